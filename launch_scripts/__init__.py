@@ -1,0 +1,1 @@
+"""Starts, records and shows the swarm."""

@@ -1,0 +1,1 @@
+"""Cost map to tree to route: one process per target."""

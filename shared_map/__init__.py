@@ -1,0 +1,1 @@
+"""Terrain and marks become cost: what all processes share."""

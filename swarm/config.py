@@ -1,0 +1,430 @@
+"""A scenario: frozen settings, read once from a TOML file and handed down by section.
+
+Every number that a user may turn has its home here, with its unit in its name. A wrong key, type or value is
+refused with the file, the key, what was found and what is allowed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import ipaddress
+import re
+import tomllib
+import types
+import typing
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from swarm.errors import ConfigError
+
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=1, le=100_000)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
+Point = tuple[float, float]
+
+Strategy = Literal[
+    "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
+]
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of the sections of a scenario."""
+
+
+class ZoneConfig(Section, frozen=True, kw_only=True):
+    """A polygon painted on the terrain.
+
+    kind       forbidden is lethal; preferred halves the pace; road sets the road pace; rough doubles the pace
+    polygon_m  [east, south] corners in metres from the north-west corner of the terrain
+    """
+
+    kind: Literal["forbidden", "preferred", "road", "rough"]
+    polygon_m: Annotated[tuple[Point, ...], Meta(min_length=3)]
+    name: str = ""
+
+
+class HiddenConfig(Section, frozen=True, kw_only=True):
+    """What is true of the terrain and missing from the map: vehicles find it out."""
+
+    closed_roads: Annotated[int, Meta(ge=0, le=1000)] = 0
+    rubble_fields: Annotated[int, Meta(ge=0, le=10_000)] = 0
+    flooded_share: Annotated[float, Meta(ge=0, le=0.3)] = 0.0
+    zones: tuple[ZoneConfig, ...] = ()
+
+
+class TerrainConfig(Section, frozen=True, kw_only=True):
+    """Where elevation and photo come from.
+
+    source        "jacksboro" (built in), "synthetic", or a path to .tif, .hgt, .asc, .npz or .map
+    photo         a colour GeoTIFF on the same ground, or nothing
+    resolution_m  cell size to bring everything to; the source's own if not given
+    roads         how many roads to lay between seeded places, as there is no map of them
+    """
+
+    source: str = "jacksboro"
+    photo: str | None = None
+    resolution_m: Positive | None = None
+    nodata: Literal["lethal", "fill"] = "lethal"
+    roads: Annotated[int, Meta(ge=0, le=200)] = 0
+    rows: Annotated[int, Meta(ge=1, le=16384)] = 256
+    cols: Annotated[int, Meta(ge=1, le=16384)] = 256
+    relief_m: NotNegative = 400.0
+    hidden: HiddenConfig = HiddenConfig()
+
+
+class CostConfig(Section, frozen=True, kw_only=True):
+    """How terrain becomes pace. `flat_speed_m_per_s` is driven on level open ground, `road_speed_m_per_s` on roads.
+
+    slope_rule     linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
+                   Tobler's hiking function
+    max_slope_deg  steeper ground is lethal
+    """
+
+    flat_speed_m_per_s: Positive = 10.0
+    road_speed_m_per_s: Positive = 20.0
+    slope_rule: Literal["linear", "quadratic", "tobler"] = "quadratic"
+    steep_factor: Annotated[float, Meta(ge=1)] = 6.0
+    max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
+    classes: bool = True
+    vehicle_radius_m: NotNegative = 0.0
+    zones: tuple[ZoneConfig, ...] = ()
+
+
+class TargetConfig(Section, frozen=True, kw_only=True):
+    """A target, or `count` alike. Ids are `name` for one, `name0, name1, ...` for several.
+
+    walk      still; random: a new heading now and then; waypoints: to random places by the cheapest way;
+              evade: away from the nearest vehicles; external: somebody else publishes its pose
+    caught    jump: a captured target turns up elsewhere; stay: it goes on as before
+    start     [row, col]; a random passable cell if not given
+    """
+
+    name: Name = "t"
+    count: Annotated[int, Meta(ge=1, le=1000)] = 1
+    walk: Literal["still", "random", "waypoints", "evade", "external"] = "waypoints"
+    speed_m_per_s: NotNegative = 4.0
+    caught: Literal["jump", "stay"] = "jump"
+    start: tuple[int, int] | None = None
+
+
+class GroupConfig(Section, frozen=True, kw_only=True):
+    """Vehicles that belong together.
+
+    targets  ids they may chase; all if empty
+    start    spread over the terrain, or clustered around one random place
+    cells    explicit [row, col] places for the first vehicles
+    """
+
+    name: Name = "all"
+    vehicles: Count = 100
+    targets: tuple[Name, ...] = ()
+    start: Literal["spread", "cluster"] = "spread"
+    cells: tuple[tuple[int, int], ...] = ()
+
+
+class VehicleConfig(Section, frozen=True, kw_only=True):
+    """How vehicles behave.
+
+    sense_range_m     radius within which the simulated sensor sees the true ground
+    capture_range_m   a target this near is captured
+    route_cells       steps of a route asked for at a time; 0 is the whole route
+    claim_cells       cells ahead that a vehicle claims
+    patience_s        after so long without a step, it looks for a way around
+    reassign_s        how often it asks which target is the cheapest
+    hysteresis        another target must be cheaper by this share to be worth a change
+    """
+
+    per_agent: Annotated[int, Meta(ge=1, le=1000)] = 25
+    tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
+    sense_range_m: Positive = 300.0
+    capture_range_m: Positive = 150.0
+    route_cells: Annotated[int, Meta(ge=0)] = 0
+    claim_cells: Annotated[int, Meta(ge=1, le=16)] = 3
+    patience_s: Positive = 1.0
+    reassign_s: Positive = 5.0
+    hysteresis: NotNegative = 0.15
+
+
+class PlannerConfig(Section, frozen=True, kw_only=True):
+    """How a planner keeps its tree.
+
+    edge           octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
+    length_weight  lambda of the paper's length-aware key, seconds per metre
+    k_min          smallest block exponent of the variable range: windows are 2**(k+2)+1 cells wide
+    full_every     rotation: a full growth every so many moves
+    cpu_budget     auto: share of one core that this planner may use
+    max_gap        the range is forced over a vehicle whose certified gap exceeds this
+    push_s         newer routes are pushed to a vehicle at most this often
+    """
+
+    strategy: Strategy = "auto"
+    tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
+    edge: Literal["octile", "paper"] = "octile"
+    neighbours: Literal[4, 8] = 8
+    corner_cutting: bool = False
+    length_weight: NotNegative = 0.0
+    k_min: Annotated[int, Meta(ge=0, le=12)] = 3
+    full_every: Annotated[int, Meta(ge=1)] = 10
+    cpu_budget: Annotated[float, Meta(gt=0, le=1)] = 0.1
+    max_gap: Annotated[float, Meta(ge=1)] = 1.5
+    push_s: Positive = 1.0
+
+
+class MapConfig(Section, frozen=True, kw_only=True):
+    """How the shared map is replicated.
+
+    publish_hz  a tile's set is put at most this often by its author
+    digest_s    every replica tells this often what it holds
+    """
+
+    publish_hz: Positive = 10.0
+    digest_s: Positive = 1.0
+
+
+class TlsConfig(Section, frozen=True, kw_only=True):
+    """Mutual TLS: certificate files in PEM."""
+
+    ca: str
+    certificate: str
+    key: str
+
+
+class NetworkConfig(Section, frozen=True, kw_only=True):
+    """Where processes meet.
+
+    listen   what the router listens on; beyond loopback it must be tls/ with certificates
+    connect  which routers the other processes connect to
+    peers    other routers that a router connects to
+    lease_s  a silent peer counts as gone after this
+    """
+
+    namespace: Name = "swarm"
+    listen: Annotated[tuple[str, ...], Meta(min_length=1)] = ("tcp/127.0.0.1:7447",)
+    connect: Annotated[tuple[str, ...], Meta(min_length=1)] = ("tcp/127.0.0.1:7447",)
+    peers: tuple[str, ...] = ()
+    lease_s: Annotated[float, Meta(ge=0.5, le=60)] = 2.0
+    connect_timeout_s: Positive = 10.0
+    tls: TlsConfig | None = None
+
+
+class MonitorConfig(Section, frozen=True, kw_only=True):
+    """The live view. Ports are on loopback; 0 picks a free one."""
+
+    live: bool = True
+    grpc_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
+    web_port: Annotated[int, Meta(ge=0, le=65535)] = 9090
+    frame_hz: Annotated[float, Meta(gt=0, le=60)] = 10.0
+    memory_mib: Annotated[int, Meta(ge=16)] = 256
+
+
+class Scenario(Section, frozen=True, kw_only=True):
+    """One run, whole.
+
+    seconds     how long the run lasts
+    time_scale  seconds on the terrain per second of the run: motion is that much faster than real
+    """
+
+    name: Name = "unnamed"
+    seed: Annotated[int, Meta(ge=0, le=2**53)] = 1
+    seconds: Positive = 60.0
+    time_scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
+    terrain: TerrainConfig = TerrainConfig()
+    cost: CostConfig = CostConfig()
+    targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1)] = (TargetConfig(),)
+    groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1)] = (GroupConfig(),)
+    vehicles: VehicleConfig = VehicleConfig()
+    planner: PlannerConfig = PlannerConfig()
+    map: MapConfig = MapConfig()
+    network: NetworkConfig = NetworkConfig()
+    monitor: MonitorConfig = MonitorConfig()
+
+    @property
+    def target_ids(self) -> list[str]:
+        return [id for target in self.targets for id in ids_of(target)]
+
+    @property
+    def vehicle_count(self) -> int:
+        return sum(group.vehicles for group in self.groups)
+
+
+def ids_of(target: TargetConfig) -> list[str]:
+    if target.count == 1:
+        return [target.name]
+    return [f"{target.name}{n}" for n in range(target.count)]
+
+
+class AgentPlan(msgspec.Struct, frozen=True):
+    """Which vehicles an agent process hosts: `count` of a group, from its `first` on."""
+
+    id: str
+    group: GroupConfig
+    first: int
+    count: int
+
+    @property
+    def vehicle_ids(self) -> list[str]:
+        return [f"{self.id}-{n:02d}" for n in range(self.count)]
+
+
+def plan_agents(scenario: Scenario) -> list[AgentPlan]:
+    """The agent processes of a scenario. An agent serves one group."""
+    agents: list[AgentPlan] = []
+    for group in scenario.groups:
+        for first in range(0, group.vehicles, scenario.vehicles.per_agent):
+            count = min(scenario.vehicles.per_agent, group.vehicles - first)
+            agents.append(AgentPlan(f"a{len(agents)}", group, first, count))
+    return agents
+
+
+def load_scenario(path: Path) -> Scenario:
+    """Read and check a scenario. Raises ConfigError that names the file and the key."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot read scenario {path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"scenario {path} is not text: {error.reason} at byte {error.start}") from error
+    return parse_scenario(text, str(path), base=path.parent)
+
+
+def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
+    """As `load_scenario`, of a text. Relative files in it are taken relative to `base`."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: not TOML: {error}") from error
+    try:
+        scenario = msgspec.convert(raw, Scenario)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {_explain(str(error), raw)}") from error
+    _check(scenario, source)
+    return scenario if base is None else _anchored(scenario, base)
+
+
+def _check(scenario: Scenario, source: str) -> None:
+    ids = scenario.target_ids
+    doubled = sorted({id for id in ids if ids.count(id) > 1})
+    if doubled:
+        raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    names = [group.name for group in scenario.groups]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
+    for group in scenario.groups:
+        for id in group.targets:
+            if id not in ids:
+                raise ConfigError(
+                    f"{source}: groups: {group.name} chases {id!r}, which is no target{_nearest(id, ids)}"
+                )
+    for key, endpoints in (("listen", scenario.network.listen), ("connect", scenario.network.connect)):
+        for endpoint in endpoints:
+            check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
+
+
+def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
+    """Beyond loopback only mutual TLS will do. Raises ConfigError."""
+    match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
+    if match is None or int(match[3]) > 65535:
+        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint such as tcp/127.0.0.1:7447 or tls/host:7447")
+    protocol, host = match[1], match[2].strip("[]")
+    if protocol == "tls" and not has_tls:
+        raise ConfigError(f"{where}: {endpoint} needs network.tls with ca, certificate and key")
+    if protocol == "tcp" and not _loopback(host):
+        raise ConfigError(
+            f"{where}: {endpoint} leaves this machine in the clear; use tls/{host}:{match[3]} with network.tls"
+        )
+
+
+def _loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _anchored(scenario: Scenario, base: Path) -> Scenario:
+    """Relative paths of a scenario file, made relative to where it lies."""
+    terrain = scenario.terrain
+    source = terrain.source
+    if source not in BUILT_IN_TERRAINS:
+        source = str(base / source)
+    photo = None if terrain.photo is None else str(base / terrain.photo)
+    network = scenario.network
+    if network.tls is not None:
+        tls = network.tls
+        tls = TlsConfig(ca=str(base / tls.ca), certificate=str(base / tls.certificate), key=str(base / tls.key))
+        network = msgspec.structs.replace(network, tls=tls)
+    terrain = msgspec.structs.replace(terrain, source=source, photo=photo)
+    return msgspec.structs.replace(scenario, terrain=terrain, network=network)
+
+
+BUILT_IN_TERRAINS = ("jacksboro", "synthetic")
+
+
+def _explain(reason: str, raw: dict[str, Any]) -> str:
+    """msgspec's message with the key in TOML's words, what was found, and the nearest allowed name."""
+    path = "$"
+    located = re.fullmatch(r"(.*) - at `(.*)`", reason, re.DOTALL)
+    if located:
+        reason, path = located[1], located[2]
+    steps = re.findall(r"\.([A-Za-z_]\w*)|\[(\d+|\.\.\.)\]", path)
+    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", reason)
+    section: Any = Scenario
+    value: Any = raw
+    name = ""
+    for key, index in steps:
+        if key:
+            name = f"{name}.{key}" if name else key
+            section = _field_type(section, key)
+            value = value.get(key) if isinstance(value, dict) else None
+        else:
+            name += f"[{index}]"
+            section = _item_type(section)
+            value = value[int(index)] if isinstance(value, list) and index.isdecimal() else None
+    if unknown:
+        key = unknown[1]
+        allowed = list(section.__struct_fields__) if hasattr(section, "__struct_fields__") else []
+        where = f"{name}.{key}" if name else key
+        return f"unknown key {where}{_nearest(key, allowed)}; allowed here: {', '.join(allowed)}"
+    reason = reason[:1].lower() + reason[1:]
+    found = "" if value is None or isinstance(value, (dict, list)) else f", found {value!r}"
+    return f"{name or 'scenario'}: {reason}{found}{_choices(section)}"
+
+
+def _nearest(word: str, allowed: list[str]) -> str:
+    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _plain(hint: Any) -> Any:
+    """A type without Annotated and Optional around it."""
+    while True:
+        origin = typing.get_origin(hint)
+        if origin is Annotated:
+            hint = typing.get_args(hint)[0]
+        elif origin in (types.UnionType, typing.Union):
+            hint = next(arg for arg in typing.get_args(hint) if arg is not type(None))
+        else:
+            return hint
+
+
+def _field_type(section: Any, key: str) -> Any:
+    section = _plain(section)
+    if not hasattr(section, "__struct_fields__"):
+        return None
+    return _plain(typing.get_type_hints(section, include_extras=True).get(key))
+
+
+def _item_type(section: Any) -> Any:
+    args = typing.get_args(section)
+    return _plain(args[0]) if args else None
+
+
+def _choices(section: Any) -> str:
+    if typing.get_origin(section) is Literal:
+        return f"; allowed: {', '.join(map(repr, typing.get_args(section)))}"
+    return ""

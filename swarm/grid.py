@@ -1,0 +1,207 @@
+"""The grid that everybody shares: cells, metres, tiles, regions and windows.
+
+Row 0 is north. A cell is the flat index `row * cols + col`. Metres are in the terrain's own projected frame:
+x grows to the east, y to the north; `west_m` and `north_m` are the outer corner of cell (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from swarm.errors import OutsideGridError
+
+TILE_CELLS = 32
+"""Side of a tile in cells: what an author knows about one tile travels as one value."""
+REGION_TILES = 8
+"""Side of a region in tiles: the unit of interest on the wire."""
+
+STEP_ROW = (-1, -1, 0, 1, 1, 1, 0, -1)
+STEP_COL = (0, 1, 1, 1, 0, -1, -1, -1)
+"""Direction codes 0..7, clockwise from north. Odd codes are diagonal."""
+NO_DIRECTION = 255
+"""In a parent array: the target itself, or a cell from which there is no way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A rectangle of cells: rows row0 <= row < row1 and columns col0 <= col < col1."""
+
+    row0: int
+    col0: int
+    row1: int
+    col1: int
+
+    @property
+    def empty(self) -> bool:
+        return self.row1 <= self.row0 or self.col1 <= self.col0
+
+    @property
+    def cells(self) -> int:
+        return 0 if self.empty else (self.row1 - self.row0) * (self.col1 - self.col0)
+
+    def union(self, other: Window) -> Window:
+        """The smallest window that covers both; an empty one adds nothing."""
+        if self.empty:
+            return other
+        if other.empty:
+            return self
+        return Window(
+            min(self.row0, other.row0),
+            min(self.col0, other.col0),
+            max(self.row1, other.row1),
+            max(self.col1, other.col1),
+        )
+
+    def contains(self, row: int, col: int) -> bool:
+        return self.row0 <= row < self.row1 and self.col0 <= col < self.col1
+
+    def touches(self, other: Window) -> bool:
+        """Whether the two overlap or share a border, so that merging them wastes little."""
+        return (
+            self.row0 <= other.row1
+            and other.row0 <= self.row1
+            and self.col0 <= other.col1
+            and other.col0 <= self.col1
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class GridSpec:
+    """Shape and place of the terrain: `rows` x `cols` cells of `resolution_m` metres."""
+
+    rows: int
+    cols: int
+    resolution_m: float
+    west_m: float = 0.0
+    north_m: float = 0.0
+    crs: str = "local"
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.cols < 1:
+            raise ValueError(f"a grid needs at least one cell, not {self.rows} x {self.cols}")
+        if not self.resolution_m > 0:
+            raise ValueError(f"resolution_m must be positive, not {self.resolution_m}")
+
+    @property
+    def cells(self) -> int:
+        return self.rows * self.cols
+
+    @property
+    def window(self) -> Window:
+        """The whole grid."""
+        return Window(0, 0, self.rows, self.cols)
+
+    @property
+    def tile_cols(self) -> int:
+        return -(-self.cols // TILE_CELLS)
+
+    @property
+    def tile_rows(self) -> int:
+        return -(-self.rows // TILE_CELLS)
+
+    @property
+    def tiles(self) -> int:
+        return self.tile_rows * self.tile_cols
+
+    @property
+    def region_cols(self) -> int:
+        return -(-self.tile_cols // REGION_TILES)
+
+    @property
+    def region_rows(self) -> int:
+        return -(-self.tile_rows // REGION_TILES)
+
+    @property
+    def regions(self) -> int:
+        return self.region_rows * self.region_cols
+
+    def inside(self, row: int, col: int) -> bool:
+        return 0 <= row < self.rows and 0 <= col < self.cols
+
+    def cell(self, row: int, col: int) -> int:
+        """Flat index of (row, col). Raises OutsideGridError outside the grid."""
+        if not self.inside(row, col):
+            raise OutsideGridError(f"row {row}, col {col} is not in {self.rows} x {self.cols}")
+        return row * self.cols + col
+
+    def row_col(self, cell: int) -> tuple[int, int]:
+        """(row, col) of a flat index. Raises OutsideGridError outside the grid."""
+        if not 0 <= cell < self.cells:
+            raise OutsideGridError(f"cell {cell} is not in {self.rows} x {self.cols}")
+        return divmod(cell, self.cols)
+
+    def centre_m(self, cell: int) -> tuple[float, float]:
+        """(x_m, y_m) of the middle of a cell."""
+        row, col = self.row_col(cell)
+        return (
+            self.west_m + (col + 0.5) * self.resolution_m,
+            self.north_m - (row + 0.5) * self.resolution_m,
+        )
+
+    def cell_at_m(self, x_m: float, y_m: float) -> int:
+        """The cell that holds a point. Raises OutsideGridError outside the grid."""
+        row = int((self.north_m - y_m) // self.resolution_m)
+        col = int((x_m - self.west_m) // self.resolution_m)
+        return self.cell(row, col)
+
+    def tile_of(self, cell: int) -> int:
+        row, col = self.row_col(cell)
+        return (row // TILE_CELLS) * self.tile_cols + col // TILE_CELLS
+
+    def region_of_tile(self, tile: int) -> int:
+        if not 0 <= tile < self.tiles:
+            raise OutsideGridError(f"tile {tile} is not in 0..{self.tiles - 1}")
+        tile_row, tile_col = divmod(tile, self.tile_cols)
+        return (tile_row // REGION_TILES) * self.region_cols + tile_col // REGION_TILES
+
+    def region_of(self, cell: int) -> int:
+        return self.region_of_tile(self.tile_of(cell))
+
+    def tile_window(self, tile: int) -> Window:
+        """The cells of a tile; tiles at the east and south border may be cut off."""
+        if not 0 <= tile < self.tiles:
+            raise OutsideGridError(f"tile {tile} is not in 0..{self.tiles - 1}")
+        tile_row, tile_col = divmod(tile, self.tile_cols)
+        row0, col0 = tile_row * TILE_CELLS, tile_col * TILE_CELLS
+        return Window(row0, col0, min(row0 + TILE_CELLS, self.rows), min(col0 + TILE_CELLS, self.cols))
+
+    def around(self, cell: int, half: int) -> Window:
+        """The window of `half` cells to every side of a cell, cut at the border."""
+        row, col = self.row_col(cell)
+        return Window(
+            max(row - half, 0),
+            max(col - half, 0),
+            min(row + half + 1, self.rows),
+            min(col + half + 1, self.cols),
+        )
+
+    def neighbours(self, cell: int) -> Iterator[tuple[int, int]]:
+        """(direction, cell) of the up to eight neighbours inside the grid."""
+        row, col = self.row_col(cell)
+        for direction in range(8):
+            r, c = row + STEP_ROW[direction], col + STEP_COL[direction]
+            if self.inside(r, c):
+                yield direction, r * self.cols + c
+
+    def distance_cells(self, a: int, b: int) -> int:
+        """Chebyshev distance: king's moves between two cells."""
+        row_a, col_a = self.row_col(a)
+        row_b, col_b = self.row_col(b)
+        return max(abs(row_a - row_b), abs(col_a - col_b))
+
+
+def walk(grid: GridSpec, start: int, directions: bytes) -> list[int]:
+    """The cells of a route: `start` and then one cell per direction code.
+
+    Raises ValueError on a code outside 0..7 and OutsideGridError where the route leaves the grid.
+    """
+    row, col = grid.row_col(start)
+    cells = [start]
+    for direction in directions:
+        if direction > 7:
+            raise ValueError(f"direction code {direction} is not in 0..7")
+        row += STEP_ROW[direction]
+        col += STEP_COL[direction]
+        cells.append(grid.cell(row, col))
+    return cells

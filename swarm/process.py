@@ -1,0 +1,182 @@
+"""The loop of a process: an inbox, a tick, signals. One thread owns a service's state; everybody else posts."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Hashable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
+
+from swarm.bus import Event, Heard, Post, WorkDone
+from swarm.clock import NS_PER_S, Clock
+from swarm.stats import Counters
+
+log = logging.getLogger(__name__)
+
+
+class Service(Protocol):
+    """A role's shell: turns events into calls of its core, and its core's actions into calls of the bus."""
+
+    @property
+    def counters(self) -> Counters: ...
+
+    def start(self, now_ns: int) -> None:
+        """Subscribe, serve, raise the token. Called once, on the thread that owns the service."""
+        ...
+
+    def handle(self, event: Event, now_ns: int) -> None: ...
+
+    def tick(self, now_ns: int) -> None: ...
+
+    def stop(self, now_ns: int) -> None:
+        """Last words before the bus is closed."""
+        ...
+
+
+class Inbox:
+    """Events from any thread to the one that owns the state.
+
+    Of topics whose samples each say everything (`Topic.newest`) only the newest per key is kept, in the place of
+    the oldest unread one; so a slow reader is late, but never behind by more than one value per key.
+    """
+
+    def __init__(self) -> None:
+        self._ready = threading.Condition()
+        self._order: deque[Hashable] = deque()
+        self._events: dict[Hashable, Event | BaseException] = {}
+        self._next = 0
+        self.superseded = 0
+
+    def post(self, event: Event) -> None:
+        self._put(event, _newest_key(event))
+
+    def fail(self, error: BaseException) -> None:
+        """Make the owner raise: how a worker thread ends its process."""
+        self._put(error, None)
+
+    def _put(self, event: Event | BaseException, key: Hashable | None) -> None:
+        with self._ready:
+            if key is None:
+                self._next += 1
+                key = self._next
+            elif key in self._events:
+                self._events[key] = event
+                self.superseded += 1
+                return
+            self._order.append(key)
+            self._events[key] = event
+            self._ready.notify()
+
+    def take(self, timeout_s: float) -> Event | None:
+        """The oldest event; None if there is none within the timeout. Raises what `fail` was given."""
+        with self._ready:
+            if not self._order and timeout_s > 0:
+                self._ready.wait(timeout_s)
+            if not self._order:
+                return None
+            event = self._events.pop(self._order.popleft())
+        if isinstance(event, BaseException):
+            raise event
+        return event
+
+    def wake(self) -> None:
+        with self._ready:
+            self._ready.notify()
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+
+def _newest_key(event: Event) -> Hashable | None:
+    if isinstance(event, Heard) and event.topic.newest:
+        return (event.topic.name, *event.fields.values())
+    return None
+
+
+class ThreadWorker:
+    """One thread beside the process's own. Kernels release the interpreter lock, so both make progress."""
+
+    def __init__(self, name: str, inbox: Inbox, clock: Clock) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix=name)
+        self._inbox = inbox
+        self._clock = clock
+
+    def submit(self, tag: str, job: Callable[[], object], post: Post, model_ns: int = 0) -> None:
+        def run() -> None:
+            began_ns = self._clock.now_ns()
+            result = job()
+            post(WorkDone(tag, result, self._clock.now_ns() - began_ns))
+
+        self._pool.submit(run).add_done_callback(self._failed)
+
+    def _failed(self, future: Future[None]) -> None:
+        error = None if future.cancelled() else future.exception()
+        if error is not None:
+            self._inbox.fail(error)
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+class Process:
+    """Runs one service until it is told to stop."""
+
+    def __init__(self, service: Service, inbox: Inbox, clock: Clock, tick_hz: float) -> None:
+        self._service = service
+        self._inbox = inbox
+        self._clock = clock
+        self._tick_ns = int(NS_PER_S / tick_hz)
+        self._stopping = threading.Event()
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._inbox.wake()
+
+    def stop_on_signals(self) -> None:
+        """SIGTERM and SIGINT end the loop after the event in hand. Call on the main thread."""
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: self.stop())
+
+    def run(self) -> None:
+        """Start, loop, stop. A tick that comes late is taken once and the missed ones are dropped."""
+        counters = self._service.counters
+        self._service.start(self._clock.now_ns())
+        due_ns = self._clock.now_ns()
+        try:
+            while not self._stopping.is_set():
+                now_ns = self._clock.now_ns()
+                if now_ns >= due_ns:
+                    missed = (now_ns - due_ns) // self._tick_ns
+                    if missed:
+                        counters.count("ticks_dropped", missed)
+                    due_ns += (missed + 1) * self._tick_ns
+                    self._service.tick(now_ns)
+                    counters.observe("tick_ms", (self._clock.now_ns() - now_ns) / 1e6)
+                    counters.gauge("inbox", float(len(self._inbox)))
+                # Bounded, because a signal handler cannot interrupt a wait that nobody notifies.
+                wait_s = min((due_ns - self._clock.now_ns()) / NS_PER_S, 0.5)
+                event = self._inbox.take(wait_s)
+                if event is not None:
+                    self._service.handle(event, self._clock.now_ns())
+        finally:
+            self._service.stop(self._clock.now_ns())
+
+
+def end_with(parent_gone: Callable[[], object], stop: Callable[[], None], grace_s: float = 3.0) -> None:
+    """Watch for the end of the parent on a thread: then stop, and after a grace period end without asking.
+
+    parent_gone  blocks until the parent is gone, as `wait([parent_process().sentinel])` does
+    """
+
+    def watch() -> None:
+        parent_gone()
+        log.warning("the launcher is gone: stopping")
+        stop()
+        threading.Event().wait(grace_s)
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent-watch", daemon=True).start()

@@ -1,0 +1,87 @@
+"""Counters and mergeable histograms that every process publishes about itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+_BASE = 1.04
+_LOG_BASE = math.log(_BASE)
+
+
+class Histogram:
+    """Positive values in logarithmic buckets 4 % wide: merged by adding, quantiles within 2 %.
+
+    A plain sample reservoir cannot be merged across processes, and fixed buckets (as of Prometheus) are too
+    coarse for latencies from microseconds to seconds.
+    """
+
+    def __init__(self, buckets: Mapping[int, int] | None = None) -> None:
+        self.buckets: dict[int, int] = dict(buckets or {})
+
+    def add(self, value: float, times: int = 1) -> None:
+        """Count a value; what is not positive and finite falls into the lowest bucket kept for zero."""
+        if not math.isfinite(value):
+            return
+        bucket = _ZERO if value <= 0 else round(math.log(value) / _LOG_BASE)
+        self.buckets[bucket] = self.buckets.get(bucket, 0) + times
+
+    def merge(self, buckets: Mapping[int, int]) -> None:
+        for bucket, count in buckets.items():
+            self.buckets[bucket] = self.buckets.get(bucket, 0) + count
+
+    @property
+    def count(self) -> int:
+        return sum(self.buckets.values())
+
+    def quantile(self, q: float) -> float | None:
+        """The value below which a share `q` of all values lies; None of nothing."""
+        total = self.count
+        if total == 0:
+            return None
+        rank = min(total - 1, int(q * total))
+        seen = 0
+        for bucket in sorted(self.buckets):
+            seen += self.buckets[bucket]
+            if seen > rank:
+                return _value(bucket)
+        raise AssertionError("unreachable")
+
+    def mean(self) -> float | None:
+        total = self.count
+        if total == 0:
+            return None
+        return sum(_value(bucket) * count for bucket, count in self.buckets.items()) / total
+
+
+_ZERO = -10_000
+
+
+def _value(bucket: int) -> float:
+    return 0.0 if bucket == _ZERO else math.exp(bucket * _LOG_BASE)
+
+
+def merged(parts: Iterable[Mapping[int, int]]) -> Histogram:
+    """One histogram of many processes'."""
+    whole = Histogram()
+    for part in parts:
+        whole.merge(part)
+    return whole
+
+
+class Counters:
+    """What a process counts, gauges and times, by name. Names carry units: `route_query_ms`."""
+
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = {}
+        self.gauges: dict[str, float] = {}
+        self.histograms: dict[str, Histogram] = {}
+
+    def count(self, name: str, by: int = 1) -> None:
+        self.counts[name] = self.counts.get(name, 0) + by
+
+    def gauge(self, name: str, value: float) -> None:
+        self.gauges[name] = value
+
+    def observe(self, name: str, value: float) -> None:
+        self.histograms.setdefault(name, Histogram()).add(value)

@@ -1,0 +1,152 @@
+"""Every key expression of the wire, with its message, rate and quality of service. `docs/wire.md` is made
+of this."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from enum import Enum
+
+from swarm.messages import (
+    Claims,
+    CostReply,
+    CostRequest,
+    Digest,
+    Fleet,
+    Followed,
+    MarkSet,
+    MarksRequest,
+    Message,
+    Note,
+    Nothing,
+    PlannerStatus,
+    PushedRoute,
+    RouteReply,
+    RouteRequest,
+    RunInfo,
+    Stats,
+    TargetPose,
+)
+
+
+class Priority(Enum):
+    """Zenoh's priorities that we use."""
+
+    INTERACTIVE = "interactive"
+    DATA = "data"
+    BACKGROUND = "background"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One row of the wire.
+
+    key       template below the namespace; `{name}` stands for one chunk
+    message   what is put, or what a query is answered with
+    request   for a queryable: what is asked; None for a topic that is only published
+    newest    each value says all there is under its key, so a reader may skip to the newest
+    buffer    samples that a slow reader keeps; the oldest are dropped first
+    """
+
+    name: str
+    key: str
+    message: type[Message]
+    what: str
+    rate: str
+    request: type[Message] | None = None
+    published: bool = True
+    newest: bool = True
+    priority: Priority = Priority.DATA
+    buffer: int = 1024
+    _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.key))
+        object.__setattr__(self, "_pattern", re.compile(pattern))
+
+    def expression(self, namespace: str, **fields: str | int) -> str:
+        """The key expression: fields that are not given become `*`."""
+        given = {name: fields.get(name, "*") for name in self.fields}
+        unknown = sorted(set(fields) - set(given))
+        if unknown:
+            raise TypeError(f"topic {self.name} has no field {unknown[0]}; it has {', '.join(given)}")
+        return f"{namespace}/{self.key.format(**given)}"
+
+    def keyed(self, namespace: str, **fields: str | int) -> str:
+        """The key of one value: every field must be given, and none may be a wildcard."""
+        missing = [name for name in self.fields if name not in fields]
+        if missing:
+            raise TypeError(f"topic {self.name} needs the field {missing[0]}")
+        key = self.expression(namespace, **fields)
+        if "*" in key or "$" in key:
+            raise ValueError(f"{key} is not the key of one value")
+        return key
+
+    def parse(self, namespace: str, key: str) -> dict[str, str] | None:
+        """The fields of a key, None of a key that is not this topic's."""
+        if not key.startswith(namespace + "/"):
+            return None
+        match = self._pattern.fullmatch(key[len(namespace) + 1 :])
+        return match.groupdict() if match else None
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        return tuple(re.findall(r"{(\w+)}", self.key))
+
+
+RUN = Topic(
+    "run", "run/{role}/{id}", RunInfo, "which run and terrain a process belongs to", "asked at every start",
+    request=Nothing, published=False,
+)  # fmt: skip
+MARKS = Topic(
+    "marks", "marks/{region}/{tile}/{author}", MarkSet,
+    "an author's whole set for a tile; the author and the keeper answer for it",
+    "on change, at most 10 Hz a tile", request=MarksRequest, buffer=8192,
+)  # fmt: skip
+DIGEST = Topic(
+    "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",
+    priority=Priority.BACKGROUND,
+)  # fmt: skip
+FLEET = Topic(
+    "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
+)  # fmt: skip
+CLAIMS = Topic(
+    "claims", "claims/{agent}", Claims,
+    "which cells vehicles hold and want; anybody who heard an agent answers with its last", "every tick, on change",
+    request=Nothing, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+FOLLOWED = Topic(
+    "followed", "vehicle/{vehicle}/followed", Followed, "the route that a vehicle has begun", "per new route",
+    newest=False, priority=Priority.BACKGROUND,
+)  # fmt: skip
+PUSHED_ROUTE = Topic(
+    "pushed-route", "vehicle/{vehicle}/route", PushedRoute, "a newer route for a vehicle in the updated range",
+    "per update",
+)  # fmt: skip
+POSE = Topic("pose", "target/{target}/pose", TargetPose, "where a target is", "every tick")
+ROUTE = Topic(
+    "route", "target/{target}/route", RouteReply, "routes from cells to the target", "asked",
+    request=RouteRequest, published=False,
+)  # fmt: skip
+COST = Topic(
+    "cost", "target/{target}/cost", CostReply, "cost-to-go of a batch of cells", "asked",
+    request=CostRequest, published=False,
+)  # fmt: skip
+STATUS = Topic(
+    "status", "target/{target}/status", PlannerStatus, "how a planner is doing", "2 Hz",
+    priority=Priority.BACKGROUND,
+)  # fmt: skip
+STATS = Topic(
+    "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz", priority=Priority.BACKGROUND,
+)  # fmt: skip
+NOTE = Topic(
+    "note", "note/{role}/{id}", Note, "something worth telling a person", "as it happens",
+    newest=False, priority=Priority.BACKGROUND,
+)  # fmt: skip
+
+TOPICS = (
+    RUN, MARKS, DIGEST, FLEET, CLAIMS, FOLLOWED, PUSHED_ROUTE, POSE, ROUTE, COST, STATUS, STATS, NOTE,
+)  # fmt: skip
+
+ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
+"""Liveliness tokens, one per process."""

@@ -1,0 +1,1 @@
+"""Route to motion to marks: many vehicles per process."""
