@@ -1,0 +1,46 @@
+"""Where many things went, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+TrackKey = tuple[str, int]
+"""Who, and which piece of its track: a target that turns up elsewhere begins a new piece."""
+
+
+class Tracks:
+    """Samples of places, at most about `limit` of them: when that is reached every second sampling is forgotten,
+    and from then on half as many are taken."""
+
+    def __init__(self, interval_ns: int, limit: int = 400_000) -> None:
+        self._interval_ns = interval_ns
+        self._limit = limit
+        self._count = 0
+        self._due_ns: int | None = None
+        self._samplings: list[tuple[int, tuple[TrackKey, ...], NDArray[np.float32]]] = []
+
+    def due(self, now_ns: int) -> bool:
+        return self._due_ns is None or now_ns >= self._due_ns
+
+    def add(self, now_ns: int, keys: Sequence[TrackKey], places_m: NDArray[np.float32]) -> None:
+        """One sampling: `places_m` has a row (east, south) per key."""
+        self._due_ns = now_ns + self._interval_ns
+        if not keys:
+            return
+        self._samplings.append((now_ns, tuple(keys), np.asarray(places_m, np.float32).reshape(-1, 2)))
+        self._count += len(keys)
+        if self._count > self._limit and len(self._samplings) > 2:
+            self._samplings = self._samplings[::2]
+            self._count = sum(len(keys) for _, keys, _ in self._samplings)
+            self._interval_ns *= 2
+
+    def lines(self) -> dict[TrackKey, NDArray[np.float32]]:
+        """Per key its places in order of time: rows (east, south), in metres."""
+        points: dict[TrackKey, list[NDArray[np.float32]]] = {}
+        for _, keys, places in self._samplings:
+            for key, place in zip(keys, places, strict=True):
+                points.setdefault(key, []).append(place)
+        return {key: np.array(places) for key, places in points.items()}
