@@ -31,7 +31,8 @@ class Asked:
     answerer: Answerer
 
     def answer(self, message: Message, **fields: str | int) -> None:
-        """Send one reply. `fields` complete the key where `serve` left wildcards."""
+        """Send one reply. `fields` complete the key where `serve` left wildcards; a reply whose key is not
+        among those asked for is not sent."""
         self.answerer.answer(message, fields)
 
     def refuse(self, reason: str) -> None:
@@ -141,7 +142,8 @@ class Bus(Protocol):
         ...
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
-        """Post `Appeared` for the tokens that are up now and later, `Disappeared` when they fall."""
+        """Post `Appeared` for the tokens of others that are up now and later, `Disappeared` when they fall or
+        the link to them is lost."""
         ...
 
     def watch_links(self, post: Post) -> None:

@@ -1,15 +1,14 @@
 """A network inside one process, on a manual clock: the same services run on it in tests and simulations.
 
-Everything is encoded and decoded as on the wire. What a link does to a message (delay, drop, duplicate, reorder,
-partition) is decided by a `LinkModel`, so that a seed replays a run exactly.
+Everything is encoded and decoded as on the wire, once per message: those who hear it share the frozen result. What
+a link does to a message (delay, loss, repetition, partition) is decided by a `LinkModel`, so that a seed
+replays a run exactly.
 """
 
 from __future__ import annotations
 
-import fnmatch
-import heapq
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from swarm.bus import (
@@ -22,40 +21,17 @@ from swarm.bus import (
     LinkChanged,
     Post,
     Replied,
-    WorkDone,
 )
-from swarm.clock import NS_PER_S, ManualClock
+from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.messages import Message, decode, encode
+from swarm.scheduler import InlineWorker as InlineWorker
+from swarm.scheduler import Scheduler as Scheduler
 from swarm.topics import Topic
 
-
-class Scheduler:
-    """What happens when, on a manual clock. Of two things due at once the one scheduled first happens first."""
-
-    def __init__(self, clock: ManualClock) -> None:
-        self.clock = clock
-        self._due: list[tuple[int, int, Callable[[], None]]] = []
-        self._count = 0
-
-    def at(self, when_ns: int, action: Callable[[], None]) -> None:
-        self._count += 1
-        heapq.heappush(self._due, (max(when_ns, self.clock.now_ns()), self._count, action))
-
-    def after(self, delay_ns: int, action: Callable[[], None]) -> None:
-        self.at(self.clock.now_ns() + delay_ns, action)
-
-    def run_until(self, end_ns: int) -> int:
-        """Let everything due up to `end_ns` happen; returns how many things did."""
-        happened = 0
-        while self._due and self._due[0][0] <= end_ns:
-            when_ns, _, action = heapq.heappop(self._due)
-            self.clock.advance_to(max(when_ns, self.clock.now_ns()))
-            action()
-            happened += 1
-        self.clock.advance_to(max(end_ns, self.clock.now_ns()))
-        return happened
+TOKEN_NS = 1_000_000
+"""How long word of a token takes; zenoh needs 3 to 8 ms to notice a killed process."""
 
 
 class LinkModel(Protocol):
@@ -65,7 +41,9 @@ class LinkModel(Protocol):
         """One delay per copy that arrives; none where it is lost."""
         ...
 
-    def connected(self, source: str, destination: str, now_ns: int) -> bool: ...
+    def connected(self, source: str, destination: str, now_ns: int) -> bool:
+        """Whether the network takes the two for connected: it notices a cut only after a while."""
+        ...
 
 
 class PerfectLinks:
@@ -81,101 +59,76 @@ class PerfectLinks:
         return True
 
 
-@dataclass(eq=False)
-class _Interest:
-    bus: MemoryBus
-    topic: Topic
-    fields: Mapping[str, str]
-    post: Post
-
-    def matches(self, topic: Topic, fields: Mapping[str, str]) -> bool:
-        return topic is self.topic and all(
-            _intersect(fields.get(name, "*"), self.fields.get(name, "*")) for name in topic.fields
-        )
-
-
-def _intersect(a: str, b: str) -> bool:
-    """Whether two chunks, either of which may hold wildcards, can name the same thing."""
-    if "*" in a and "*" in b:
-        return a == "*" or b == "*" or a == b
-    return fnmatch.fnmatchcase(a, b) if "*" in b else fnmatch.fnmatchcase(b, a)
+Trace = Callable[[int, str, str, str, bytes], None]
+"""Told of each delivery: time, source node, destination node, topic, payload."""
 
 
 class MemoryNetwork:
-    """What Zenoh is for real processes. `trace` is told of every delivery."""
+    """What Zenoh is for real processes."""
 
-    def __init__(
-        self,
-        scheduler: Scheduler,
-        links: LinkModel,
-        trace: Callable[[int, str, str, str, bytes], None] | None = None,
-        lease_ns: int = 2 * NS_PER_S,
-    ) -> None:
+    def __init__(self, scheduler: Scheduler, links: LinkModel, trace: Trace | None = None) -> None:
         self.scheduler = scheduler
         self.links = links
-        self.lease_ns = lease_ns
-        self._trace = trace
         self.buses: list[MemoryBus] = []
+        self.trace = trace
+        self._down: set[str] = set()
 
     def bus(self, node: str, namespace: str = "swarm") -> MemoryBus:
         bus = MemoryBus(self, node, namespace)
         self.buses.append(bus)
         return bus
 
-    def carry(
-        self, source: MemoryBus, to: MemoryBus, what: str, payload: bytes, arrive: Callable[[], None]
-    ) -> None:
-        """Schedule the arrival of each copy of a message at a node that is still open by then."""
-        now_ns = self.scheduler.clock.now_ns()
-        delays = (0,) if source is to else self.links.delays_ns(source.node, to.node, what, now_ns)
-        for delay_ns in delays:
-
-            def deliver() -> None:
-                if not to.closed:
-                    if self._trace is not None:
-                        self._trace(self.scheduler.clock.now_ns(), source.node, to.node, what, payload)
-                    arrive()
-
-            self.scheduler.after(delay_ns, deliver)
-
-    def announce(self, peer: Peer, origin: MemoryBus, up: bool) -> None:
-        """Tell every watcher of a token that rose or fell, over reliable links that a partition cuts."""
-        for bus in self.buses:
-            if bus is not origin:
-                self.tell(bus, origin, peer, up)
-
-    def tell(self, bus: MemoryBus, origin: MemoryBus, peer: Peer, up: bool) -> None:
-        if not self.links.connected(origin.node, bus.node, self.scheduler.clock.now_ns()):
-            return
-        for role, post in bus.watchers:
-            if role in ("*", peer.role):
-                event: Event = Appeared(peer) if up else Disappeared(peer)
-
-                def deliver(post: Post = post, event: Event = event) -> None:
-                    if not bus.closed:
-                        post(event)
-
-                self.scheduler.after(1_000_000, deliver)
+    def connected(self, source: MemoryBus, to: MemoryBus) -> bool:
+        if source is to:
+            return True
+        if source.node in self._down or to.node in self._down:
+            return False
+        return self.links.connected(source.node, to.node, self.scheduler.clock.now_ns())
 
     def link_changed(self, node: str, up: bool) -> None:
-        """A node's link came up or went down: those beyond it lose or regain its tokens."""
-        for bus in self.buses:
-            if bus.node == node and not bus.closed:
-                for post in bus.link_watchers:
-                    post(LinkChanged(up))
-                for other in self.buses:
-                    if other is bus or other.closed:
-                        continue
-                    for peer in other.tokens:
-                        self.force(bus, peer, up)
-                    for peer in bus.tokens:
-                        self.force(other, peer, up)
+        """Cut a node off from all others, or bring it back."""
+        if up:
+            self._down.discard(node)
+        else:
+            self._down.add(node)
+        self.relink([node], up)
 
-    @staticmethod
-    def force(bus: MemoryBus, peer: Peer, up: bool) -> None:
-        for role, post in bus.watchers:
-            if role in ("*", peer.role):
-                post(Appeared(peer) if up else Disappeared(peer))
+    def relink(self, nodes: Sequence[str], up: bool) -> None:
+        """Nodes notice that their link came up or went down; everybody's view of the tokens follows."""
+        for bus in list(self.buses):
+            if bus.node in nodes:
+                for post in bus.link_watchers:
+                    bus.later(TOKEN_NS, post, LinkChanged(up))
+        self.compare_tokens()
+
+    def compare_tokens(self) -> None:
+        for bus in self.buses:
+            for watcher in bus.watchers:
+                watcher.compare()
+
+    def arrivals_ns(self, source: MemoryBus, to: MemoryBus, what: str) -> Sequence[int]:
+        """When each copy of a message sent now arrives."""
+        now_ns = self.scheduler.clock.now_ns()
+        if source is to:
+            return (now_ns,)
+        if self._down and (source.node in self._down or to.node in self._down):
+            return ()
+        return [now_ns + delay for delay in self.links.delays_ns(source.node, to.node, what, now_ns)]
+
+
+@dataclass(eq=False, slots=True)
+class _Interest:
+    """A subscription or a queryable. `fields` holds all the topic's, wildcards included."""
+
+    bus: MemoryBus
+    topic: Topic
+    fields: dict[str, str]
+    post: Post
+
+
+def _intersect(a: Mapping[str, str], b: Mapping[str, str]) -> bool:
+    """Whether two keys of one topic, either of which may have wildcards, can name the same value."""
+    return all(chunk == b[name] or chunk == "*" or b[name] == "*" for name, chunk in a.items())
 
 
 class MemoryBus:
@@ -187,32 +140,37 @@ class MemoryBus:
         self.namespace = namespace
         self.closed = False
         self.counts: dict[str, int] = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
-        self.subscriptions: list[_Interest] = []
-        self.queryables: list[_Interest] = []
-        self.watchers: list[tuple[str, Post]] = []
+        self.subscriptions: dict[str, list[_Interest]] = {}
+        self.queryables: dict[str, list[_Interest]] = {}
+        self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
         self.tokens: list[Peer] = []
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        topic.keyed(self.namespace, **fields)
-        self.publish_bytes(topic, encode(message), {name: str(value) for name, value in fields.items()})
+        self.publish_bytes(topic, encode(message), topic.one(fields))
 
     def publish_bytes(self, topic: Topic, payload: bytes, fields: dict[str, str]) -> None:
         """Put any payload at all: tests send garbage through this."""
+        if self.closed:
+            return
         self.counts["messages_out"] += 1
+        sample = _Sample(topic, fields, payload)
+        scheduler = self.network.scheduler
         for bus in self.network.buses:
-            if bus.closed or bus.namespace != self.namespace:
-                continue
-            for interest in bus.subscriptions:
-                if interest.matches(topic, fields):
-                    arrive = _Arrival(bus, interest, topic, fields, payload)
-                    self.network.carry(self, bus, topic.name, payload, arrive)
+            for interest in bus.subscriptions.get(topic.name, ()):
+                if bus.namespace == self.namespace and _intersect(fields, interest.fields):
+                    for when_ns in self.network.arrivals_ns(self, bus, topic.name):
+                        scheduler.at(when_ns, _Arrival(self, interest, sample))
 
     def subscribe(self, topic: Topic, post: Post, **fields: str | int) -> None:
-        self.subscriptions.append(_Interest(self, topic, {k: str(v) for k, v in fields.items()}, post))
+        interest = _Interest(self, topic, topic.every(fields), post)
+        self.subscriptions.setdefault(topic.name, []).append(interest)
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
-        self.queryables.append(_Interest(self, topic, {k: str(v) for k, v in fields.items()}, post))
+        if topic.request is None:
+            raise TypeError(f"topic {topic.name} is not a queryable")
+        interest = _Interest(self, topic, topic.every(fields), post)
+        self.queryables.setdefault(topic.name, []).append(interest)
 
     def ask(
         self,
@@ -224,42 +182,43 @@ class MemoryBus:
         timeout_s: float = 2.0,
         **fields: str | int,
     ) -> None:
-        assert topic.request is not None
-        wanted = {name: str(value) for name, value in fields.items()}
+        if topic.request is None:
+            raise TypeError(f"topic {topic.name} is not a queryable")
+        wanted = topic.every(fields)
+        scheduler = self.network.scheduler
+        asking = _Asking(self, topic, wanted, tag, post)
+        if self.closed:
+            scheduler.after(0, asking.finish)
+            return
+        self.counts["messages_out"] += 1
         interests = [
             interest
             for bus in self.network.buses
-            if not bus.closed and bus.namespace == self.namespace
-            for interest in bus.queryables
-            if interest.matches(topic, wanted)
-            and self.network.links.connected(self.node, bus.node, self.network.scheduler.clock.now_ns())
+            if bus.namespace == self.namespace and self.network.connected(self, bus)
+            for interest in bus.queryables.get(topic.name, ())
+            if _intersect(wanted, interest.fields)
         ]
-        asking = _Asking(self, topic, tag, post, pending=len(interests))
+        asking.waiting = set(range(len(interests)))
         if not interests:
-            self.network.scheduler.after(0, asking.finish)
+            scheduler.after(0, asking.finish)
             return
         payload = encode(request)
-        for interest in interests:
-            answerer = _MemoryAnswerer(asking, interest)
-            event = Asked(topic, wanted, decode(payload, topic.request), answerer)
-
-            def arrive(interest: _Interest = interest, event: Asked = event) -> None:
-                interest.post(event)
-
-            self.network.carry(self, interest.bus, topic.name, payload, arrive)
-        self.network.scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)
+        parsed = decode(payload, topic.request)
+        for index, interest in enumerate(interests):
+            for when_ns in self.network.arrivals_ns(self, interest.bus, topic.name):
+                answerer = _MemoryAnswerer(asking, interest, index)
+                event = Asked(topic, wanted, parsed, answerer)
+                scheduler.at(when_ns, _Delivery(self, interest.bus, topic.name, payload, interest.post, event))
+        scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)
 
     def declare_alive(self, peer: Peer) -> None:
         self.tokens.append(peer)
-        self.network.announce(peer, self, up=True)
+        self.network.compare_tokens()
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
-        self.watchers.append((role, post))
-        for bus in self.network.buses:
-            if bus is not self and not bus.closed:
-                for peer in bus.tokens:
-                    if role in ("*", peer.role):
-                        self.network.scheduler.after(1_000_000, lambda peer=peer: post(Appeared(peer)))  # type: ignore[misc]
+        watcher = _Watcher(self, role, post)
+        self.watchers.append(watcher)
+        watcher.compare()
 
     def watch_links(self, post: Post) -> None:
         self.link_watchers.append(post)
@@ -269,46 +228,126 @@ class MemoryBus:
         if self.closed:
             return
         self.closed = True
-        for peer in self.tokens:
-            self.network.announce(peer, self, up=False)
         self.network.buses.remove(self)
+        self.network.compare_tokens()
+
+    def later(self, delay_ns: int, post: Post, event: Event) -> None:
+        """Post an event unless we are closed by then."""
+        self.network.scheduler.after(delay_ns, lambda: None if self.closed else post(event))
+
+    def traced(self, source: MemoryBus, what: str, payload: bytes) -> bool:
+        """Note a delivery; False if we are gone."""
+        if self.closed:
+            return False
+        trace = self.network.trace
+        if trace is not None:
+            trace(self.network.scheduler.clock.now_ns(), source.node, self.node, what, payload)
+        return True
 
 
 @dataclass(eq=False)
+class _Watcher:
+    """Somebody who wants to know which tokens are up, the own process's aside."""
+
+    bus: MemoryBus
+    role: str
+    post: Post
+    visible: list[Peer] = field(default_factory=list)
+
+    def compare(self) -> None:
+        bus = self.bus
+        now = [
+            peer
+            for other in bus.network.buses
+            if other is not bus and other.namespace == bus.namespace
+            for peer in other.tokens
+            if self.role in ("*", peer.role) and bus.network.connected(other, bus)
+        ]
+        for peer in self.visible:
+            if peer not in now:
+                bus.later(TOKEN_NS, self.post, Disappeared(peer))
+        for peer in now:
+            if peer not in self.visible:
+                bus.later(TOKEN_NS, self.post, Appeared(peer))
+        self.visible = now
+
+
+class _Sample:
+    """One put, parsed when the first subscription is reached."""
+
+    __slots__ = ("_heard", "_parsed", "fields", "payload", "topic")
+
+    def __init__(self, topic: Topic, fields: dict[str, str], payload: bytes) -> None:
+        self.topic = topic
+        self.fields = fields
+        self.payload = payload
+        self._heard: Heard | None = None
+        self._parsed = False
+
+    def heard(self) -> Heard | None:
+        """The event; None if the payload does not parse."""
+        if not self._parsed:
+            self._parsed = True
+            try:
+                self._heard = Heard(self.topic, self.fields, decode(self.payload, self.topic.message))
+            except ProtocolError:
+                self._heard = None
+        return self._heard
+
+
+@dataclass(eq=False, slots=True)
 class _Arrival:
     """A sample reaching a subscription: parsed at the door, as on the real bus."""
 
-    bus: MemoryBus
+    source: MemoryBus
     interest: _Interest
-    topic: Topic
-    fields: Mapping[str, str]
-    payload: bytes
+    sample: _Sample
 
     def __call__(self) -> None:
-        self.bus.counts["messages_in"] += 1
-        try:
-            message = decode(self.payload, self.topic.message)
-        except ProtocolError:
-            self.bus.counts["payloads_dropped"] += 1
+        bus = self.interest.bus
+        if not bus.traced(self.source, self.sample.topic.name, self.sample.payload):
             return
-        self.interest.post(Heard(self.topic, self.fields, message))
+        bus.counts["messages_in"] += 1
+        heard = self.sample.heard()
+        if heard is None:
+            bus.counts["payloads_dropped"] += 1
+        else:
+            self.interest.post(heard)
+
+
+@dataclass(eq=False, slots=True)
+class _Delivery:
+    """A query reaching a queryable."""
+
+    source: MemoryBus
+    to: MemoryBus
+    what: str
+    payload: bytes
+    post: Post
+    event: Event
+
+    def __call__(self) -> None:
+        if self.to.traced(self.source, self.what, self.payload):
+            self.to.counts["messages_in"] += 1
+            self.post(self.event)
 
 
 @dataclass(eq=False)
 class _Asking:
-    """One query under way."""
+    """One query under way. `waiting` are the queryables that have not ended yet."""
 
     bus: MemoryBus
     topic: Topic
+    wanted: dict[str, str]
     tag: str
     post: Post
-    pending: int
+    waiting: set[int] = field(default_factory=set)
     replies: int = 0
     failure: str | None = None
     over: bool = False
 
     def finish(self) -> None:
-        if not self.over and not self.bus.closed:
+        if not self.over:
             self.over = True
             self.post(AskEnded(self.tag, self.topic, self.replies, self.failure))
 
@@ -322,26 +361,36 @@ class _Asking:
 class _MemoryAnswerer:
     asking: _Asking
     interest: _Interest
+    index: int
     ended: bool = False
+    last_arrival_ns: int = 0
 
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
-        asking = self.asking
+        if self.ended:
+            raise RuntimeError("answered after the end")
+        asking, bus = self.asking, self.interest.bus
+        concrete = {name: chunk for name, chunk in self.interest.fields.items() if chunk != "*"}
+        named = asking.topic.one({**concrete, **fields})
+        if bus.closed or not _intersect(named, asking.wanted):
+            return
+        bus.counts["messages_out"] += 1
         payload = encode(message)
-        named = {**self.interest.fields, **{name: str(value) for name, value in fields.items()}}
+        reply = Replied(asking.tag, asking.topic, named, decode(payload, asking.topic.message))
 
         def arrive() -> None:
             if not asking.over:
+                asking.bus.counts["messages_in"] += 1
                 asking.replies += 1
-                reply = decode(payload, asking.topic.message)
-                asking.post(Replied(asking.tag, asking.topic, named, reply))
+                asking.post(reply)
 
-        self._carry(payload, arrive)
+        self._send(payload, arrive)
 
     def refuse(self, reason: str) -> None:
         def arrive() -> None:
             self.asking.failure = reason
 
-        self._carry(reason.encode(), arrive)
+        if not self.ended:
+            self._send(reason.encode(), arrive)
 
     def end(self) -> None:
         if self.ended:
@@ -349,27 +398,22 @@ class _MemoryAnswerer:
         self.ended = True
 
         def arrive() -> None:
-            self.asking.pending -= 1
-            if self.asking.pending == 0:
+            self.asking.waiting.discard(self.index)
+            if not self.asking.waiting:
                 self.asking.finish()
 
-        self._carry(b"", arrive)
+        self._send(b"", arrive)
 
-    def _carry(self, payload: bytes, arrive: Callable[[], None]) -> None:
-        asking = self.asking
-        asking.bus.network.carry(self.interest.bus, asking.bus, asking.topic.name, payload, arrive)
+    def _send(self, payload: bytes, arrive: Callable[[], None]) -> None:
+        """What answers one query stays in order; it may be lost or repeated."""
+        source, to, what = self.interest.bus, self.asking.bus, self.asking.topic.name
+        if source.closed:
+            return
 
+        def deliver() -> None:
+            if to.traced(source, what, payload):
+                arrive()
 
-class InlineWorker:
-    """A `Worker` whose jobs run at once and are done after the time that they are taken to cost."""
-
-    def __init__(self, scheduler: Scheduler) -> None:
-        self._scheduler = scheduler
-        self._closed = False
-
-    def submit(self, tag: str, job: Callable[[], object], post: Post, model_ns: int = 0) -> None:
-        done = WorkDone(tag, job(), model_ns)
-        self._scheduler.after(model_ns, lambda: None if self._closed else post(done))
-
-    def close(self) -> None:
-        self._closed = True
+        for arrival_ns in source.network.arrivals_ns(source, to, what):
+            self.last_arrival_ns = max(self.last_arrival_ns, arrival_ns)
+            source.network.scheduler.at(self.last_arrival_ns, deliver)

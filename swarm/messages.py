@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import enum
 import math
+import re
 import sys
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgpack
 import msgspec
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from swarm.errors import ProtocolError
 from swarm.grid import STEP_COL, STEP_ROW, TILE_CELLS
+from swarm.stats import TOP_BUCKET, ZERO_BUCKET
 
 WIRE_VERSION = 1
 MAX_PAYLOAD_BYTES = 8 << 20
@@ -28,7 +30,12 @@ COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 assert sys.byteorder == "little", "columns travel as little-endian bytes"
 
 M = TypeVar("M", bound="Message")
-_ID_LIMIT = 64
+Natural = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+"""A count, a time or a sequence number: leaves room to add to it in 64 bits."""
+Cell = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 32)]
+"""A cell, row or column as others name it. The message cannot know the grid: it may lie outside."""
+
+_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema"):
@@ -58,8 +65,13 @@ def _check_column(name: str, data: bytes, width: int, count: int) -> None:
 
 
 def _check_id(name: str, value: str) -> None:
-    if not 0 < len(value) <= _ID_LIMIT or not all(c.isalnum() or c in "_.-" for c in value):
-        raise ValueError(f"{name} {value[:80]!r} is not 1 to {_ID_LIMIT} of letters, digits, '_', '.', '-'")
+    if _ID.fullmatch(value) is None:
+        raise ValueError(f"{name} {value[:80]!r} is not 1 to 64 of letters, digits, '_', '.', '-'")
+
+
+def _check_directions(directions: bytes) -> None:
+    if directions and max(directions) > 7:
+        raise ValueError(f"direction code {max(directions)} is not in 0..7")
 
 
 def _check_finite(name: str, *values: float) -> None:
@@ -78,13 +90,13 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=_schema("run")):
     run_id: str
     role: str
     id: str
-    incarnation: int
+    incarnation: Natural
     scenario: str
     terrain: str
-    rows: int
-    cols: int
+    rows: Natural
+    cols: Natural
     resolution_m: float
-    started_ns: int
+    started_ns: Natural
 
 
 class Nothing(Message, frozen=True, kw_only=True, tag=_schema("nothing")):
@@ -114,9 +126,9 @@ class MarkSet(Message, frozen=True, kw_only=True, tag=_schema("marks")):
 
     author: str
     group: str
-    tile: int
-    epoch: int
-    seq: int
+    tile: Natural
+    epoch: Natural
+    seq: Natural
     cells: bytes
     kinds: bytes
     paces: bytes
@@ -124,8 +136,7 @@ class MarkSet(Message, frozen=True, kw_only=True, tag=_schema("marks")):
 
     def __post_init__(self) -> None:
         _check_id("author", self.author)
-        if self.tile < 0 or not 0 <= self.epoch < 1 << 62 or not 0 <= self.seq < 1 << 62:
-            raise ValueError(f"tile {self.tile}, epoch {self.epoch}, seq {self.seq}: expected 0 <= n < 2**62")
+        _check_id("group", self.group)
         count = len(self.kinds)
         _check_column("cells", self.cells, 2, count)
         _check_column("paces", self.paces, 4, count)
@@ -168,7 +179,7 @@ class MarksRequest(Message, frozen=True, kw_only=True, tag=_schema("marks-reques
     """Asks authors and the keeper for sets: of these authors and tiles, or of all where a list is empty."""
 
     authors: list[str] = []
-    tiles: list[int] = []
+    tiles: list[Natural] = []
 
 
 # --- vehicles -----------------------------------------------------------------------------------------------
@@ -204,9 +215,9 @@ class Fleet(Message, frozen=True, kw_only=True, tag=_schema("fleet")):
 
     author: str
     group: str
-    region: int
-    seq: int
-    stamp_ns: int
+    region: Natural
+    seq: Natural
+    stamp_ns: Natural
     ids: list[str]
     target_ids: list[str]
     cells: bytes
@@ -218,6 +229,7 @@ class Fleet(Message, frozen=True, kw_only=True, tag=_schema("fleet")):
 
     def __post_init__(self) -> None:
         _check_id("author", self.author)
+        _check_id("group", self.group)
         for id in self.ids:
             _check_id("vehicle", id)
         for id in self.target_ids:
@@ -240,8 +252,11 @@ class Want(msgspec.Struct, frozen=True, kw_only=True):
     """A cell that a vehicle wants to enter. The lower (ticket, agent, vehicle) goes first."""
 
     vehicle: str
-    cell: int
-    ticket: int
+    cell: Cell
+    ticket: Natural
+
+    def __post_init__(self) -> None:
+        _check_id("vehicle", self.vehicle)
 
 
 class Claims(Message, frozen=True, kw_only=True, tag=_schema("claims")):
@@ -252,15 +267,17 @@ class Claims(Message, frozen=True, kw_only=True, tag=_schema("claims")):
     """
 
     agent: str
-    incarnation: int
-    seq: int
-    clock: int
-    holds: dict[str, list[int]]
+    incarnation: Natural
+    seq: Natural
+    clock: Natural
+    holds: dict[str, list[Cell]]
     wants: list[Want]
-    seen: dict[str, tuple[int, int]]
+    seen: dict[str, tuple[Natural, Natural]]
 
     def __post_init__(self) -> None:
         _check_id("agent", self.agent)
+        for vehicle in self.holds:
+            _check_id("vehicle", vehicle)
         if any(not cells for cells in self.holds.values()):
             raise ValueError("a vehicle holds at least the cell that it stands on")
 
@@ -270,10 +287,16 @@ class Followed(Message, frozen=True, kw_only=True, tag=_schema("followed")):
 
     vehicle: str
     target: str
-    start: int
+    start: Cell
     directions: bytes
     cost_s: float
     lower_bound_s: float
+
+    def __post_init__(self) -> None:
+        _check_id("vehicle", self.vehicle)
+        _check_id("target", self.target)
+        _check_directions(self.directions)
+        _check_finite("cost_s", self.cost_s, self.lower_bound_s)
 
 
 # --- targets and routes -------------------------------------------------------------------------------------
@@ -284,14 +307,14 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=_schema("pose")):
     was put somewhere else, as after a capture."""
 
     target: str
-    incarnation: int
-    seq: int
-    stamp_ns: int
-    cell: int
+    incarnation: Natural
+    seq: Natural
+    stamp_ns: Natural
+    cell: Cell
     x_m: float
     y_m: float
-    captures: int = 0
-    jumps: int = 0
+    captures: Natural = 0
+    jumps: Natural = 0
 
     def __post_init__(self) -> None:
         _check_id("target", self.target)
@@ -315,20 +338,18 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=_schema("route-reques
     force      the route ran out: the planner's range is forced to cover these cells
     """
 
-    cells: list[int] = []
+    cells: list[Cell] = []
     vehicles: list[str] = []
-    max_cells: int = 0
+    max_cells: Natural = 0
     force: bool = False
-    row: int | None = None
-    col: int | None = None
+    row: Cell | None = None
+    col: Cell | None = None
 
     def __post_init__(self) -> None:
         if len(self.cells) > 100_000:
             raise ValueError(f"{len(self.cells)} cells in one request, at most 100000")
         if self.vehicles and len(self.vehicles) != len(self.cells):
             raise ValueError(f"{len(self.vehicles)} vehicles for {len(self.cells)} cells")
-        if self.max_cells < 0:
-            raise ValueError(f"max_cells is {self.max_cells}, expected 0 or more")
         if (self.row is None) != (self.col is None):
             raise ValueError("give both row and col, or neither")
 
@@ -342,12 +363,17 @@ class Route(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     status: RouteStatus
-    start: int
+    start: Cell
     directions: bytes = b""
     cost_s: float = math.inf
     lower_bound_s: float = 0.0
     length_m: float = 0.0
     remaining_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_directions(self.directions)
+        if math.isnan(self.cost_s + self.lower_bound_s + self.length_m + self.remaining_s):
+            raise ValueError("a cost or length of a route is not a number")
 
     @property
     def gap(self) -> float:
@@ -362,12 +388,12 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=_schema("route")):
     exact growth, `incarnation` is the planner's."""
 
     target: str
-    incarnation: int
-    target_cell: int | None
-    map_version: int
+    incarnation: Natural
+    target_cell: Cell | None
+    map_version: Natural
     tree_age_ms: float
-    rows: int
-    cols: int
+    rows: Natural
+    cols: Natural
     routes: list[Route]
 
 
@@ -376,18 +402,18 @@ class PushedRoute(Message, frozen=True, kw_only=True, tag=_schema("pushed-route"
 
     vehicle: str
     target: str
-    incarnation: int
-    target_cell: int
-    map_version: int
+    incarnation: Natural
+    target_cell: Cell
+    map_version: Natural
     route: Route
 
 
 class CostRequest(Message, frozen=True, kw_only=True, tag=_schema("cost-request")):
     """Asks what it costs to reach the planner's target from each of these cells."""
 
-    cells: list[int] = []
-    row: int | None = None
-    col: int | None = None
+    cells: list[Cell] = []
+    row: Cell | None = None
+    col: Cell | None = None
 
     def __post_init__(self) -> None:
         if len(self.cells) > 100_000:
@@ -400,11 +426,16 @@ class CostReply(Message, frozen=True, kw_only=True, tag=_schema("cost")):
     """cost_to_go_s  float32 per asked cell, inf where there is no way or the cell is outside."""
 
     target: str
-    incarnation: int
-    target_cell: int | None
-    map_version: int
+    incarnation: Natural
+    target_cell: Cell | None
+    map_version: Natural
     tree_age_ms: float
     cost_to_go_s: bytes
+
+    def __post_init__(self) -> None:
+        _check_id("target", self.target)
+        if len(self.cost_to_go_s) % 4 or np.isnan(column(self.cost_to_go_s, "<f4")).any():
+            raise ValueError("cost_to_go_s is not a column of float32 without NaN")
 
 
 class PlannerStatus(Message, frozen=True, kw_only=True, tag=_schema("planner-status")):
@@ -412,21 +443,26 @@ class PlannerStatus(Message, frozen=True, kw_only=True, tag=_schema("planner-sta
     cost over optimum, measured at the last exact growth over the vehicles that follow (None before)."""
 
     target: str
-    incarnation: int
-    stamp_ns: int
+    incarnation: Natural
+    stamp_ns: Natural
     strategy: str
-    target_cell: int | None
-    map_version: int
+    target_cell: Cell | None
+    map_version: Natural
     tree_age_ms: float
-    window: list[int]
-    growths: int
-    window_growths: int
+    window: list[Cell]
+    growths: Natural
+    window_growths: Natural
     growth_ms: float
-    routes_served: int
-    following: int
+    routes_served: Natural
+    following: Natural
     gap_mean: float | None = None
     gap_p95: float | None = None
     gap_max: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_id("target", self.target)
+        if len(self.window) not in (0, 4):
+            raise ValueError(f"window has {len(self.window)} numbers, expected [row0, col0, row1, col1]")
 
 
 # --- how processes are doing --------------------------------------------------------------------------------
@@ -437,11 +473,20 @@ class Stats(Message, frozen=True, kw_only=True, tag=_schema("stats")):
 
     role: str
     id: str
-    incarnation: int
-    stamp_ns: int
-    counts: dict[str, int]
+    incarnation: Natural
+    stamp_ns: Natural
+    counts: dict[str, Natural]
     gauges: dict[str, float]
-    histograms: dict[str, dict[int, int]]
+    histograms: dict[str, dict[int, Natural]]
+
+    def __post_init__(self) -> None:
+        _check_id("role", self.role)
+        _check_id("id", self.id)
+        _check_finite("a gauge", *self.gauges.values())
+        for name, buckets in self.histograms.items():
+            for bucket in buckets:
+                if not ZERO_BUCKET <= bucket <= TOP_BUCKET:
+                    raise ValueError(f"histogram {name[:80]} has a bucket {bucket}")
 
 
 class Note(Message, frozen=True, kw_only=True, tag=_schema("note")):
@@ -449,10 +494,14 @@ class Note(Message, frozen=True, kw_only=True, tag=_schema("note")):
 
     role: str
     id: str
-    stamp_ns: int
+    stamp_ns: Natural
     kind: str
     text: str
-    cell: int | None = None
+    cell: Cell | None = None
+
+    def __post_init__(self) -> None:
+        _check_id("role", self.role)
+        _check_id("id", self.id)
 
 
 # --- the door -----------------------------------------------------------------------------------------------

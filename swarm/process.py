@@ -130,10 +130,11 @@ class Process:
         self._inbox = inbox
         self._clock = clock
         self._tick_ns = int(NS_PER_S / tick_hz)
-        self._stopping = threading.Event()
+        self._stopping = False
 
     def stop(self) -> None:
-        self._stopping.set()
+        """From any thread, and from a signal handler: so no lock that the interrupted thread might hold."""
+        self._stopping = True
         self._inbox.wake()
 
     def stop_on_signals(self) -> None:
@@ -147,7 +148,7 @@ class Process:
         self._service.start(self._clock.now_ns())
         due_ns = self._clock.now_ns()
         try:
-            while not self._stopping.is_set():
+            while not self._stopping:
                 now_ns = self._clock.now_ns()
                 if now_ns >= due_ns:
                     missed = (now_ns - due_ns) // self._tick_ns

@@ -7,6 +7,10 @@ from collections.abc import Iterable, Mapping
 
 _BASE = 1.04
 _LOG_BASE = math.log(_BASE)
+ZERO_BUCKET = -20_000
+"""Below the bucket of the smallest float: what is not positive is kept here, as zero."""
+TOP_BUCKET = 18_000
+"""The largest bucket, about 1e306: beyond it a float would overflow."""
 
 
 class Histogram:
@@ -20,10 +24,10 @@ class Histogram:
         self.buckets: dict[int, int] = dict(buckets or {})
 
     def add(self, value: float, times: int = 1) -> None:
-        """Count a value; what is not positive and finite falls into the lowest bucket kept for zero."""
+        """Count a value: what is not positive as zero, what is not finite not at all."""
         if not math.isfinite(value):
             return
-        bucket = _ZERO if value <= 0 else round(math.log(value) / _LOG_BASE)
+        bucket = ZERO_BUCKET if value <= 0 else min(round(math.log(value) / _LOG_BASE), TOP_BUCKET)
         self.buckets[bucket] = self.buckets.get(bucket, 0) + times
 
     def merge(self, buckets: Mapping[int, int]) -> None:
@@ -51,14 +55,12 @@ class Histogram:
         total = self.count
         if total == 0:
             return None
-        return sum(_value(bucket) * count for bucket, count in self.buckets.items()) / total
-
-
-_ZERO = -10_000
+        # In order, so that the sum does not depend on the order of merging.
+        return math.fsum(_value(bucket) * count for bucket, count in sorted(self.buckets.items())) / total
 
 
 def _value(bucket: int) -> float:
-    return 0.0 if bucket == _ZERO else math.exp(bucket * _LOG_BASE)
+    return 0.0 if bucket == ZERO_BUCKET else math.exp(bucket * _LOG_BASE)
 
 
 def merged(parts: Iterable[Mapping[int, int]]) -> Histogram:
@@ -81,7 +83,11 @@ class Counters:
         self.counts[name] = self.counts.get(name, 0) + by
 
     def gauge(self, name: str, value: float) -> None:
-        self.gauges[name] = value
+        """Note the present value; what is not finite is no value."""
+        if math.isfinite(value):
+            self.gauges[name] = value
+        else:
+            self.gauges.pop(name, None)
 
     def observe(self, name: str, value: float) -> None:
         self.histograms.setdefault(name, Histogram()).add(value)

@@ -4,6 +4,7 @@ of this."""
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -58,40 +59,57 @@ class Topic:
     newest: bool = True
     priority: Priority = Priority.DATA
     buffer: int = 1024
+    fields: tuple[str, ...] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.key))
         object.__setattr__(self, "_pattern", re.compile(pattern))
+        object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
+
+    def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
+        """All fields as chunks of a key; those not given become `*`.
+
+        Raises TypeError on a field that the topic has not, ValueError on what is not one chunk.
+        """
+        named = {name: _chunk(fields[name]) if name in fields else "*" for name in self.fields}
+        if len(fields) > len(named) or any(name not in named for name in fields):
+            unknown = next(name for name in fields if name not in named)
+            raise TypeError(f"topic {self.name} has no field {unknown}; it has {', '.join(named)}")
+        return named
+
+    def one(self, fields: Mapping[str, str | int]) -> dict[str, str]:
+        """All fields of one value: every one must be given, and none may be a wildcard."""
+        named = self.every(fields)
+        for name, chunk in named.items():
+            if chunk == "*":
+                raise TypeError(f"topic {self.name} needs the field {name}")
+        return named
 
     def expression(self, namespace: str, **fields: str | int) -> str:
         """The key expression: fields that are not given become `*`."""
-        given = {name: fields.get(name, "*") for name in self.fields}
-        unknown = sorted(set(fields) - set(given))
-        if unknown:
-            raise TypeError(f"topic {self.name} has no field {unknown[0]}; it has {', '.join(given)}")
-        return f"{namespace}/{self.key.format(**given)}"
+        return f"{namespace}/{self.key.format(**self.every(fields))}"
 
     def keyed(self, namespace: str, **fields: str | int) -> str:
-        """The key of one value: every field must be given, and none may be a wildcard."""
-        missing = [name for name in self.fields if name not in fields]
-        if missing:
-            raise TypeError(f"topic {self.name} needs the field {missing[0]}")
-        key = self.expression(namespace, **fields)
-        if "*" in key or "$" in key:
-            raise ValueError(f"{key} is not the key of one value")
-        return key
+        """The key of one value."""
+        return f"{namespace}/{self.key.format(**self.one(fields))}"
 
     def parse(self, namespace: str, key: str) -> dict[str, str] | None:
         """The fields of a key, None of a key that is not this topic's."""
         if not key.startswith(namespace + "/"):
             return None
-        match = self._pattern.fullmatch(key[len(namespace) + 1 :])
+        match = self._pattern.fullmatch(key, len(namespace) + 1)
         return match.groupdict() if match else None
 
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return tuple(re.findall(r"{(\w+)}", self.key))
+
+_CHUNK = re.compile(r"[^/*$?#\s]+|\*")
+
+
+def _chunk(value: str | int) -> str:
+    chunk = str(value)
+    if _CHUNK.fullmatch(chunk) is None:
+        raise ValueError(f"{chunk!r} cannot be a part of a key: no '/', '*', '$', '?', '#' or blanks")
+    return chunk
 
 
 RUN = Topic(

@@ -40,6 +40,7 @@ _PRIORITIES = {
 _LOG_AGAIN_S = 60.0
 _QUERY_BUFFER = 4096
 _TOKEN_BUFFER = 65_536
+_CLOSE_S = 3.0
 
 
 def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
@@ -106,6 +107,8 @@ class ZenohBus:
         self._session = session
         self._namespace = namespace
         self._counts = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
+        self._counting = threading.Lock()
+        self._own_peers: list[Peer] = []
         self._entities: list[Any] = []
         self._threads: list[threading.Thread] = []
         self._logged_s: dict[str, float] = {}
@@ -133,7 +136,7 @@ class ZenohBus:
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         if self._closed:
             return
-        self._counts["messages_out"] += 1
+        self._count("messages_out")
         self._session.put(
             topic.keyed(self._namespace, **fields),
             encode(message),
@@ -143,7 +146,7 @@ class ZenohBus:
 
     def subscribe(self, topic: Topic, post: Post, **fields: str | int) -> None:
         def arrive(sample: zenoh.Sample) -> None:
-            self._counts["messages_in"] += 1
+            self._count("messages_in")
             key = str(sample.key_expr)
             try:
                 named = self._fields(topic, key)
@@ -165,7 +168,7 @@ class ZenohBus:
         concrete = {name: str(value) for name, value in fields.items()}
 
         def arrive(query: zenoh.Query) -> None:
-            self._counts["messages_in"] += 1
+            self._count("messages_in")
             key = str(query.key_expr)
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
             answerer = _ZenohAnswerer(self, topic, query, concrete, parameters.get("format") == "json")
@@ -180,7 +183,9 @@ class ZenohBus:
                 answerer.refuse(f"{topic.name}: {error}")
                 answerer.end()
                 return
-            post(Asked(topic, self._fields(topic, key), request, answerer))
+            # A tool may ask with `**`, which no template parses: then we were asked for all that we serve.
+            asked = topic.parse(self._namespace, key) or dict.fromkeys(topic.fields, "*") | concrete
+            post(Asked(topic, asked, request, answerer))
 
         queryable = self._session.declare_queryable(
             topic.expression(self._namespace, **fields), zenoh.handlers.FifoChannel(_QUERY_BUFFER)
@@ -214,7 +219,7 @@ class ZenohBus:
                 self._drop(key, error)
                 return
             replies += 1
-            self._counts["messages_in"] += 1
+            self._count("messages_in")
             post(Replied(tag, topic, named, message))
 
         def finish() -> None:
@@ -223,7 +228,7 @@ class ZenohBus:
         if self._closed:
             finish()
             return
-        self._counts["messages_out"] += 1
+        self._count("messages_out")
         self._session.get(
             topic.expression(self._namespace, **fields),
             zenoh.handlers.Callback(arrive, finish, indirect=False),
@@ -235,6 +240,7 @@ class ZenohBus:
         )
 
     def declare_alive(self, peer: Peer) -> None:
+        self._own_peers.append(peer)
         key = ALIVE_KEY.format(role=peer.role, id=peer.id, incarnation=peer.incarnation)
         self._entities.append(self._session.liveliness().declare_token(f"{self._namespace}/{key}"))
 
@@ -245,6 +251,8 @@ class ZenohBus:
             except ProtocolError as error:
                 self._drop(str(sample.key_expr), error)
                 return
+            if peer in self._own_peers:
+                return  # our own token falls with the link; that we are alive needs no telling
             post(Appeared(peer) if sample.kind == zenoh.SampleKind.PUT else Disappeared(peer))
 
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
@@ -263,14 +271,22 @@ class ZenohBus:
         self._read(listener, arrive, "links")
 
     def close(self) -> None:
+        """Leave the network, within seconds even if the router hangs and zenoh would wait for it."""
         if self._closed:
             return
         self._closed = True
+        closer = threading.Thread(target=self._undeclare, name="close", daemon=True)
+        closer.start()
+        closer.join(_CLOSE_S)
+        if closer.is_alive():
+            log.warning("the router does not answer: left without saying goodbye")
+
+    def _undeclare(self) -> None:
         for entity in reversed(self._entities):
             entity.undeclare()
-        self._session.close()  # type: ignore[no-untyped-call]
         for thread in self._threads:
             thread.join(timeout=2.0)
+        self._session.close()  # type: ignore[no-untyped-call]
 
     def _read(self, entity: Any, arrive: Callable[[Any], None], name: str) -> None:
         """Read an entity's channel on a thread of its own until it is undeclared."""
@@ -295,8 +311,13 @@ class ZenohBus:
             raise ProtocolError(f"{key} is not a key of topic {topic.name} ({topic.key})")
         return fields
 
+    def _count(self, name: str) -> None:
+        """Several of zenoh's threads count: adding one is not atomic."""
+        with self._counting:
+            self._counts[name] += 1
+
     def _drop(self, key: str, error: ProtocolError) -> None:
-        self._counts["payloads_dropped"] += 1
+        self._count("payloads_dropped")
         now_s = time.monotonic()
         if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
             if len(self._logged_s) > 10_000:  # a hostile sender may use a new key each time
@@ -326,14 +347,16 @@ class _ZenohAnswerer:
         if self._query is None:
             raise RuntimeError("answered after the end")
         key = self._topic.keyed(self._bus.namespace, **{**self._concrete, **fields})
-        self._bus._counts["messages_out"] += 1
+        if self._bus._closed or not self._query.key_expr.intersects(zenoh.KeyExpr(key)):
+            return
+        self._bus._count("messages_out")
         if self._as_json:
             self._query.reply(key, encode_readable(message), encoding=zenoh.Encoding.APPLICATION_JSON)
         else:
             self._query.reply(key, encode(message))
 
     def refuse(self, reason: str) -> None:
-        if self._query is not None:
+        if self._query is not None and not self._bus._closed:
             self._query.reply_err(reason.encode())
 
     def end(self) -> None:
