@@ -31,6 +31,8 @@ Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
 ]
 
+ClassName = Literal["unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow"]
+
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of the sections of a scenario."""
@@ -81,16 +83,19 @@ class CostConfig(Section, frozen=True, kw_only=True):
     """How terrain becomes pace. `flat_speed_m_per_s` is driven on level open ground, `road_speed_m_per_s` on roads.
 
     slope_rule     linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
-                   Tobler's hiking function
+                   Tobler's hiking function; energy is a wheeled vehicle of constant power
     max_slope_deg  steeper ground is lethal
+    classes        whether what covers the ground (water, forest, rock ...) counts
+    class_factor   pace of a class relative to open ground, instead of the built-in factors; inf is lethal
     """
 
     flat_speed_m_per_s: Positive = 10.0
     road_speed_m_per_s: Positive = 20.0
-    slope_rule: Literal["linear", "quadratic", "tobler"] = "quadratic"
+    slope_rule: Literal["linear", "quadratic", "tobler", "energy"] = "quadratic"
     steep_factor: Annotated[float, Meta(ge=1)] = 6.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
     classes: bool = True
+    class_factor: dict[ClassName, Positive] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0
     zones: tuple[ZoneConfig, ...] = ()
 

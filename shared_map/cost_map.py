@@ -1,0 +1,160 @@
+"""The composite cost map of one process: prior ground, marks over it, inflation around what is lethal.
+
+Marks replace the ground cell by cell; then a cell is lethal where a vehicle in its middle would touch lethal
+ground.
+After any sequence of `apply`, the composite equals one made from scratch of the last statement about each cell.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.layers import LETHAL, Floats, inflate, inflation_halves
+from shared_map.terrain import Terrain
+from swarm.errors import OutsideGridError
+from swarm.grid import TILE_CELLS, Window
+from swarm.messages import MarkKind
+
+MAX_WINDOWS = 32
+"""Dirty windows are merged into fewer beyond this."""
+
+
+class CostSnapshot(NamedTuple):
+    """A copy that another thread may keep."""
+
+    pace_s_per_m: Floats
+    version: int
+
+
+class CostMap:
+    """Composite pace of a terrain.
+
+    pace_s_per_m    float32 (rows, cols)  what may be driven and how fast; changed in place
+    ground_s_per_m  float32 (rows, cols)  the same without inflation: compare what a sensor sees with this
+    version         grows by one with every `apply` that changed the ground
+    """
+
+    def __init__(self, terrain: Terrain) -> None:
+        self.terrain = terrain
+        self.grid = terrain.grid
+        self.version = 0
+        self.pace_s_per_m: Floats = np.array(terrain.pace_s_per_m, np.float32)
+        self._halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
+        self.ground_s_per_m: Floats = self.pace_s_per_m
+        if self._halves:
+            self.ground_s_per_m = np.array(terrain.ground_s_per_m, np.float32)
+        self._prior = np.asarray(terrain.ground_s_per_m).reshape(-1)
+        self._dirty: list[Window] = []
+
+    def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
+        """Make these the current statements about these cells (flat indices). Of a repeated cell the last counts.
+
+        PACE sets the pace, also where the prior is lethal; LETHAL forbids; CLEAR gives back the prior."""
+        if len(cells) == 0:
+            return
+        where = np.asarray(cells, np.int64)
+        if int(where.min()) < 0 or int(where.max()) >= self.grid.cells:
+            raise OutsideGridError(f"a mark is on cell {int(where.max())} of {self.grid.rows} x {self.grid.cols}")
+        where, values = self._last_of_each(where, np.asarray(kinds), np.asarray(paces, np.float32))
+        ground = self.ground_s_per_m.reshape(-1)
+        changed = ground[where] != values
+        if not changed.any():
+            return
+        where, values = where[changed], values[changed]
+        lethality = np.isinf(ground[where]) != np.isinf(values)
+        ground[where] = values
+        self.version += 1
+        if not self._halves:
+            self._note_dirty(where)
+            return
+        self._compose(where, where[lethality])
+
+    def take_dirty(self) -> list[Window]:
+        """Windows that cover every cell whose pace changed since the last call; they do not touch each other."""
+        windows, self._dirty = self._dirty, []
+        return windows
+
+    def snapshot(self) -> CostSnapshot:
+        return CostSnapshot(self.pace_s_per_m.copy(), self.version)
+
+    def _last_of_each(
+        self, where: NDArray[np.int64], kinds: NDArray[np.uint8], paces: Floats
+    ) -> tuple[NDArray[np.int64], Floats]:
+        values = np.where(kinds == MarkKind.PACE, paces, LETHAL)
+        clear = kinds == MarkKind.CLEAR
+        values[clear] = self._prior[where[clear]]
+        if len(where) > 1:
+            unique, first_from_behind = np.unique(where[::-1], return_index=True)
+            if len(unique) < len(where):
+                return unique, values[::-1][first_from_behind]
+        return where, values
+
+    def _compose(self, where: NDArray[np.int64], flipped: NDArray[np.int64]) -> None:
+        """Inflation again around cells whose lethality flipped; elsewhere only the cell itself can have changed."""
+        pace, ground = self.pace_s_per_m, self.ground_s_per_m
+        flat = pace.reshape(-1)
+        before = flat[where]
+        flat[where] = np.where(np.isinf(before), before, ground.reshape(-1)[where])
+        dirty = where[flat[where] != before]
+        reach = len(self._halves) - 1
+        for window in cluster(flipped, self.grid.cols):
+            inner = self._grown(window, reach)
+            outer = self._grown(inner, reach)
+            fresh = inflate(ground[outer.row0 : outer.row1, outer.col0 : outer.col1], self._halves)
+            row0, col0 = inner.row0 - outer.row0, inner.col0 - outer.col0
+            fresh = fresh[row0 : row0 + inner.row1 - inner.row0, col0 : col0 + inner.col1 - inner.col0]
+            view = pace[inner.row0 : inner.row1, inner.col0 : inner.col1]
+            rows, cols = np.nonzero(view != fresh)
+            view[...] = fresh
+            dirty = np.concatenate([dirty, (rows + inner.row0) * self.grid.cols + cols + inner.col0])
+        if len(dirty):
+            self._note_dirty(dirty)
+
+    def _grown(self, window: Window, by: int) -> Window:
+        return Window(
+            max(window.row0 - by, 0),
+            max(window.col0 - by, 0),
+            min(window.row1 + by, self.grid.rows),
+            min(window.col1 + by, self.grid.cols),
+        )
+
+    def _note_dirty(self, where: NDArray[np.int64]) -> None:
+        self._dirty = merged([*self._dirty, *cluster(where, self.grid.cols)])
+
+
+def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
+    """Few windows that cover all cells: the bounding box per tile, boxes that touch merged."""
+    if len(cells) == 0:
+        return []
+    rows, columns = np.divmod(cells, cols)
+    tiles = (rows // TILE_CELLS) * (cols // TILE_CELLS + 1) + columns // TILE_CELLS
+    order = np.argsort(tiles, kind="stable")
+    starts = np.flatnonzero(np.diff(tiles[order], prepend=-1))
+    rows, columns = rows[order], columns[order]
+    tops, bottoms = np.minimum.reduceat(rows, starts), np.maximum.reduceat(rows, starts)
+    lefts, rights = np.minimum.reduceat(columns, starts), np.maximum.reduceat(columns, starts)
+    boxes = zip(tops.tolist(), lefts.tolist(), bottoms.tolist(), rights.tolist(), strict=True)
+    return merged([Window(top, left, bottom + 1, right + 1) for top, left, bottom, right in boxes])
+
+
+def merged(windows: list[Window]) -> list[Window]:
+    """Windows that touch made one, until none touch; one window for all beyond MAX_WINDOWS."""
+    apart: list[Window] = []
+    for window in windows:
+        if window.empty:
+            continue
+        while True:
+            touching = next((n for n, other in enumerate(apart) if window.touches(other)), None)
+            if touching is None:
+                break
+            window = window.union(apart.pop(touching))
+        apart.append(window)
+    if len(apart) > MAX_WINDOWS:
+        whole = apart[0]
+        for window in apart[1:]:
+            whole = whole.union(window)
+        return [whole]
+    return apart

@@ -1,0 +1,146 @@
+"""Seeded landscapes: heights, what covers them, and a photograph of it.
+
+Only additions, products and square roots of seeded numbers, so that a seed gives the same landscape everywhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.layers import Bools, Bytes, Floats, TerrainClass, gradient
+
+TINT = np.array(
+    [
+        [122, 118, 100],  # UNKNOWN
+        [42, 74, 98],  # WATER
+        [58, 84, 46],  # FOREST
+        [138, 130, 120],  # ROCK
+        [126, 142, 78],  # GRASS
+        [156, 134, 98],  # SOIL
+        [186, 178, 164],  # ROAD
+        [164, 122, 108],  # BUILT
+        [236, 240, 244],  # SNOW
+    ],
+    np.uint8,
+)
+"""Natural colours of the classes, as in a photograph."""
+
+
+def fractal(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
+    """Smooth noise of many scales, roughly -1..1, the broadest hills `coarsest` cells wide. Ridged has sharp crests
+    and broad valleys."""
+    field = np.zeros((rows, cols), np.float32)
+    amplitude, scale, total = 1.0, float(coarsest), 0.0
+    while scale >= 2.0 and amplitude > 0.01:
+        octave = _lattice_noise(rng, rows, cols, scale)
+        if ridged:
+            np.abs(octave, out=octave)
+            octave *= np.float32(-2)
+            octave += np.float32(1)
+        octave *= np.float32(amplitude)
+        field += octave
+        total += amplitude
+        amplitude *= 0.5
+        scale /= 2.0
+    field /= np.float32(max(total, 1.0))
+    return field
+
+
+def _lattice_noise(rng: np.random.Generator, rows: int, cols: int, scale: float) -> Floats:
+    high, wide = int(rows / scale) + 3, int(cols / scale) + 3
+    lattice = rng.uniform(-1.0, 1.0, (high, wide)).astype(np.float32)
+    offset = rng.uniform(0.0, 1.0, 2)
+    return _along(_along(lattice, rows, scale, float(offset[0])).T, cols, scale, float(offset[1])).T
+
+
+def _along(lattice: Floats, count: int, scale: float, offset: float) -> Floats:
+    """Smoothstep interpolation of rows."""
+    at = np.arange(count) / scale + offset
+    low = at.astype(np.intp)
+    part = (at - low).astype(np.float32)
+    part = (part * part * (np.float32(3) - np.float32(2) * part))[:, None]
+    between: Floats = lattice[low] * (np.float32(1) - part) + lattice[low + 1] * part
+    return between
+
+
+def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Floats:
+    """Mountains with sharp crests, broad valleys and plains, `relief_m` from lowest to highest."""
+    rng = np.random.default_rng([seed, 1])
+    broad = max(min(rows, cols) / 2.5, 8.0)
+    ridges = fractal(rng, rows, cols, broad, ridged=True)
+    where = fractal(rng, rows, cols, broad * 1.5)
+    hills = fractal(rng, rows, cols, broad / 2)
+    where -= np.float32(where.min())
+    where /= np.float32(max(float(where.max()), 1e-6))
+    height = ridges * where * where + hills * np.float32(0.15)
+    height -= np.float32(height.min())
+    height *= np.float32(relief_m / max(float(height.max()), 1e-6))
+    return height
+
+
+def cover(elevation_m: Floats, resolution_m: float, seed: int, lakes: bool = True) -> Bytes:
+    """Plausible classes where nobody has looked: lakes in the lowest hollows, rock on what is steep, forest on
+    slopes, grass between, bare soil here and there."""
+    rows, cols = elevation_m.shape
+    rng = np.random.default_rng([seed, 2])
+    east, north = gradient(elevation_m, resolution_m)
+    grade = np.sqrt(east * east + north * north)
+    patches = fractal(rng, rows, cols, max(min(rows, cols) / 12, 4.0))
+    known = ~np.isnan(elevation_m)
+    steep = np.quantile(grade[known], 0.985) if known.any() else 1.0
+    gentle = np.quantile(grade[known], 0.30) if known.any() else 0.0
+    classes = np.full((rows, cols), TerrainClass.GRASS, np.uint8)
+    classes[(grade > gentle) & (patches > -0.12)] = TerrainClass.FOREST
+    classes[(grade <= gentle) & (patches < -0.35)] = TerrainClass.SOIL
+    classes[grade > max(float(steep), 0.3)] = TerrainClass.ROCK
+    if lakes:
+        classes[flat_water(elevation_m)] = TerrainClass.WATER
+    classes[~known] = TerrainClass.UNKNOWN
+    return classes
+
+
+def flat_water(elevation_m: Floats, at_least: int = 4) -> Bools:
+    """Level patches: cells exactly as high as all eight neighbours, in patches of `at_least`, and their shores.
+
+    Elevation models are levelled on lakes; real ground is never as flat as that. A plain (more than a third of the
+    terrain) is no lake."""
+    from scipy import ndimage
+
+    level = ndimage.maximum_filter(elevation_m, 3) == ndimage.minimum_filter(elevation_m, 3)
+    labels, count = ndimage.label(level, structure=np.ones((3, 3), np.int8))
+    if count == 0 or level.mean() > 1 / 3:
+        return np.zeros(elevation_m.shape, np.bool_)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    lakes: NDArray[np.bool_] = sizes[labels] >= at_least
+    return np.asarray(ndimage.binary_dilation(lakes, np.ones((3, 3), np.bool_)), np.bool_)
+
+
+def hillshade(elevation_m: Floats, resolution_m: float, exaggeration: float = 1.0) -> Floats:
+    """Light from the north-west, 45 degrees high: 0 dark to 1 bright; level ground is 0.707."""
+    east, north = gradient(np.nan_to_num(elevation_m), resolution_m)
+    east *= np.float32(exaggeration)
+    north *= np.float32(exaggeration)
+    light = (east - north) * np.float32(0.5) + np.float32(0.70710678)
+    light /= np.sqrt(east * east + north * north + np.float32(1))
+    return np.clip(light, 0, 1, out=light)
+
+
+def paint_photo(elevation_m: Floats, classes: Bytes, resolution_m: float, seed: int) -> Bytes:
+    """A photograph of what covers the ground, lit from the north-west, paler in the heights."""
+    rows, cols = elevation_m.shape
+    rng = np.random.default_rng([seed, 3])
+    colour = TINT[np.minimum(classes, len(TINT) - 1)].astype(np.float32)
+    texture = fractal(rng, rows, cols, 16.0)
+    water = classes == TerrainClass.WATER
+    low, high = float(np.nanmin(elevation_m)), float(np.nanmax(elevation_m))
+    height = np.nan_to_num((elevation_m - np.float32(low)) / np.float32(max(high - low, 1e-3)))
+    pale = np.where(water, np.float32(0), height * np.float32(0.25))[..., None]
+    colour += (np.float32(190) - colour) * pale
+    light = hillshade(elevation_m, resolution_m, 1.5) / np.float32(0.70710678)
+    light = np.float32(0.35) + np.float32(0.65) * light + texture * np.float32(0.18)
+    light = np.where(water, np.float32(1) + texture * np.float32(0.04), light)
+    colour *= light[..., None]
+    colour[np.isnan(elevation_m)] = 0
+    return np.clip(colour, 0, 255).astype(np.uint8)

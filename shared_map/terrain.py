@@ -1,0 +1,301 @@
+"""A terrain: elevation, photo, classes and prior pace on one metric grid; built once, prepared in a run's folder.
+
+Agents import this, so nothing slow is imported at the top: what only building needs is imported where it is used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.layers import (
+    Bytes,
+    Floats,
+    TerrainClass,
+    grade,
+    inflate,
+    inflation_halves,
+    paint_zones,
+    terrain_pace,
+)
+from swarm.config import CostConfig, Scenario
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+from swarm.role import RoleSetup
+
+FORMAT = 1
+"""Raised when what lies in a prepared folder, or how terrain is built, changes."""
+_META = "terrain.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain:
+    """What the map says before anybody has driven. Arrays are (rows, cols) and must not be written to.
+
+    elevation_m       float32  NaN where there is a void
+    photo             uint8    (rows, cols, 3)
+    pace_s_per_m      float32  the prior: the ground with inflation; inf is lethal
+    ground_s_per_m    float32  the ground itself, as a sensor sees it; the same array if the vehicle fits its cell
+    classes           uint8    TerrainClass
+    digest            16 hex digits of grid, prior pace and cost rules
+    notes             sentences about where it came from and what was done to it
+    """
+
+    grid: GridSpec
+    elevation_m: Floats
+    photo: Bytes
+    pace_s_per_m: Floats
+    classes: Bytes
+    digest: str
+    ground_s_per_m: Floats
+    vehicle_radius_m: float = 0.0
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def lethal(self) -> NDArray[np.bool_]:
+        return np.isinf(self.pace_s_per_m)
+
+
+def build_terrain(scenario: Scenario) -> Terrain:
+    """The terrain of a scenario. Raises TerrainError with one sentence."""
+    from shared_map.sources import load_source
+
+    source = load_source(scenario.terrain, scenario.seed)
+    grid, classes = source.grid, source.classes
+    notes = list(source.notes)
+    steepness = grade(source.elevation_m, grid.resolution_m)
+    steepness[np.isnan(source.elevation_m)] = np.nan
+    cost = scenario.cost
+    if scenario.terrain.roads:
+        from shared_map.roads import lay_roads
+
+        laid = lay_roads(terrain_pace(steepness, classes, cost), scenario.terrain.roads, grid, cost, scenario.seed)
+        classes = np.where(laid, np.uint8(TerrainClass.ROAD), classes)
+        notes.append(f"{scenario.terrain.roads} roads laid between seeded places, {int(laid.sum())} cells")
+    ground = terrain_pace(steepness, classes, cost)
+    paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m))
+    photo = source.photo
+    if photo is None:
+        from shared_map.synthetic import paint_photo
+
+        photo = paint_photo(source.elevation_m, classes, grid.resolution_m, scenario.seed)
+        notes.append("photo painted from elevation and classes, as there is none")
+    return _finished(grid, source.elevation_m, photo, classes, ground, cost, tuple(notes))
+
+
+def _finished(
+    grid: GridSpec,
+    elevation_m: Floats,
+    photo: Bytes,
+    classes: Bytes,
+    ground: Floats,
+    cost: CostConfig,
+    notes: tuple[str, ...],
+) -> Terrain:
+    halves = inflation_halves(cost.vehicle_radius_m, grid.resolution_m)
+    pace = inflate(ground, halves) if halves else ground
+    if np.isinf(pace).all():
+        why = _why_lethal(elevation_m, ground, cost, grid)
+        raise TerrainError(f"every cell of the terrain is lethal, no vehicle could stand anywhere: {why}")
+    digest = _digest(grid, pace, cost)
+    return Terrain(
+        grid=grid,
+        elevation_m=elevation_m,
+        photo=photo,
+        pace_s_per_m=pace,
+        classes=classes,
+        digest=digest,
+        ground_s_per_m=ground,
+        vehicle_radius_m=cost.vehicle_radius_m,
+        notes=notes,
+    )
+
+
+def _why_lethal(elevation_m: Floats, ground: Floats, cost: CostConfig, grid: GridSpec) -> str:
+    if np.isnan(elevation_m).all():
+        return "it has no heights at all, only voids"
+    if not np.isinf(ground).all():
+        return f"cost.vehicle_radius_m = {cost.vehicle_radius_m:g} is too wide for every gap in it"
+    steep = grade(elevation_m, grid.resolution_m)
+    steepest = float(np.degrees(np.arctan(np.nanmedian(steep))))
+    return (
+        f"half of it is steeper than {steepest:.1f} degrees, cost.max_slope_deg is {cost.max_slope_deg:g}; "
+        "check it, the zones, the classes and the units of the heights"
+    )
+
+
+def _digest(grid: GridSpec, pace: Floats, cost: CostConfig) -> str:
+    digest = hashlib.blake2b(digest_size=8)
+    digest.update(f"{FORMAT} {grid}".encode())
+    digest.update(np.ascontiguousarray(pace).data)
+    digest.update(msgspec.json.encode(cost, order="sorted"))
+    return digest.hexdigest()
+
+
+def terrain_of_pace(
+    pace_s_per_m: Floats,
+    resolution_m: float = 10.0,
+    elevation_m: Floats | None = None,
+    vehicle_radius_m: float = 0.0,
+) -> Terrain:
+    """A level terrain of given pace, for tests, benchmarks and maps that are no landscape."""
+    ground = np.array(pace_s_per_m, np.float32)
+    rows, cols = ground.shape
+    grid = GridSpec(rows, cols, resolution_m)
+    height = np.zeros((rows, cols), np.float32) if elevation_m is None else np.array(elevation_m, np.float32)
+    cost = CostConfig(vehicle_radius_m=vehicle_radius_m)
+    photo = np.full((rows, cols, 3), 128, np.uint8)
+    return _finished(grid, height, photo, np.zeros((rows, cols), np.uint8), ground, cost, ())
+
+
+def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
+    """The true pace of the ground: the prior ground changed by what `terrain.hidden` asks for.
+
+    Without inflation: it is what a sensor sees of each cell. Never shown to planners."""
+    from shared_map.truth import hide
+
+    return hide(scenario.terrain.hidden, scenario.cost, terrain, scenario.seed)
+
+
+# --- prepared: built once by the launcher, read by every process in a blink -----------------------------------
+
+
+def scenario_key(scenario: Scenario) -> str:
+    """Fingerprint of all that a terrain is built from: a prepared one with another key is another terrain."""
+    parts = {"format": FORMAT, "seed": scenario.seed, "terrain": scenario.terrain, "cost": scenario.cost}
+    files = [name for name in (scenario.terrain.source, scenario.terrain.photo) if name]
+    stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in map(Path, files) if path.is_file()]
+    payload = msgspec.json.encode([parts, stamps], order="sorted")
+    return hashlib.blake2b(payload, digest_size=8).hexdigest()
+
+
+def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") -> None:
+    """Write a terrain and its truth where `load_prepared` finds them. The description is written last."""
+    arrays: dict[str, NDArray[Any]] = {
+        "elevation": terrain.elevation_m,
+        "photo": terrain.photo,
+        "pace": terrain.pace_s_per_m,
+        "classes": terrain.classes,
+        "truth": truth,
+    }
+    if terrain.ground_s_per_m is not terrain.pace_s_per_m:
+        arrays["ground"] = terrain.ground_s_per_m
+    meta = {
+        "format": FORMAT,
+        "key": key,
+        "grid": msgspec.to_builtins(terrain.grid),
+        "digest": terrain.digest,
+        "vehicle_radius_m": terrain.vehicle_radius_m,
+        "arrays": sorted(arrays),
+        "notes": list(terrain.notes),
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _META).unlink(missing_ok=True)
+        for name, array in arrays.items():
+            np.save(folder / f"{name}.npy", np.ascontiguousarray(array), allow_pickle=False)
+        partial = folder / f"{_META}.part"
+        partial.write_text(json.dumps(meta, indent=1), encoding="utf-8")
+        partial.rename(folder / _META)
+    except OSError as error:
+        raise TerrainError(f"cannot write the prepared terrain to {folder}: {error.strerror or error}") from error
+
+
+def load_prepared(folder: Path, key: str = "") -> Terrain | None:
+    """The terrain that `save_prepared` left, mapped read-only; None if there is none, or one of another key.
+
+    Raises TerrainError if it is damaged."""
+    meta = _read_meta(folder)
+    if meta is None or (key and meta.get("key") != key):
+        return None
+    try:
+        grid = GridSpec(**meta["grid"])
+        digest, radius, notes = str(meta["digest"]), float(meta["vehicle_radius_m"]), tuple(meta["notes"])
+        has_ground = "ground" in meta["arrays"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise TerrainError(f"prepared terrain {folder / _META} is damaged ({error}); delete the folder") from error
+    shape = (grid.rows, grid.cols)
+    pace = _read_array(folder, "pace", shape, np.float32)
+    return Terrain(
+        grid=grid,
+        elevation_m=_read_array(folder, "elevation", shape, np.float32),
+        photo=_read_array(folder, "photo", (*shape, 3), np.uint8),
+        pace_s_per_m=pace,
+        classes=_read_array(folder, "classes", shape, np.uint8),
+        digest=digest,
+        ground_s_per_m=_read_array(folder, "ground", shape, np.float32) if has_ground else pace,
+        vehicle_radius_m=radius,
+        notes=notes,
+    )
+
+
+def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
+    """The truth beside a prepared terrain; None if there is none."""
+    meta = _read_meta(folder)
+    if meta is None or (key and meta.get("key") != key):
+        return None
+    grid = GridSpec(**meta["grid"])
+    return _read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
+
+
+def _read_meta(folder: Path) -> dict[str, Any] | None:
+    try:
+        meta = json.loads((folder / _META).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise TerrainError(
+            f"prepared terrain {folder / _META} is unreadable ({error}); delete the folder"
+        ) from error
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        return None
+    return meta
+
+
+def _read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any]) -> NDArray[Any]:
+    path = folder / f"{name}.npy"
+    try:
+        array: NDArray[Any] = np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise TerrainError(f"prepared terrain {path} is unreadable ({error}); delete the folder") from error
+    if array.shape != tuple(shape) or array.dtype != dtype:
+        raise TerrainError(f"prepared terrain {path} is {array.shape} {array.dtype}, not as described; delete it")
+    return array
+
+
+def load_terrain(setup: RoleSetup) -> Terrain:
+    """The terrain of a run: prepared in its folder if it is there, else built."""
+    if setup.run_dir is not None:
+        terrain = load_prepared(setup.run_dir, scenario_key(setup.scenario))
+        if terrain is not None:
+            return terrain
+    return build_terrain(setup.scenario)
+
+
+def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
+    """The truth of a run, as `load_terrain`."""
+    if setup.run_dir is not None:
+        truth = load_prepared_truth(setup.run_dir, scenario_key(setup.scenario))
+        if truth is not None:
+            return truth
+    return build_truth(setup.scenario, terrain)
+
+
+def prepare(folder: Path, scenario: Scenario) -> tuple[Terrain, Floats]:
+    """Build terrain and truth of a scenario and leave them in a folder for the other processes."""
+    terrain = build_terrain(scenario)
+    truth = build_truth(scenario, terrain)
+    save_prepared(folder, terrain, truth, scenario_key(scenario))
+    return terrain, truth
+
+
+def with_notes(terrain: Terrain, *notes: str) -> Terrain:
+    return replace(terrain, notes=terrain.notes + notes)
