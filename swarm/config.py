@@ -6,19 +6,17 @@ refused with the file, the key, what was found and what is allowed.
 
 from __future__ import annotations
 
-import difflib
 import ipaddress
 import re
 import tomllib
-import types
-import typing
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
 from swarm.errors import ConfigError
+from swarm.explain import explain, nearest
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -306,7 +304,7 @@ def parse_scenario(text: str, source: str = "scenario", base: Path | None = None
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {_explain(str(error), raw)}") from error
+        raise ConfigError(f"{source}: {explain(str(error), raw, Scenario)}") from error
     _check(scenario, source)
     return scenario if base is None else _anchored(scenario, base)
 
@@ -323,7 +321,7 @@ def _check(scenario: Scenario, source: str) -> None:
         for id in group.targets:
             if id not in ids:
                 raise ConfigError(
-                    f"{source}: groups: {group.name} chases {id!r}, which is no target{_nearest(id, ids)}"
+                    f"{source}: groups: {group.name} chases {id!r}, which is no target{nearest(id, ids)}"
                 )
     for key, endpoints in (("listen", scenario.network.listen), ("connect", scenario.network.connect)):
         for endpoint in endpoints:
@@ -368,68 +366,3 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
 
 
 BUILT_IN_TERRAINS = ("jacksboro", "synthetic")
-
-
-def _explain(reason: str, raw: dict[str, Any]) -> str:
-    """msgspec's message with the key in TOML's words, what was found, and the nearest allowed name."""
-    path = "$"
-    located = re.fullmatch(r"(.*) - at `(.*)`", reason, re.DOTALL)
-    if located:
-        reason, path = located[1], located[2]
-    steps = re.findall(r"\.([A-Za-z_]\w*)|\[(\d+|\.\.\.)\]", path)
-    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", reason)
-    section: Any = Scenario
-    value: Any = raw
-    name = ""
-    for key, index in steps:
-        if key:
-            name = f"{name}.{key}" if name else key
-            section = _field_type(section, key)
-            value = value.get(key) if isinstance(value, dict) else None
-        else:
-            name += f"[{index}]"
-            section = _item_type(section)
-            value = value[int(index)] if isinstance(value, list) and index.isdecimal() else None
-    if unknown:
-        key = unknown[1]
-        allowed = list(section.__struct_fields__) if hasattr(section, "__struct_fields__") else []
-        where = f"{name}.{key}" if name else key
-        return f"unknown key {where}{_nearest(key, allowed)}; allowed here: {', '.join(allowed)}"
-    reason = reason[:1].lower() + reason[1:]
-    found = "" if value is None or isinstance(value, (dict, list)) else f", found {value!r}"
-    return f"{name or 'scenario'}: {reason}{found}{_choices(section)}"
-
-
-def _nearest(word: str, allowed: list[str]) -> str:
-    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else ""
-
-
-def _plain(hint: Any) -> Any:
-    """A type without Annotated and Optional around it."""
-    while True:
-        origin = typing.get_origin(hint)
-        if origin is Annotated:
-            hint = typing.get_args(hint)[0]
-        elif origin in (types.UnionType, typing.Union):
-            hint = next(arg for arg in typing.get_args(hint) if arg is not type(None))
-        else:
-            return hint
-
-
-def _field_type(section: Any, key: str) -> Any:
-    section = _plain(section)
-    if not hasattr(section, "__struct_fields__"):
-        return None
-    return _plain(typing.get_type_hints(section, include_extras=True).get(key))
-
-
-def _item_type(section: Any) -> Any:
-    args = typing.get_args(section)
-    return _plain(args[0]) if args else None
-
-
-def _choices(section: Any) -> str:
-    if typing.get_origin(section) is Literal:
-        return f"; allowed: {', '.join(map(repr, typing.get_args(section)))}"
-    return ""

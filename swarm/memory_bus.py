@@ -23,9 +23,10 @@ from swarm.bus import (
     Replied,
 )
 from swarm.clock import NS_PER_S
+from swarm.codec import decode, encode
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
-from swarm.messages import Message, decode, encode
+from swarm.messages import Message
 from swarm.scheduler import InlineWorker as InlineWorker
 from swarm.scheduler import Scheduler as Scheduler
 from swarm.topics import Topic

@@ -17,17 +17,11 @@ from typing import Any
 import zenoh
 
 from swarm.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Post, Replied
+from swarm.codec import MAX_PAYLOAD_BYTES, decode, decode_parameters, encode, encode_readable
 from swarm.config import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
-from swarm.messages import (
-    MAX_PAYLOAD_BYTES,
-    Message,
-    decode,
-    decode_parameters,
-    encode,
-    encode_readable,
-)
+from swarm.messages import Message
 from swarm.topics import ALIVE_KEY, Priority, Topic
 
 log = logging.getLogger(__name__)

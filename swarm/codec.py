@@ -1,0 +1,112 @@
+"""The door through which bytes become messages: MessagePack, unpacked with size limits and validated.
+
+Nothing but ProtocolError comes out of it, whatever goes in.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, TypeVar
+
+import msgpack
+import msgspec
+
+from swarm.errors import ProtocolError
+from swarm.fields import column
+from swarm.grid import STEP_COL, STEP_ROW
+from swarm.messages import Message, schema_of
+
+MAX_PAYLOAD_BYTES = 8 << 20
+COMPASS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
+
+M = TypeVar("M", bound=Message)
+
+_UNPACK_LIMITS: dict[str, Any] = {
+    "raw": False,
+    "strict_map_key": False,
+    "max_str_len": 1 << 16,
+    "max_bin_len": MAX_PAYLOAD_BYTES,
+    "max_array_len": 1 << 18,
+    "max_map_len": 1 << 16,
+    "max_ext_len": 0,
+}
+
+
+def encode(message: Message) -> bytes:
+    """A message as MessagePack."""
+    return msgspec.msgpack.encode(message)
+
+
+def decode(payload: bytes, message_type: type[M]) -> M:
+    """The message in a payload. Raises ProtocolError, and nothing else, on what is not one."""
+    if len(payload) > MAX_PAYLOAD_BYTES:
+        raise ProtocolError(f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES}")
+    try:
+        fields = msgpack.unpackb(payload, **_UNPACK_LIMITS)
+        return msgspec.convert(fields, message_type, builtin_types=(bytes,))
+    except RecursionError as error:
+        raise ProtocolError("nested too deeply") from error
+    except Exception as error:  # msgpack raises a dozen kinds; none may pass the door
+        raise ProtocolError(f"{type(error).__name__}: {error}"[:300]) from error
+
+
+def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
+    """The request in a selector such as `?row=40&col=200`. Raises ProtocolError on what does not fit."""
+    fields = {key: value for key, value in parameters.items() if key != "format"}
+    allowed = message_type.__struct_fields__
+    unknown = sorted(set(fields) - set(allowed))
+    if unknown:
+        raise ProtocolError(f"unknown parameter {unknown[0]!r}, allowed: {', '.join(allowed)}")
+    tag = message_type.__struct_config__.tag
+    try:
+        return msgspec.convert({**fields, "schema": tag}, message_type, strict=False)
+    except (msgspec.ValidationError, ValueError) as error:
+        raise ProtocolError(str(error)) from error
+
+
+def encode_readable(message: Message) -> bytes:
+    """A message as JSON for people: directions as compass points, float columns as lists, inf as null."""
+    return msgspec.json.encode(_readable(msgspec.to_builtins(message, builtin_types=(bytes,))))
+
+
+_COLUMN_TYPES = {
+    "cells": "<u4",
+    "east_m": "<f4",
+    "south_m": "<f4",
+    "heading_rad": "<f4",
+    "cost_to_go_s": "<f4",
+    "paces": "<f4",
+    "stamps_ns": "<i8",
+}
+
+
+def _readable(value: Any, name: str = "", schema: str = "") -> Any:
+    if isinstance(value, dict):
+        schema = value.get("schema", schema)
+        fields = {key: _readable(item, str(key), schema) for key, item in value.items()}
+        if schema == schema_of("route") and "routes" in value:
+            for route, raw in zip(fields["routes"], value["routes"], strict=True):
+                route["cells_row_col"] = _cells_row_col(raw["start"], raw["directions"], value["cols"])
+        return fields
+    if isinstance(value, list):
+        return [_readable(item, name, schema) for item in value]
+    if isinstance(value, bytes):
+        if name == "directions":
+            return [COMPASS[code] if code < 8 else code for code in value]
+        if name == "cells" and schema == schema_of("marks"):
+            return column(value, "<u2").tolist()
+        if name in _COLUMN_TYPES:
+            return [_readable(item) for item in column(value, _COLUMN_TYPES[name]).tolist()]
+        return list(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _cells_row_col(start: int, directions: bytes, cols: int) -> list[list[int]]:
+    row, col = divmod(start, cols)
+    cells = [[row, col]]
+    for code in directions:
+        row, col = row + STEP_ROW[code], col + STEP_COL[code]
+        cells.append([row, col])
+    return cells

@@ -1,0 +1,56 @@
+"""What the fields of messages are made of, and how they are checked.
+
+Columns of numbers travel as little-endian bytes, because a list of a thousand Python ints costs a hundred times
+more to pack and check. A check raises ValueError, which the door turns into a dropped payload.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+assert sys.byteorder == "little", "columns travel as little-endian bytes"
+
+Natural = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+"""A count, a time or a sequence number: leaves room to add to it in 64 bits."""
+Cell = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 32)]
+"""A cell, row or column as others name it. The message cannot know the grid: it may lie outside."""
+
+_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+
+
+def pack_column(values: Any, dtype: str) -> bytes:
+    """A column of numbers as little-endian bytes."""
+    return np.ascontiguousarray(values, dtype=dtype).tobytes()
+
+
+def column(data: bytes, dtype: str) -> NDArray[Any]:
+    """The read-only array that `pack_column` packed."""
+    return np.frombuffer(data, dtype=dtype)
+
+
+def check_column(name: str, data: bytes, width: int, count: int) -> None:
+    if len(data) != width * count:
+        raise ValueError(f"{name} has {len(data)} bytes, expected {count} values of {width}")
+
+
+def check_id(name: str, value: str) -> None:
+    if _ID.fullmatch(value) is None:
+        raise ValueError(f"{name} {value[:80]!r} is not 1 to 64 of letters, digits, '_', '.', '-'")
+
+
+def check_directions(directions: bytes) -> None:
+    if directions and max(directions) > 7:
+        raise ValueError(f"direction code {max(directions)} is not in 0..7")
+
+
+def check_finite(name: str, *values: float) -> None:
+    for value in values:
+        if not math.isfinite(value):
+            raise ValueError(f"{name} is {value}, expected a finite number")
