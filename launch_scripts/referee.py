@@ -1,0 +1,147 @@
+"""The referee: from what vehicles report, who stood where for how long, and who broke a law. Pure.
+
+A report of a vehicle holds from its stamp until the vehicle's next report. Where reports between two are missing
+(the sequence number jumps) and the vehicle moved meanwhile, the older one is known to hold at its stamp only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.clock import NS_PER_S
+from swarm.messages import NO_TARGET, Fleet, VehicleState, column
+
+_SKEW_NS = NS_PER_S // 200
+"""Overlaps shorter than this are within what the clocks of two processes may differ."""
+_REMEMBER_NS = 5 * NS_PER_S
+_APART_NS = 2 * NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Collision:
+    """Two vehicles on one cell at one time; told once per encounter."""
+
+    first: str
+    second: str
+    cell: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LethalEntry:
+    """A vehicle came to stand on a cell that is lethal in truth."""
+
+    vehicle: str
+    cell: int
+    stamp_ns: int
+
+
+@dataclass(slots=True, eq=False)
+class _Stay:
+    """A vehicle on a cell, from its first to its last proven moment there."""
+
+    vehicle: str
+    cell: int
+    begin_ns: int
+    end_ns: int
+
+
+@dataclass(slots=True)
+class _Vehicle:
+    stay: _Stay
+    author: str
+    seq: int
+    stamp_ns: int
+
+
+class Referee:
+    """Reports in, broken laws out. Repeated and late reports change nothing."""
+
+    def __init__(self, passable: NDArray[np.bool_]) -> None:
+        self._passable = passable.ravel()
+        self._vehicles: dict[str, _Vehicle] = {}
+        self._stays: dict[int, list[_Stay]] = {}
+        self._encounters: dict[tuple[str, str], int] = {}
+        self._swept_ns = 0
+
+    @property
+    def cells(self) -> NDArray[np.int64]:
+        """Where every vehicle was last."""
+        return np.fromiter((vehicle.stay.cell for vehicle in self._vehicles.values()), dtype=np.int64)
+
+    def hear(self, fleet: Fleet) -> list[Collision | LethalEntry]:
+        """Take in a report. Cells outside the grid are nobody's business here."""
+        broken: list[Collision | LethalEntry] = []
+        for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
+            if cell < len(self._passable):
+                broken.extend(self._report(id, cell, fleet))
+        if fleet.stamp_ns - self._swept_ns > NS_PER_S:
+            self._sweep(fleet.stamp_ns)
+        return broken
+
+    def _report(self, id: str, cell: int, fleet: Fleet) -> Iterator[Collision | LethalEntry]:
+        stamp_ns = fleet.stamp_ns
+        known = self._vehicles.get(id)
+        if known is not None:
+            if stamp_ns <= known.stamp_ns:
+                return
+            gapless = fleet.author == known.author and fleet.seq <= known.seq + 1
+            known.author, known.seq, known.stamp_ns = fleet.author, fleet.seq, stamp_ns
+            stay = known.stay
+            if cell == stay.cell or gapless:
+                stay.end_ns = stamp_ns
+                yield from self._meetings(stay)
+            if cell == stay.cell:
+                return
+        entered = _Stay(id, cell, stamp_ns, stamp_ns)
+        self._stays.setdefault(cell, []).append(entered)
+        if known is None:
+            self._vehicles[id] = _Vehicle(entered, fleet.author, fleet.seq, stamp_ns)
+        else:
+            known.stay = entered
+        if not self._passable[cell]:
+            yield LethalEntry(id, cell, stamp_ns)
+
+    def _meetings(self, stay: _Stay) -> Iterator[Collision]:
+        here = self._stays.get(stay.cell, ())
+        if len(here) < 2:
+            return
+        for other in here:
+            overlap_ns = min(stay.end_ns, other.end_ns) - max(stay.begin_ns, other.begin_ns)
+            if other.vehicle == stay.vehicle or overlap_ns <= _SKEW_NS:
+                continue
+            first, second = sorted((stay.vehicle, other.vehicle))
+            last_ns = self._encounters.get((first, second))
+            until_ns = min(stay.end_ns, other.end_ns)
+            self._encounters[first, second] = max(until_ns, last_ns or 0)
+            if last_ns is None or until_ns - last_ns > _APART_NS:
+                yield Collision(first, second, stay.cell, until_ns)
+
+    def _sweep(self, now_ns: int) -> None:
+        """Forget stays that ended long ago; whoever has not moved on since still stands there."""
+        self._swept_ns = now_ns
+        for cell in list(self._stays):
+            kept = [
+                stay
+                for stay in self._stays[cell]
+                if now_ns - stay.end_ns <= _REMEMBER_NS or self._vehicles[stay.vehicle].stay is stay
+            ]
+            if kept:
+                self._stays[cell] = kept
+            else:
+                del self._stays[cell]
+
+
+def chasers(fleet: Fleet, target: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Of the vehicles in a report: the positions of those that chase a target, and which of these say ARRIVED."""
+    if target not in fleet.target_ids:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_)
+    index = fleet.target_ids.index(target)
+    assert index != NO_TARGET
+    chasing = np.flatnonzero(column(fleet.targets, "<u1") == index)
+    arrived = column(fleet.states, "<u1")[chasing] == VehicleState.ARRIVED
+    return chasing, arrived

@@ -1,0 +1,253 @@
+"""The simulated targets: where they are, how they move, who caught them, and who broke a law on the way.
+
+`TargetWorld` is the core, `TargetsService` puts it on the bus. They know the truth; no planner or vehicle
+does.
+"""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.referee import Collision, LethalEntry, Referee, chasers
+from launch_scripts.walks import Budget, Ground, Walker, far_place, slowness_of
+from shared_map.layers import inflate, inflation_halves
+from shared_map.terrain import Terrain
+from swarm.bus import Bus, Event, Heard, Post
+from swarm.clock import NS_PER_S
+from swarm.config import Scenario, TargetConfig, ids_of
+from swarm.errors import ConfigError
+from swarm.membership import Member
+from swarm.messages import Fleet, PlannerStatus, TargetPose, column
+from swarm.role import RoleSetup
+from swarm.topics import FLEET, POSE, STATUS
+
+LISTEN_NS = NS_PER_S * 3 // 4
+"""Planners tell twice a second where their targets are: a restarted driver listens before it makes places up."""
+JUMP_COOL_DOWN_NS = 2 * NS_PER_S
+STAY_COOL_DOWN_NS = 5 * NS_PER_S
+_LONGEST_TICK_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Publish:
+    pose: TargetPose
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    target: str
+    vehicle: str
+    cell: int
+
+
+Action = Publish | Captured | Collision | LethalEntry
+
+
+@dataclass(eq=False)
+class _Target:
+    config: TargetConfig
+    walker: Walker
+    x_m: float
+    y_m: float
+    placed: bool = False
+    seq: int = 0
+    captures: int = 0
+    jumps: int = 0
+    calm_until_ns: int = 0
+
+
+class TargetWorld:
+    """Targets and referee. Poses, reports and ticks in; poses, captures and broken laws out.
+
+    An incarnation that starts while others run goes on where planners last saw the targets. A capture counts once:
+    a target that jumps is out of reach for a cool-down, one that stays must first have been alone for another.
+    """
+
+    def __init__(
+        self, scenario: Scenario, terrain: Terrain, truth_s_per_m: NDArray[np.float32], incarnation: int
+    ) -> None:
+        self._grid = terrain.grid
+        # A target keeps to where vehicles fit, by the truth and by the prior map: elsewhere nobody could reach it.
+        halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
+        pace = np.where(terrain.lethal, np.float32(np.inf), inflate(truth_s_per_m, halves))
+        self._ground = Ground(terrain.grid, pace.astype(np.float32))
+        self._referee = Referee(np.isfinite(truth_s_per_m))
+        self._incarnation = incarnation
+        self._capture_range_m = scenario.vehicles.capture_range_m
+        self._time_scale = scenario.time_scale
+        self._started_ns: int | None = None
+        self._ticked_ns = 0
+        self._targets = {
+            id: self._place(id, config, scenario) for config in scenario.targets for id in ids_of(config)
+        }
+
+    def _place(self, id: str, config: TargetConfig, scenario: Scenario) -> _Target:
+        chance = random.Random(f"{scenario.seed}/{id}")
+        if config.start is None:
+            cell = self._ground.random_home(chance)
+        elif not self._grid.inside(*config.start):
+            shape = f"{self._grid.rows} x {self._grid.cols}"
+            raise ConfigError(f"target {id}: start {list(config.start)} is outside the terrain of {shape} cells")
+        else:
+            cell = self._grid.cell(*config.start)
+            if self._ground.lethal(cell):
+                raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
+        walker = Walker(id, config.walk, slowness_of(config, scenario.cost), chance, cell)
+        return _Target(config, walker, *self._grid.centre_m(cell))
+
+    def hear_status(self, status: PlannerStatus) -> None:
+        """Where a planner last saw a target that we have not yet placed ourselves."""
+        target, cell = self._targets.get(status.target), status.target_cell
+        if target is None or target.placed or cell is None or target.config.walk == "external":
+            return
+        if 0 <= cell < self._grid.cells and not self._ground.lethal(cell):
+            target.walker.put(cell)
+            target.placed = True
+
+    def hear_pose(self, pose: TargetPose) -> None:
+        """Where somebody else says that an external target is."""
+        target = self._targets.get(pose.target)
+        if target is not None and target.config.walk == "external" and 0 <= pose.cell < self._grid.cells:
+            target.walker.put(pose.cell)
+            target.x_m, target.y_m = pose.x_m, pose.y_m
+            target.placed = True
+
+    def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
+        actions: list[Action] = list(self._referee.hear(fleet))
+        for id in fleet.target_ids:
+            target = self._targets.get(id)
+            if target is not None and target.placed:
+                vehicle = self._catcher(fleet, id, target)
+                if vehicle is not None:
+                    actions.extend(self._reached(id, target, vehicle, now_ns))
+        return actions
+
+    def tick(self, now_ns: int) -> list[Action]:
+        """Move everybody on and tell where they are."""
+        if self._started_ns is None:
+            self._started_ns = self._ticked_ns = now_ns
+        elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * self._time_scale
+        self._ticked_ns = now_ns
+        listening = now_ns - self._started_ns < LISTEN_NS
+        vehicles = self._referee.cells
+        budget = Budget()
+        actions: list[Action] = []
+        for id, target in self._targets.items():
+            if target.config.walk == "external" or (listening and not target.placed):
+                continue
+            if target.placed:
+                target.walker.advance(self._ground, elapsed_s, vehicles, budget)
+            target.placed = True
+            actions.append(Publish(self._pose(id, target, now_ns)))
+        return actions
+
+    def _pose(self, id: str, target: _Target, now_ns: int) -> TargetPose:
+        target.x_m, target.y_m = target.walker.position_m(self._ground)
+        target.seq += 1
+        return TargetPose(
+            target=id,
+            incarnation=self._incarnation,
+            seq=target.seq,
+            stamp_ns=now_ns,
+            cell=target.walker.cell,
+            x_m=target.x_m,
+            y_m=target.y_m,
+            captures=target.captures,
+            jumps=target.jumps,
+        )
+
+    def _catcher(self, fleet: Fleet, id: str, target: _Target) -> str | None:
+        """The first vehicle in a report that has this target, which it chases, within reach.
+
+        A vehicle that says ARRIVED is believed to twice the range: the target may have moved on since it looked.
+        """
+        chasing, arrived = chasers(fleet, id)
+        if not len(chasing):
+            return None
+        east_m = column(fleet.east_m, "<f4")[chasing] - (target.x_m - self._grid.west_m)
+        south_m = column(fleet.south_m, "<f4")[chasing] - (self._grid.north_m - target.y_m)
+        reach_m = np.where(arrived, 2 * self._capture_range_m, self._capture_range_m)
+        near = np.flatnonzero(np.hypot(east_m, south_m) <= reach_m)
+        return fleet.ids[int(chasing[near[0]])] if len(near) else None
+
+    def _reached(self, id: str, target: _Target, vehicle: str, now_ns: int) -> list[Action]:
+        calm = now_ns >= target.calm_until_ns
+        jumps = target.config.caught == "jump" and target.config.walk != "external"
+        if calm or not jumps:
+            target.calm_until_ns = now_ns + (JUMP_COOL_DOWN_NS if jumps else STAY_COOL_DOWN_NS)
+        if not calm:
+            return []
+        target.captures += 1
+        captured = Captured(id, vehicle, target.walker.cell)
+        if not jumps:
+            return [captured]
+        target.jumps += 1
+        clear_cells = 1 + int(2 * self._capture_range_m / self._grid.resolution_m)
+        walker = target.walker
+        walker.put(far_place(self._ground, walker.cell, self._referee.cells, clear_cells, walker.chance))
+        return [captured, Publish(self._pose(id, target, now_ns))]
+
+
+class TargetsService:
+    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`."""
+
+    def __init__(
+        self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
+    ) -> None:
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._scenario = setup.scenario
+        self._bus = bus
+        self._post = post
+        self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation)
+        self.counters = self._member.counters
+        for name in ("captures", "collisions", "lethal_entries", "poses"):
+            self.counters.count(name, 0)
+
+    def start(self, now_ns: int) -> None:
+        self._member.join()
+        self._bus.subscribe(FLEET, self._post)
+        self._bus.subscribe(STATUS, self._post)
+        for target in self._scenario.targets:
+            if target.walk == "external":
+                for id in ids_of(target):
+                    self._bus.subscribe(POSE, self._post, target=id)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if self._member.handle(event):
+            return
+        match event:
+            case Heard(message=Fleet() as fleet):
+                self._perform(self._world.hear_fleet(fleet, now_ns), now_ns)
+            case Heard(message=PlannerStatus() as status):
+                self._world.hear_status(status)
+            case Heard(message=TargetPose() as pose):
+                self._world.hear_pose(pose)
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> None:
+        self._perform(self._world.tick(now_ns), now_ns)
+        self._member.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        self._member.publish_stats(now_ns)
+
+    def _perform(self, actions: list[Action], now_ns: int) -> None:
+        for action in actions:
+            match action:
+                case Publish(pose):
+                    self.counters.count("poses")
+                    self._bus.publish(POSE, pose, target=pose.target)
+                case Captured(target, vehicle, cell):
+                    self.counters.count("captures")
+                    self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell)
+                case Collision(first, second, cell):
+                    self.counters.count("collisions")
+                    self._member.note(now_ns, "collision", f"{first} and {second} on one cell", cell)
+                case LethalEntry(vehicle, cell):
+                    self.counters.count("lethal_entries")
+                    self._member.note(now_ns, "lethal-entry", f"{vehicle} entered a lethal cell", cell)

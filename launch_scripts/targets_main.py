@@ -1,0 +1,28 @@
+"""The driver of the simulated targets, who is also the referee, as a process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from launch_scripts.targets import TargetsService
+from shared_map.terrain import load_terrain, load_truth
+from swarm.clock import MonotonicClock
+from swarm.process import Inbox, Process, end_with
+from swarm.role import RoleSetup
+from swarm.zenoh_bus import open_bus
+
+TICK_HZ = 10.0
+
+
+def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+    """Drive all targets of the scenario until SIGTERM, SIGINT or the end of the launcher."""
+    terrain = load_terrain(setup)
+    truth = load_truth(setup, terrain)
+    inbox = Inbox()
+    with open_bus(setup.scenario.network) as bus:
+        service = TargetsService(setup, terrain, truth, bus, inbox.post)
+        process = Process(service, inbox, MonotonicClock(), TICK_HZ)
+        process.stop_on_signals()
+        if stop_when is not None:
+            end_with(stop_when, process.stop)
+        process.run()

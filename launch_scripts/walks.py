@@ -1,0 +1,262 @@
+"""How simulated targets move over the true ground. Pure: time and chance are arguments.
+
+Targets take legal steps only: to one of eight neighbours, never into a lethal cell, never between two lethal cells.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from swarm.config import CostConfig, TargetConfig
+from swarm.errors import TerrainError
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+
+Walk = Literal["still", "random", "waypoints", "evade", "external"]
+
+WAY_HALF_CELLS = 96
+"""Waypoints lie in a window this far to every side: bounds what a way costs, whatever the size of the terrain."""
+_TURN_SHARE = 1 / 20
+_FEAR_CELLS = 40
+_STEPS_PER_TICK = 1000
+
+
+class Ground:
+    """The true pace of every cell, and which steps are possible on it."""
+
+    def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32]) -> None:
+        self.grid = grid
+        self.pace_s_per_m = pace_s_per_m
+        self.passable: NDArray[np.bool_] = np.isfinite(pace_s_per_m)
+        if not self.passable.any():
+            raise TerrainError("every cell of the terrain is lethal: nobody could stand on it")
+        # A diagonal step that does not squeeze between two lethal cells has a passable cell beside it, so what is
+        # connected by eight-neighbour steps is exactly what is connected by four-neighbour steps.
+        regions: NDArray[np.signedinteger[Any]]
+        regions, _ = label(self.passable)
+        sizes = np.bincount(regions.ravel())
+        sizes[0] = 0
+        self.home: NDArray[np.int64] = np.flatnonzero(regions.ravel() == int(sizes.argmax()))
+        """The cells of the largest connected passable part."""
+
+    def lethal(self, cell: int) -> bool:
+        return not self.passable.flat[cell]
+
+    def random_home(self, chance: random.Random) -> int:
+        return int(self.home[chance.randrange(len(self.home))])
+
+    def step(self, cell: int, direction: int) -> int | None:
+        """The cell that a step leads to; None where there is no such step."""
+        row, col = divmod(cell, self.grid.cols)
+        d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
+        to_row, to_col = row + d_row, col + d_col
+        if not self.grid.inside(to_row, to_col) or not self.passable[to_row, to_col]:
+            return None
+        if d_row and d_col and not (self.passable[row, to_col] or self.passable[to_row, col]):
+            return None
+        return to_row * self.grid.cols + to_col
+
+    def steps(self, cell: int) -> list[tuple[int, int]]:
+        """(direction, cell) of every possible step."""
+        found = ((direction, self.step(cell, direction)) for direction in range(8))
+        return [(direction, to) for direction, to in found if to is not None]
+
+    def length_m(self, cell: int, to: int) -> float:
+        straight = abs(cell - to) in (1, self.grid.cols)
+        return self.grid.resolution_m * (1.0 if straight else math.sqrt(2))
+
+    def way(self, start: int, chance: random.Random) -> list[int]:
+        """The cheapest way to a random place that can be reached inside the window around `start`, without `start`
+        itself; empty if there is none."""
+        window = self.grid.around(start, WAY_HALF_CELLS)
+        rows, cols = window.row1 - window.row0, window.col1 - window.col0
+        graph = _steps_graph(self.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1])
+        row, col = self.grid.row_col(start)
+        here = (row - window.row0) * cols + col - window.col0
+        cost, before = dijkstra(graph, directed=True, indices=np.asarray(here), return_predecessors=True)
+        reached = np.isfinite(cost)
+        reached[here] = False
+        r, c = np.divmod(np.arange(rows * cols), cols)
+        far = np.maximum(abs(r - (row - window.row0)), abs(c - (col - window.col0))) >= WAY_HALF_CELLS // 3
+        places = np.flatnonzero(reached & far)
+        if not len(places):
+            places = np.flatnonzero(reached)
+        if not len(places):
+            return []
+        way: list[int] = []
+        at = int(places[chance.randrange(len(places))])
+        while at != here:
+            way.append((at // cols + window.row0) * self.grid.cols + at % cols + window.col0)
+            at = int(before[at])
+        way.reverse()
+        return way
+
+
+def _steps_graph(pace: NDArray[np.float32]) -> csr_array[np.float64]:
+    """Every possible step of a window of pace as an edge that costs what entering its end costs."""
+    rows, cols = pace.shape
+    padded = np.full((rows + 2, cols + 2), np.inf)
+    padded[1:-1, 1:-1] = pace
+    open_ = np.isfinite(padded)
+    cells = np.arange(rows * cols).reshape(rows, cols)
+    starts: list[NDArray[np.int64]] = []
+    ends: list[NDArray[np.int64]] = []
+    costs: list[NDArray[np.float64]] = []
+
+    def shifted(array: NDArray[Any], d_row: int, d_col: int) -> NDArray[Any]:
+        return array[1 + d_row : 1 + d_row + rows, 1 + d_col : 1 + d_col + cols]
+
+    for direction in range(8):
+        d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
+        possible = open_[1:-1, 1:-1] & shifted(open_, d_row, d_col)
+        if d_row and d_col:
+            possible &= shifted(open_, d_row, 0) | shifted(open_, 0, d_col)
+        start = cells[possible]
+        starts.append(start)
+        ends.append(start + d_row * cols + d_col)
+        costs.append(shifted(padded, d_row, d_col)[possible] * math.hypot(d_row, d_col))
+    edges = (np.concatenate(costs), (np.concatenate(starts), np.concatenate(ends)))
+    return csr_array(edges, shape=(rows * cols, rows * cols))
+
+
+@dataclass(eq=False)
+class Walker:
+    """One target under way: on `cell`, or `progress_s` into the step from there `towards` the next."""
+
+    id: str
+    walk: Walk
+    slowness: float
+    """Its pace over that of the terrain, 1 or more."""
+    chance: random.Random
+    cell: int
+    towards: int | None = None
+    progress_s: float = 0.0
+    heading: int = 0
+    way: list[int] = field(default_factory=list)
+    """Cells to come, the last first."""
+
+    def put(self, cell: int) -> None:
+        """Turn up somewhere else."""
+        self.cell = cell
+        self.towards = None
+        self.progress_s = 0.0
+        self.way = []
+
+    def advance(self, ground: Ground, elapsed_s: float, vehicles: NDArray[np.int64], budget: Budget) -> None:
+        """Move on for a time on the terrain. `vehicles` are the cells that an evader keeps away from."""
+        if not math.isfinite(self.slowness):
+            return
+        for _ in range(_STEPS_PER_TICK):
+            if self.towards is None:
+                self.towards = self._choose(ground, vehicles, budget)
+                if self.towards is None:
+                    return
+            step_s = self._step_s(ground)
+            if self.progress_s + elapsed_s < step_s:
+                self.progress_s += elapsed_s
+                return
+            elapsed_s -= step_s - self.progress_s
+            self.cell, self.towards, self.progress_s = self.towards, None, 0.0
+
+    def position_m(self, ground: Ground) -> tuple[float, float]:
+        """(x_m, y_m), on the line between two cells' middles while under way."""
+        x_m, y_m = ground.grid.centre_m(self.cell)
+        if self.towards is None:
+            return x_m, y_m
+        share = self.progress_s / self._step_s(ground)
+        to_x_m, to_y_m = ground.grid.centre_m(self.towards)
+        return x_m + share * (to_x_m - x_m), y_m + share * (to_y_m - y_m)
+
+    def _step_s(self, ground: Ground) -> float:
+        assert self.towards is not None
+        pace = float(ground.pace_s_per_m.flat[self.towards])
+        return ground.length_m(self.cell, self.towards) * pace * self.slowness
+
+    def _choose(self, ground: Ground, vehicles: NDArray[np.int64], budget: Budget) -> int | None:
+        match self.walk:
+            case "random":
+                return self._wander(ground)
+            case "waypoints":
+                if not self.way and budget.take():
+                    self.way = ground.way(self.cell, self.chance)[::-1]
+                return self.way.pop() if self.way else None
+            case "evade":
+                return self._flee(ground, vehicles)
+            case "still" | "external":
+                return None
+
+    def _wander(self, ground: Ground) -> int | None:
+        if self.chance.random() < _TURN_SHARE:
+            self.heading = self.chance.randrange(8)
+        for turn in (0, 1, -1, 2, -2, 3, -3, 4):
+            heading = (self.heading + turn) % 8
+            to = ground.step(self.cell, heading)
+            if to is not None:
+                self.heading = heading
+                return to
+        return None
+
+    def _flee(self, ground: Ground, vehicles: NDArray[np.int64]) -> int | None:
+        """To the neighbour that is least crowded by the vehicles near enough to be feared."""
+        row, col = ground.grid.row_col(self.cell)
+        rows, cols = np.divmod(vehicles, ground.grid.cols)
+        near = np.maximum(abs(rows - row), abs(cols - col)) <= _FEAR_CELLS
+        if not near.any():
+            return self._wander(ground)
+        rows, cols = rows[near], cols[near]
+
+        def crowding(to: int) -> float:
+            to_row, to_col = ground.grid.row_col(to)
+            return float((1.0 / ((rows - to_row) ** 2 + (cols - to_col) ** 2 + 0.25)).sum())
+
+        steps = ground.steps(self.cell)
+        return min(steps, key=lambda step: (crowding(step[1]), step[1]))[1] if steps else None
+
+
+@dataclass
+class Budget:
+    """How many ways may still be computed in this tick; the other walkers wait for the next."""
+
+    ways: int = 1
+
+    def take(self) -> bool:
+        self.ways -= 1
+        return self.ways >= 0
+
+
+def slowness_of(target: TargetConfig, cost: CostConfig) -> float:
+    """On level open ground the target keeps its own speed, elsewhere it is as much slower or faster as the ground
+    is; it never outruns a vehicle's pace on the same cell. Infinite for one that stands still."""
+    if target.speed_m_per_s <= 0:
+        return math.inf
+    return max(1.0, cost.flat_speed_m_per_s / target.speed_m_per_s)
+
+
+def far_place(
+    ground: Ground, away_from: int, vehicles: NDArray[np.int64], clear_cells: int, chance: random.Random
+) -> int:
+    """A random place at least a quarter of the terrain's diagonal from a cell, and clear of vehicles; of 32 drawn
+    the farthest, if none is."""
+    grid = ground.grid
+    row, col = grid.row_col(away_from)
+    enough = math.hypot(grid.rows, grid.cols) / 4
+    near_rows, near_cols = np.divmod(vehicles, grid.cols)
+    best, best_distance = away_from, -1.0
+    for _ in range(32):
+        place = ground.random_home(chance)
+        to_row, to_col = grid.row_col(place)
+        distance = math.hypot(to_row - row, to_col - col)
+        crowded = bool((np.maximum(abs(near_rows - to_row), abs(near_cols - to_col)) <= clear_cells).any())
+        if distance >= enough and not crowded:
+            return place
+        if distance > best_distance:
+            best, best_distance = place, distance
+    return best
