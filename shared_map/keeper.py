@@ -1,0 +1,212 @@
+"""What the keeper must not lose: sets on their way to the disk (core), and the disk (SQLite)."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import sqlite3
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO
+
+from shared_map.digest import Ledger
+from swarm.errors import StoreError
+from swarm.messages import MarkSet
+
+log = logging.getLogger(__name__)
+
+STORE_VERSION = "1"
+_MEMORY = ":memory:"
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS sets (
+    tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
+    cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL,
+    PRIMARY KEY (tile, author)
+) WITHOUT ROWID;
+"""
+_UPSERT = """
+INSERT INTO sets (tile, author, grp, epoch, seq, cells, kinds, paces, stamps_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)
+ON CONFLICT (tile, author) DO UPDATE SET grp = excluded.grp, epoch = excluded.epoch, seq = excluded.seq,
+    cells = excluded.cells, kinds = excluded.kinds, paces = excluded.paces, stamps_ns = excluded.stamps_ns
+WHERE (excluded.epoch, excluded.seq) >= (sets.epoch, sets.seq)
+"""
+
+
+class KeeperStore:
+    """Every set in one SQLite file, or in memory under the name ":memory:". One process at a time.
+
+    A commit is on the disk when it returns (WAL with synchronous=FULL): it survives kill -9 of this process at any
+    instant, and a power cut as far as the disk keeps what it was told to flush.
+
+    rebuild  move a damaged file aside and begin an empty one, to be filled from the swarm
+    """
+
+    def __init__(self, path: Path | str, *, rebuild: bool = False) -> None:
+        self.path = Path(path)
+        self._lock: IO[bytes] | None = None
+        in_memory = str(path) == _MEMORY
+        if not in_memory:
+            self._lock = _lock(self.path)
+        try:
+            self._db = _open(str(path))
+        except StoreError:
+            if in_memory or not rebuild:
+                self._unlock()
+                raise
+            log.warning("moved the damaged store to %s", _move_aside(self.path))
+            self._db = _open(str(path))
+
+    def bind(self, terrain: str) -> None:
+        """Belong to this terrain from now on. Raises StoreError if the store holds the marks of another."""
+        try:
+            row = self._db.execute("SELECT value FROM meta WHERE key = 'terrain'").fetchone()
+            if row is None:
+                with self._db:
+                    self._db.execute("INSERT INTO meta VALUES ('terrain', ?)", (terrain,))
+                return
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+        if row[0] != terrain:
+            raise StoreError(
+                f"the store {self.path} holds marks on terrain {row[0]}, but this run has terrain {terrain}: "
+                "give another --store, or the terrain and cost rules that it was made with"
+            )
+
+    @property
+    def terrain(self) -> str | None:
+        """Digest of the terrain that the store belongs to; None before the first `bind`."""
+        row = self._db.execute("SELECT value FROM meta WHERE key = 'terrain'").fetchone()
+        return None if row is None else str(row[0])
+
+    def load(self) -> Iterator[MarkSet]:
+        """Everything in the store. Raises StoreError where a row is no set."""
+        try:
+            for tile, author, group, epoch, seq, cells, kinds, paces, stamps_ns in self._db.execute(
+                "SELECT tile, author, grp, epoch, seq, cells, kinds, paces, stamps_ns FROM sets"
+            ):
+                yield MarkSet(
+                    author=author,
+                    group=group,
+                    tile=tile,
+                    epoch=epoch,
+                    seq=seq,
+                    cells=cells,
+                    kinds=kinds,
+                    paces=paces,
+                    stamps_ns=stamps_ns,
+                )
+        except (sqlite3.Error, ValueError, TypeError) as error:
+            raise StoreError(_damaged(self.path, str(error))) from error
+
+    def save(self, sets: Iterable[MarkSet]) -> None:
+        """Commit all or none; on the disk when this returns. Raises StoreError, which leaves the store usable."""
+        rows = [(s.tile, s.author, s.group, s.epoch, s.seq, s.cells, s.kinds, s.paces, s.stamps_ns) for s in sets]
+        try:
+            with self._db:
+                self._db.executemany(_UPSERT, rows)
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    def close(self) -> None:
+        self._db.close()
+        self._unlock()
+
+    def __enter__(self) -> KeeperStore:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
+def _open(path: str) -> sqlite3.Connection:
+    try:
+        db = sqlite3.connect(path, check_same_thread=False, timeout=2.0)
+    except sqlite3.Error as error:
+        raise StoreError(f"cannot open the store {path}: {error}") from error
+    try:
+        db.execute("PRAGMA journal_mode = WAL")
+        db.execute("PRAGMA synchronous = FULL")
+        found = [row[0] for row in db.execute("PRAGMA quick_check(1)")]
+        if found != ["ok"]:
+            raise StoreError(_damaged(path, found[0] if found else "no answer from quick_check"))
+        with db:
+            db.executescript(_SCHEMA)
+            db.execute("INSERT OR IGNORE INTO meta VALUES ('version', ?)", (STORE_VERSION,))
+        version = db.execute("SELECT value FROM meta WHERE key = 'version'").fetchone()[0]
+        if version != STORE_VERSION:
+            raise StoreError(f"the store {path} has version {version}, this program reads {STORE_VERSION}")
+    except sqlite3.DatabaseError as error:
+        db.close()
+        if isinstance(error, sqlite3.OperationalError):
+            raise StoreError(f"cannot open the store {path}: {error}") from error
+        raise StoreError(_damaged(path, str(error))) from error
+    except StoreError:
+        db.close()
+        raise
+    return db
+
+
+def _damaged(path: Path | str, reason: str) -> str:
+    return (
+        f"the store {path} is damaged ({reason}): move it away, or start the keeper with --rebuild to fill a new "
+        "one from the swarm"
+    )
+
+
+def _lock(path: Path) -> IO[bytes]:
+    """One writer: a second keeper on the same file is refused. The lock falls with its process."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = open(f"{path}.lock", "wb")  # noqa: SIM115 - held until close
+    except OSError as error:
+        raise StoreError(f"cannot open the store {path}: {error.strerror or error}") from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        lock.close()
+        raise StoreError(f"the store {path} is in use by another keeper") from error
+    return lock
+
+
+def _move_aside(path: Path) -> Path:
+    number = 1
+    while (aside := path.with_name(f"{path.name}.damaged-{number}")).exists():
+        number += 1
+    os.replace(path, aside)
+    for tail in ("-wal", "-shm"):
+        Path(f"{path}{tail}").unlink(missing_ok=True)
+    return aside
+
+
+class Keeper:
+    """Which sets wait for the disk and which are on it. Only the latter are in `committed`, which is what the
+    keeper's digest, and so the acknowledgement, is made of."""
+
+    def __init__(self) -> None:
+        self.committed = Ledger()
+        self._waiting: dict[tuple[int, str], MarkSet] = {}
+
+    def restored(self, mark_set: MarkSet) -> None:
+        self.committed.record(mark_set.author, mark_set.tile, mark_set.epoch, mark_set.seq)
+
+    def accept(self, mark_set: MarkSet) -> None:
+        """A set that the replica took in: the newest of its tile and author."""
+        self._waiting[mark_set.tile, mark_set.author] = mark_set
+
+    @property
+    def waiting(self) -> list[MarkSet]:
+        return list(self._waiting.values())
+
+    def saved(self, sets: Iterable[MarkSet]) -> None:
+        """These are on the disk."""
+        for each in sets:
+            self.committed.record(each.author, each.tile, each.epoch, each.seq)
+            if self._waiting.get((each.tile, each.author)) is each:
+                del self._waiting[each.tile, each.author]

@@ -1,0 +1,175 @@
+"""Marks and their merge rule. An author's set for a tile replaces its set with a lower (epoch, seq); of several
+authors' statements about one cell the newest wins, on a tie the one of the larger author id.
+
+Every decision is made on the values in the sets, never on when or in which order they were received: that is why
+merging depends on neither order, grouping nor repetition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
+from swarm.messages import TILE_AREA, MarkKind, MarkSet, column, pack_column
+
+STAMP_LIMIT_NS = 1 << 62
+"""A stamp from here on (year 2116) is refused on every replica alike, so that there is always a newer one."""
+NO_STATEMENT = -1
+"""In place of a stamp: nobody says anything about the cell."""
+
+
+class Statements(NamedTuple):
+    """Columns of statements about cells of one tile; all of one length.
+
+    cells      index inside the tile, increasing
+    kinds      MarkKind
+    paces      s/m, 0 where the kind is not PACE
+    stamps_ns  hybrid time, NO_STATEMENT where there is none
+    """
+
+    cells: NDArray[np.uint16]
+    kinds: NDArray[np.uint8]
+    paces: NDArray[np.float32]
+    stamps_ns: NDArray[np.int64]
+
+
+def statements(mark_set: MarkSet) -> Statements:
+    """The columns of a set."""
+    kinds = column(mark_set.kinds, "<u1")
+    paces = column(mark_set.paces, "<f4")
+    if (kinds != MarkKind.PACE).any():
+        paces = np.where(kinds == MarkKind.PACE, paces, np.float32(0))
+    return Statements(column(mark_set.cells, "<u2"), kinds, paces, column(mark_set.stamps_ns, "<i8"))
+
+
+def mark_set(author: str, group: str, tile: int, epoch: int, seq: int, said: Statements) -> MarkSet:
+    return MarkSet(
+        author=author,
+        group=group,
+        tile=tile,
+        epoch=epoch,
+        seq=seq,
+        cells=pack_column(said.cells, "<u2"),
+        kinds=pack_column(said.kinds, "<u1"),
+        paces=pack_column(said.paces, "<f4"),
+        stamps_ns=pack_column(said.stamps_ns, "<i8"),
+    )
+
+
+def supersedes(new: MarkSet, old: MarkSet) -> bool:
+    """Whether `new` replaces `old` of the same author and tile: higher (epoch, seq).
+
+    An author never puts two different sets under one number. Should a damaged payload look as if, the larger
+    content wins, so that even then the order of arrival does not matter.
+    """
+    if new.epoch != old.epoch:
+        return new.epoch > old.epoch
+    if new.seq != old.seq:
+        return new.seq > old.seq
+    return _content(new) > _content(old)
+
+
+def _content(of: MarkSet) -> tuple[bytes, bytes, bytes, bytes, str]:
+    return of.cells, of.kinds, of.paces, of.stamps_ns, of.group
+
+
+def fault(of: MarkSet, grid: GridSpec) -> str | None:
+    """Why a set can be no part of this grid's map; None if it can."""
+    if of.tile >= grid.tiles:
+        return f"tile {of.tile} is not in 0..{grid.tiles - 1}"
+    if not of.kinds:
+        return None
+    window = grid.tile_window(of.tile)
+    height, width = window.row1 - window.row0, window.col1 - window.col0
+    if height < TILE_CELLS or width < TILE_CELLS:
+        cells = column(of.cells, "<u2")
+        if (cells // TILE_CELLS >= height).any() or (cells % TILE_CELLS >= width).any():
+            return f"a cell of tile {of.tile} lies outside the grid"
+    newest_ns = int(column(of.stamps_ns, "<i8").max())
+    if newest_ns >= STAMP_LIMIT_NS:
+        return f"stamp {newest_ns} is not below {STAMP_LIMIT_NS}"
+    return None
+
+
+def resolve(sets: Iterable[MarkSet]) -> Statements:
+    """The winning statement about each of a tile's 1024 cells; CLEAR where nobody says anything.
+
+    sets  at most one per author, in increasing order of author
+    """
+    stamps = np.full(TILE_AREA, NO_STATEMENT, np.int64)
+    kinds = np.full(TILE_AREA, MarkKind.CLEAR, np.uint8)
+    paces = np.zeros(TILE_AREA, np.float32)
+    for each in sets:
+        if not each.kinds:
+            continue
+        said = statements(each)
+        wins = said.stamps_ns >= stamps[said.cells]  # on a tie the later, that is the larger, author
+        cells = said.cells[wins]
+        stamps[cells] = said.stamps_ns[wins]
+        kinds[cells] = said.kinds[wins]
+        paces[cells] = said.paces[wins]
+    return Statements(_TILE, kinds, paces, stamps)
+
+
+_TILE: NDArray[np.uint16] = np.arange(TILE_AREA, dtype=np.uint16)
+
+
+def sparse(dense: Statements) -> Statements:
+    """Without the cells that nobody says anything about."""
+    there = np.flatnonzero(dense.stamps_ns != NO_STATEMENT)
+    return taken(dense, there)
+
+
+def taken(said: Statements, where: NDArray[np.intp]) -> Statements:
+    return Statements(said.cells[where], said.kinds[where], said.paces[where], said.stamps_ns[where])
+
+
+NOTHING_SAID = Statements(
+    np.empty(0, np.uint16), np.empty(0, np.uint8), np.empty(0, np.float32), np.empty(0, np.int64)
+)
+
+
+def grid_cells(grid: GridSpec, tile: int, cells: NDArray[np.integer]) -> NDArray[np.uint32]:
+    """Flat indices in the grid of cells inside a tile."""
+    tile_row, tile_col = divmod(tile, grid.tile_cols)
+    inner = cells.astype(np.int64)
+    rows = inner // TILE_CELLS + tile_row * TILE_CELLS
+    return (rows * grid.cols + inner % TILE_CELLS + tile_col * TILE_CELLS).astype(np.uint32)
+
+
+def tile_cells(grid: GridSpec, cells: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.uint16]]:
+    """(tile, index inside it) of flat indices that are inside the grid."""
+    rows, cols = np.divmod(cells.astype(np.int64), grid.cols)
+    tiles = (rows // TILE_CELLS) * grid.tile_cols + cols // TILE_CELLS
+    inner = (rows % TILE_CELLS) * TILE_CELLS + cols % TILE_CELLS
+    return tiles, inner.astype(np.uint16)
+
+
+def region_tiles(grid: GridSpec, region: int) -> list[int]:
+    """The tiles of a region."""
+    region_row, region_col = divmod(region, grid.region_cols)
+    rows = range(region_row * REGION_TILES, min((region_row + 1) * REGION_TILES, grid.tile_rows))
+    cols = range(region_col * REGION_TILES, min((region_col + 1) * REGION_TILES, grid.tile_cols))
+    return [row * grid.tile_cols + col for row in rows for col in cols]
+
+
+class HybridClock:
+    """Stamps for an author's statements: its own clock, but always newer than what it knows about the very cell.
+
+    So whoever has seen a statement can overrule it at once, however far ahead the clock of its author is; that is
+    all of a hybrid logical clock that a per-cell rule needs, and one wrong clock does not drag the others along.
+    The bound: of two statements made without knowledge of each other, that of an author whose clock is d ahead may
+    beat a statement up to d younger, until the first author who has seen both speaks.
+    """
+
+    def __init__(self) -> None:
+        self._last_ns = 0
+
+    def stamps_ns(self, now_ns: int, known_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """One stamp per cell. `known_ns` is the newest stamp known about each, or NO_STATEMENT."""
+        self._last_ns = max(self._last_ns, now_ns, 0)
+        return np.minimum(np.maximum(self._last_ns, known_ns + 1), STAMP_LIMIT_NS - 1)

@@ -1,0 +1,265 @@
+"""One process's replica of the shared map. Core: sets and digests in, changed cells and asked sets out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from shared_map.digest import Held, Ledger, fingerprint
+from shared_map.marks import (
+    NO_STATEMENT,
+    NOTHING_SAID,
+    HybridClock,
+    Statements,
+    fault,
+    grid_cells,
+    mark_set,
+    resolve,
+    sparse,
+    statements,
+    supersedes,
+    tile_cells,
+)
+from swarm.clock import NS_PER_S
+from swarm.errors import OutsideGridError
+from swarm.grid import GridSpec
+from swarm.messages import MarkKind, MarkSet, MarksRequest
+
+
+class CostSink(Protocol):
+    """Where the winning statements go: the cost map."""
+
+    def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> object: ...
+
+
+@dataclass(frozen=True, slots=True)
+class PublishSet:
+    """Put this set under its author's key."""
+
+    mark_set: MarkSet
+
+
+class MapReplica:
+    """Holds the newest set of every (tile, author) and keeps a cost map at the winning statements.
+
+    author      name under which `write` speaks; None for those who only listen
+    publish_hz  each tile's set goes out at most this often
+    counts      sets_merged, sets_repeated, sets_refused, marks_merged (cells whose winner changed), marks_written
+    """
+
+    def __init__(
+        self,
+        grid: GridSpec,
+        cost_map: CostSink | None = None,
+        *,
+        author: str | None = None,
+        group: str = "all",
+        publish_hz: float = 10.0,
+    ) -> None:
+        self.grid = grid
+        self.author = author
+        self.group = group
+        self.counts = dict.fromkeys(
+            ("sets_merged", "sets_repeated", "sets_refused", "marks_merged", "marks_written"), 0
+        )
+        self.ledger = Ledger()
+        self._cost_map = cost_map
+        self._tiles: dict[int, dict[str, MarkSet]] = {}
+        self._clock = HybridClock()
+        self._publish_ns = int(NS_PER_S / publish_hz)
+        self._pending: dict[int, None] = {}  # own tiles with unpublished changes, in order
+        self._published_ns: dict[int, int] = {}
+        self._newest_ns: int | None = None
+
+    # --- what others say ------------------------------------------------------------------------------------
+
+    def merge(self, received: MarkSet, *, measured: bool = True) -> NDArray[np.uint32] | None:
+        """Take in a set. Returns the cells whose winner changed, already applied to the cost map; None if the set
+        was known, superseded or no part of this map.
+
+        measured  counts for `take_newest_stamp_ns`; not so the sets of a late join, which are old already
+        """
+        if fault(received, self.grid) is not None:
+            self.counts["sets_refused"] += 1
+            return None
+        held = self._tiles.get(received.tile, {}).get(received.author)
+        if held is not None and not supersedes(received, held):
+            self.counts["sets_repeated"] += 1
+            return None
+        if received.author == self.author:
+            self._outbid(received, held)
+            return None
+        return self._accept(received, measured)
+
+    def _outbid(self, received: MarkSet, held: MarkSet | None) -> None:
+        """Somebody who took us for dead wrote under our name: say what we say again, under a higher epoch."""
+        assert self.author is not None
+        if received.epoch + 1 >= 1 << 62:  # no honest writer counts that far, and nothing could follow it
+            self.counts["sets_refused"] += 1
+            return
+        said = NOTHING_SAID if held is None else statements(held)
+        seq = 0 if held is None else held.seq + 1
+        self._accept(mark_set(self.author, self.group, received.tile, received.epoch + 1, seq, said), False)
+        self._pending[received.tile] = None
+
+    def _accept(self, received: MarkSet, measured: bool) -> NDArray[np.uint32]:
+        tile = received.tile
+        sets = self._tiles.setdefault(tile, {})
+        before = resolve(sets[name] for name in sorted(sets))
+        sets[received.author] = received
+        after = resolve(sets[name] for name in sorted(sets))
+        self.ledger.record(received.author, tile, received.epoch, received.seq)
+        self.counts["sets_merged"] += 1
+        changed = np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces))
+        if not len(changed):
+            return _NO_CELLS
+        self.counts["marks_merged"] += len(changed)
+        cells = grid_cells(self.grid, tile, changed)
+        if self._cost_map is not None:
+            self._cost_map.apply(cells, after.kinds[changed], after.paces[changed])
+        if measured:
+            newest_ns = int(after.stamps_ns[changed].max())
+            if newest_ns != NO_STATEMENT and (self._newest_ns is None or newest_ns > self._newest_ns):
+                self._newest_ns = newest_ns
+        return cells
+
+    def take_newest_stamp_ns(self) -> int | None:
+        """The newest stamp among the marks that changed the map since this was last asked; None without any."""
+        newest_ns, self._newest_ns = self._newest_ns, None
+        return newest_ns
+
+    # --- what we say ----------------------------------------------------------------------------------------
+
+    def write(self, cells: ArrayLike, kinds: ArrayLike, paces: ArrayLike, now_ns: int) -> list[PublishSet]:
+        """State something about cells, one kind and pace each; of a cell named twice the last counts. The own
+        cost map knows at once; returned are the sets that may go out now, the others follow from `tick`."""
+        flat = np.atleast_1d(np.asarray(cells, np.int64))
+        if len(flat) and not (flat.min() >= 0 and flat.max() < self.grid.cells):
+            raise OutsideGridError(f"a cell of {flat.min()}..{flat.max()} is not in {self.grid.cells} cells")
+        new_kinds = np.broadcast_to(np.asarray(kinds, np.uint8), flat.shape)
+        new_paces = np.broadcast_to(np.asarray(paces, np.float32), flat.shape)
+        tiles, inner = tile_cells(self.grid, flat)
+        for tile in np.unique(tiles).tolist():
+            here = tiles == tile
+            self._write_tile(tile, inner[here], new_kinds[here], new_paces[here], now_ns)
+        return self.tick(now_ns)
+
+    def _write_tile(
+        self,
+        tile: int,
+        cells: NDArray[np.uint16],
+        kinds: NDArray[np.uint8],
+        paces: NDArray[np.float32],
+        now_ns: int,
+    ) -> None:
+        sets = self._tiles.get(tile, {})
+        winners = resolve(sets[name] for name in sorted(sets))
+        own = self._own(tile)
+        stamps = self._clock.stamps_ns(now_ns, winners.stamps_ns[cells])
+        # What we say already, and what stands, need not be said again.
+        paces = np.where(kinds == MarkKind.PACE, paces, np.float32(0))
+        stands = (own.stamps_ns[cells] != NO_STATEMENT) & (own.stamps_ns[cells] == winners.stamps_ns[cells])
+        said = stands & (winners.kinds[cells] == kinds) & (winners.paces[cells] == paces)
+        if len(np.unique(cells)) == len(cells):
+            if said.all():
+                return
+            cells, kinds, paces, stamps = cells[~said], kinds[~said], paces[~said], stamps[~said]
+        own.kinds[cells], own.paces[cells], own.stamps_ns[cells] = kinds, paces, stamps
+        self.counts["marks_written"] += len(cells)
+        self._put_own(tile, own)
+
+    def retract(self, cells: ArrayLike, now_ns: int) -> list[PublishSet]:
+        """Take back what we said about cells, as if we had never said it; what others say about them holds."""
+        tiles, inner = tile_cells(self.grid, np.atleast_1d(np.asarray(cells, np.int64)))
+        for tile in np.unique(tiles).tolist():
+            own = self._own(tile)
+            back = inner[tiles == tile]
+            if (own.stamps_ns[back] != NO_STATEMENT).any():
+                own.stamps_ns[back] = NO_STATEMENT
+                self._put_own(tile, own)
+        return self.tick(now_ns)
+
+    def tick(self, now_ns: int) -> list[PublishSet]:
+        """The own sets that are due to go out."""
+        due = [
+            tile
+            for tile in self._pending
+            if now_ns - self._published_ns.get(tile, -self._publish_ns) >= self._publish_ns
+        ]
+        for tile in due:
+            del self._pending[tile]
+            self._published_ns[tile] = now_ns
+        return [PublishSet(self._tiles[tile][self.author]) for tile in due if self.author is not None]
+
+    def _own(self, tile: int) -> Statements:
+        if self.author is None:
+            raise RuntimeError("a replica without an author cannot write")
+        own = self._tiles.get(tile, {}).get(self.author)
+        return resolve(() if own is None else (own,))
+
+    def _put_own(self, tile: int, own: Statements) -> None:
+        assert self.author is not None
+        held = self._tiles.get(tile, {}).get(self.author)
+        epoch, seq = (1, 0) if held is None else (held.epoch, held.seq + 1)
+        self._accept(mark_set(self.author, self.group, tile, epoch, seq, sparse(own)), False)
+        self._pending[tile] = None
+
+    # --- comparing ------------------------------------------------------------------------------------------
+
+    def digest(self) -> dict[str, bytes]:
+        """What we hold, of everybody."""
+        return self.ledger.held()
+
+    def own_digest(self) -> dict[str, bytes]:
+        """What we have said ourselves: complete for our author."""
+        return self.ledger.held([self.author] if self.author is not None else [])
+
+    def fingerprint(self) -> str:
+        return fingerprint(self.digest())
+
+    def compare(self, theirs: Held) -> list[tuple[str, list[int]]]:
+        """(author, tiles) to ask for: what they hold newer than we."""
+        missing = self.ledger.missing(theirs)
+        inside = ((author, [t for t in tiles if t < self.grid.tiles]) for author, tiles in missing)
+        return [(author, tiles) for author, tiles in inside if tiles]
+
+    def ahead_of(self, theirs: Held, authors: list[str]) -> list[MarkSet]:
+        """The sets of these authors that we hold newer than they."""
+        newer = self.ledger.ahead(theirs, authors)
+        return [self._tiles[tile][author] for author, tiles in newer for tile in tiles]
+
+    def answer(self, request: MarksRequest, author: str | None = None) -> list[MarkSet]:
+        """The sets asked for, in order of tile and author. `author` narrows it to one, as the asked key does."""
+        wanted = set(request.authors)
+        tiles: Sequence[int] = sorted(set(request.tiles)) if request.tiles else sorted(self._tiles)
+        return [
+            sets[name]
+            for tile in tiles
+            if (sets := self._tiles.get(tile)) is not None
+            for name in sorted(sets)
+            if (author is None or name == author) and (not wanted or name in wanted)
+        ]
+
+    # --- looking at it --------------------------------------------------------------------------------------
+
+    def winners(self, tile: int) -> Statements:
+        """The winning statements about a tile, without the cells that nobody speaks of."""
+        sets = self._tiles.get(tile, {})
+        return sparse(resolve(sets[name] for name in sorted(sets)))
+
+    @property
+    def tiles(self) -> list[int]:
+        """Tiles that anybody has a set for."""
+        return sorted(self._tiles)
+
+    def sets(self, tile: int) -> list[MarkSet]:
+        """The sets of a tile, in order of author."""
+        sets = self._tiles.get(tile, {})
+        return [sets[name] for name in sorted(sets)]
+
+
+_NO_CELLS: NDArray[np.uint32] = np.empty(0, np.uint32)
