@@ -1,0 +1,243 @@
+"""The command `swarm`. Each sub-command imports what it needs when it runs, so that --help is quick."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from launch_scripts import cli_ask, cli_roles
+from swarm.errors import SwarmError
+
+_BEGAN_S = time.monotonic()
+
+app = typer.Typer(
+    name="swarm",
+    help="""A swarm of vehicles chases moving targets over real terrain.
+
+For every target a planner keeps the tree of cheapest paths from everywhere to it; vehicles follow their routes and
+mark what the map did not know; all of them meet only on Zenoh.
+
+    swarm demo                               the whole swarm for a minute, on real mountains
+
+    swarm up my.toml --port 0                a scenario of your own, on free ports
+
+    swarm route --target t3 --row 40 --col 200       ask the running swarm for a route
+
+    swarm simulate jacksboro --seed 7        the same swarm in one process, faster than real time
+""",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(metavar="SCENARIO", help="A .toml file, or the name of a built-in scenario such as jacksboro."),
+]
+Seconds = Annotated[float | None, typer.Option(min=0.1, help="How long the run lasts once the swarm is up.")]
+Seed = Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")]
+Runs = Annotated[Path, typer.Option(help="Folder in which each run gets a folder of its own.")]
+Port = Annotated[
+    int | None,
+    typer.Option(min=0, max=65533, help="Router on this port, live view on the next two; 0 picks free ones."),
+]
+NoLive = Annotated[bool, typer.Option("--no-live", help="Serve no live view. The run is recorded all the same.")]
+Plain = Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live table.")]
+AsJson = Annotated[
+    bool, typer.Option("--json", help="Print the report as JSON on standard output, all else on stderr.")
+]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"swarm {version('terrain-swarm')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def demo(
+    seconds: Seconds = None,
+    seed: Seed = None,
+    runs: Runs = Path("runs"),
+    port: Port = None,
+    no_live: NoLive = False,
+    plain: Plain = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 17 processes.
+
+    The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/TIME/ with run.rrd,
+    report.json, report.png and a log file per process.
+    """
+    _up("jacksboro", seconds, seed, runs, port, no_live, plain, as_json)
+
+
+@app.command()
+def up(
+    scenario: ScenarioArgument,
+    seconds: Seconds = None,
+    seed: Seed = None,
+    runs: Runs = Path("runs"),
+    port: Port = None,
+    connect: Annotated[
+        str | None,
+        typer.Option(help="Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here."),
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Start only this role; may be given several times.")
+    ] = None,
+    run_id: Annotated[
+        str | None, typer.Option(help="Take part in this run; otherwise it is made or learnt.")
+    ] = None,
+    namespace: Annotated[
+        str | None, typer.Option(help="Prefix of all keys: runs in different ones do not meet.")
+    ] = None,
+    tls_ca: cli_roles.TlsCa = None,
+    tls_cert: cli_roles.TlsCert = None,
+    tls_key: cli_roles.TlsKey = None,
+    no_live: NoLive = False,
+    plain: Plain = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run a scenario: all of its processes on this machine, or some of them.
+
+    swarm up jacksboro --seconds 20 --port 0
+
+    swarm up my.toml --only router --only keeper
+
+    swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
+    """
+    network = {
+        "connect": connect,
+        "namespace": namespace,
+        "tls": (tls_ca, tls_cert, tls_key),
+    }
+    _up(scenario, seconds, seed, runs, port, no_live, plain, as_json, only=only, run_id=run_id, **network)
+
+
+def _up(
+    name: str,
+    seconds: float | None,
+    seed: int | None,
+    runs: Path,
+    port: int | None,
+    no_live: bool,
+    plain: bool,
+    as_json: bool,
+    *,
+    connect: str | None = None,
+    namespace: str | None = None,
+    tls: tuple[str | None, str | None, str | None] = (None, None, None),
+    only: list[str] | None = None,
+    run_id: str | None = None,
+) -> None:
+    import msgspec
+
+    from launch_scripts import options
+    from launch_scripts.processes import ROLES
+    from launch_scripts.up import UpOptions, run_swarm
+    from swarm.errors import ConfigError
+
+    scenario = options.with_network(
+        options.find_scenario(name), connect=connect, namespace=namespace, tls=options.tls_of(*tls)
+    )
+    if port is not None:
+        scenario = options.with_port(scenario, port)
+    monitor = msgspec.structs.replace(scenario.monitor, live=scenario.monitor.live and not no_live)
+    scenario = msgspec.structs.replace(
+        scenario,
+        seconds=scenario.seconds if seconds is None else seconds,
+        seed=scenario.seed if seed is None else seed,
+        monitor=monitor,
+    )
+    for role in only or ():
+        if role not in ROLES:
+            raise ConfigError(f"--only: no role {role!r}; the roles are {', '.join(ROLES)}")
+    roles = tuple(role for role in ROLES if not only or role in only)
+    if connect is not None:
+        roles = tuple(role for role in roles if role != "router")
+    raise typer.Exit(
+        run_swarm(
+            UpOptions(
+                scenario,
+                runs,
+                roles=roles,
+                joins="router" not in roles,
+                run_id=run_id,
+                as_json=as_json,
+                plain=plain,
+                began_s=_BEGAN_S,
+            )
+        )
+    )
+
+
+@app.command()
+def simulate(
+    scenario: ScenarioArgument,
+    seed: Seed = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Simulated seconds.")] = None,
+    trace: Annotated[
+        Path | None, typer.Option(help="Write the event log here; a seed always writes the same.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run the same swarm in one process, on a memory bus and a manual clock, and print the same report.
+
+    swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
+    """
+    cli_ask.simulate(scenario, seed, seconds, trace, as_json)
+
+
+app.add_typer(cli_roles.app)
+app.add_typer(cli_ask.app)
+
+
+def _mount(name: str, module: str, help: str) -> None:
+    """A sub-command whose own typer app is imported when it is called."""
+
+    def forward(ctx: typer.Context) -> None:
+        sub_app: Any = importlib.import_module(module).app
+        sub_app(args=ctx.args, prog_name=f"swarm {name}")
+
+    forward.__doc__ = help
+    app.command(
+        name,
+        context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
+        add_help_option=False,
+    )(forward)
+
+
+_mount(
+    "bench", "launch_scripts.bench.cli", "Measure: the paper's tables, scale, the wire. See `swarm bench --help`."
+)
+_mount("terrain", "launch_scripts.terrain_cli", "Look at terrains. See `swarm terrain --help`.")
+_mount("map", "launch_scripts.map_cli", "Look at shared maps and the keeper's store. See `swarm map --help`.")
+
+
+def main() -> int:
+    """Entry point: an error of the user's is one sentence and an exit code, never a traceback."""
+    try:
+        app()
+    except SwarmError as error:
+        print(f"swarm: {error}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:
+        return 0
+    return 0

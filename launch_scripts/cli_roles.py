@@ -1,0 +1,182 @@
+"""One sub-command per role: a process of a swarm, started by hand on any machine."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer()
+
+Scenario = Annotated[
+    str, typer.Option(help="A .toml file or a built-in name: the same for all processes of a run.")
+]
+Connect = Annotated[
+    str | None, typer.Option(help="The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.")
+]
+RunId = Annotated[str | None, typer.Option(help="The run to take part in; if not given, the one in the namespace.")]
+Namespace = Annotated[str | None, typer.Option(help="Prefix of all keys.")]
+Runs = Annotated[Path, typer.Option(help="Folder for what the process keeps: RUNS/RUN_ID/.")]
+TlsCa = Annotated[str | None, typer.Option("--tls-ca", help="Certificate of the authority, PEM.")]
+TlsCert = Annotated[str | None, typer.Option("--tls-cert", help="Our certificate, PEM.")]
+TlsKey = Annotated[str | None, typer.Option("--tls-key", help="Our private key, PEM.")]
+
+_PANEL = "One role, by hand"
+
+
+@app.command(rich_help_panel=_PANEL)
+def router(
+    scenario: Scenario = "jacksboro",
+    listen: Annotated[str | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447.")] = None,
+    connect: Annotated[str | None, typer.Option(help="Another router to connect to.")] = None,
+    run_id: RunId = None,
+    namespace: Namespace = None,
+    runs: Runs = Path("runs"),
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Pass everybody's messages on: the process that all others connect to."""
+    _run("router", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key), listen)
+
+
+@app.command(rich_help_panel=_PANEL)
+def keeper(
+    scenario: Scenario = "jacksboro",
+    connect: Connect = None,
+    run_id: RunId = None,
+    namespace: Namespace = None,
+    runs: Runs = Path("runs"),
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Keep the shared map's marks in a store that survives every crash."""
+    _run("keeper", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+
+
+@app.command(rich_help_panel=_PANEL)
+def planner(
+    target: Annotated[str, typer.Option(help="The target whose tree this planner keeps, such as t0.")],
+    scenario: Scenario = "jacksboro",
+    connect: Connect = None,
+    run_id: RunId = None,
+    namespace: Namespace = None,
+    runs: Runs = Path("runs"),
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Plan for one target.
+
+    swarm planner --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
+    """
+    _run("planner", target, scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+
+
+@app.command(rich_help_panel=_PANEL)
+def agent(
+    id: Annotated[str, typer.Option("--id", help="The agent, such as a0: it hosts that part of the vehicles.")],
+    scenario: Scenario = "jacksboro",
+    connect: Connect = None,
+    run_id: RunId = None,
+    namespace: Namespace = None,
+    runs: Runs = Path("runs"),
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Drive the vehicles of one agent process."""
+    _run("agent", id, scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+
+
+@app.command(rich_help_panel=_PANEL)
+def targets(
+    scenario: Scenario = "jacksboro",
+    connect: Connect = None,
+    run_id: RunId = None,
+    namespace: Namespace = None,
+    runs: Runs = Path("runs"),
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Move the simulated targets and referee the run."""
+    _run("targets", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+
+
+@app.command(rich_help_panel=_PANEL)
+def monitor(
+    scenario: Scenario = "jacksboro",
+    connect: Connect = None,
+    run_id: RunId = None,
+    namespace: Namespace = None,
+    runs: Runs = Path("runs"),
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+) -> None:
+    """Show and record the run."""
+    _run("monitor", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+
+
+def _run(
+    role: str,
+    id: str,
+    scenario_name: str,
+    connect: str | None,
+    run_id: str | None,
+    namespace: str | None,
+    runs: Path,
+    tls: tuple[str | None, str | None, str | None],
+    listen: str | None = None,
+) -> None:
+    import msgspec
+
+    from launch_scripts import options
+    from launch_scripts.child import LOG_FORMAT, load_entry
+    from launch_scripts.processes import ENTRIES, processes_of
+    from swarm.errors import ConfigError, StoreError
+    from swarm.role import RoleSetup
+
+    scenario = options.with_network(
+        options.find_scenario(scenario_name),
+        connect=None if role == "router" else connect,
+        listen=listen,
+        namespace=namespace,
+        tls=options.tls_of(*tls),
+    )
+    if role == "router" and connect is not None:
+        network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, connect))
+        scenario = msgspec.structs.replace(scenario, network=network)
+    ids = [spec.id for spec in processes_of(scenario, (role,))]
+    if id not in ids:
+        raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
+    logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, datefmt="%H:%M:%S")
+    if run_id is None:
+        run_id = options.new_run_id() if role == "router" else _found_run_id(scenario)
+    run_dir = runs / run_id
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"cannot make {run_dir}: {error.strerror or error}") from error
+    now_ns = time.time_ns()
+    logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
+    setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir.resolve())
+    load_entry(ENTRIES[role])(setup, None)
+
+
+def _found_run_id(scenario: object) -> str:
+    """The run that the namespace belongs to; a new one if nobody is there yet."""
+    from launch_scripts.options import new_run_id
+    from launch_scripts.watcher import ask_run
+    from swarm.config import Scenario
+    from swarm.zenoh_bus import open_bus
+
+    assert isinstance(scenario, Scenario)
+    with open_bus(scenario.network) as bus:
+        found = ask_run(bus)
+    return found[0].run_id if found else new_run_id()

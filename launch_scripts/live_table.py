@@ -1,0 +1,76 @@
+"""What a person sees in the terminal while the swarm runs: a table, or plain lines where there is no terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from launch_scripts.record import LiveSummary, TargetLine
+
+SHOWN_TARGETS = 24
+
+
+def live_table(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], restarts: int, title: str) -> Group:
+    """The table of one instant.
+
+    processes  role -> (alive, all)
+    """
+    table = Table(title=title, title_justify="left", expand=False, pad_edge=False)
+    table.add_column("target")
+    for heading in ("following", "nearest m", "re-plans", "ms", "gap", "captures"):
+        table.add_column(heading, justify="right")
+    for line in summary.targets[:SHOWN_TARGETS]:
+        table.add_row(*_row(line), style=None if line.planner_up else "red")
+    if len(summary.targets) > SHOWN_TARGETS:
+        table.add_row(f"... {len(summary.targets) - SHOWN_TARGETS} more")
+    lines = [Text(line, overflow="ellipsis", no_wrap=True) for line in _totals(summary)]
+    crew = Text("processes  ")
+    for role, (alive, every) in processes.items():
+        crew.append(f"{role} {alive}/{every}  ", style="green" if alive == every else "bold red")
+    crew.append(f"restarts {restarts}", style="bold yellow" if restarts else "")
+    return Group(table, *lines, crew)
+
+
+def plain_line(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], restarts: int) -> str:
+    """The same in one line."""
+    alive = sum(count for count, _ in processes.values())
+    every = sum(count for _, count in processes.values())
+    following = sum(line.following for line in summary.targets)
+    states = ", ".join(f"{count} {state}" for state, count in summary.states.items() if count)
+    return (
+        f"{summary.elapsed_s:5.1f} s  {alive}/{every} processes, {restarts} restarts; "
+        f"{states or 'no vehicles yet'}; {following} assigned; {_count(summary.captures)} captures, "
+        f"{_count(summary.reroute_requests)} re-route requests, {_count(summary.marks)} marks, "
+        f"{_count(summary.messages_per_s)} messages/s"
+    )
+
+
+def _row(line: TargetLine) -> tuple[str, ...]:
+    return (
+        line.id if line.planner_up else f"{line.id} (planner down)",
+        str(line.following),
+        "-" if line.nearest_m is None else f"{line.nearest_m:.0f}",
+        _count(line.growths),
+        "-" if line.growth_ms is None else f"{line.growth_ms:.1f}",
+        "-" if line.gap is None else f"{line.gap:.3f}",
+        str(line.captures),
+    )
+
+
+def _totals(summary: LiveSummary) -> list[str]:
+    states = "  ".join(f"{state} {count}" for state, count in summary.states.items())
+    counts = {
+        "captures": summary.captures,
+        "re-route requests": summary.reroute_requests,
+        "marks": summary.marks,
+        "messages/s": summary.messages_per_s,
+    }
+    in_all = "  ".join(f"{name} {_count(count)}" for name, count in counts.items())
+    return [f"vehicles   {states}", f"in all     {in_all}"]
+
+
+def _count(value: float | None) -> str:
+    return "-" if value is None else f"{value:,.0f}"

@@ -1,0 +1,280 @@
+"""Starts, watches, restarts and stops the processes of a run on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+import types
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from multiprocessing import forkserver, resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+
+from launch_scripts.child import LastWords, run_child
+from launch_scripts.processes import STOP_ORDER, ProcessSpec
+from swarm.role import RoleSetup
+
+log = logging.getLogger(__name__)
+
+FIRST_WAIT_S = 0.2
+LONGEST_WAIT_S = 5.0
+SETTLED_S = 10.0
+"""A process that ran for so long starts again after the shortest wait."""
+STOP_GRACE_S = 5.0
+REFUSALS_ALLOWED = 5
+
+_HELD_BACK = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+
+
+@dataclass(slots=True)
+class Backoff:
+    """How long to wait before the next start: doubled at each crash, short again after a good run."""
+
+    wait_s: float = FIRST_WAIT_S
+
+    def crashed(self, ran_s: float) -> float:
+        """Seconds to wait now."""
+        if ran_s >= SETTLED_S:
+            self.wait_s = FIRST_WAIT_S
+        wait_s = self.wait_s
+        self.wait_s = min(2 * self.wait_s, LONGEST_WAIT_S)
+        return wait_s
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """A process that was not asked to end has ended."""
+
+    spec: ProcessSpec
+    sentence: str
+    exit_code: int
+    refused: bool
+    restart_in_s: float | None
+    times: int
+
+
+@dataclass(slots=True, eq=False)
+class Running:
+    """A row of the table, as it is on this machine."""
+
+    spec: ProcessSpec
+    process: ForkServerProcess | None = None
+    words: Connection | None = None
+    began_s: float = 0.0
+    due_s: float | None = None
+    restarts: int = 0
+    refusals: int = 0
+    backoff: Backoff = field(default_factory=Backoff)
+
+    @property
+    def alive(self) -> bool:
+        return self.process is not None
+
+
+class LocalSwarm:
+    """The processes of one run. Not thread-safe: the launcher's main thread owns it.
+
+    setup_of  makes what a process is started with
+    """
+
+    def __init__(
+        self, specs: list[ProcessSpec], setup_of: Callable[[ProcessSpec], RoleSetup], log_dir: Path
+    ) -> None:
+        self.running = [Running(spec) for spec in specs]
+        self._setup_of = setup_of
+        self._log_dir = log_dir
+        self._context = multiprocessing.get_context("forkserver")
+
+    @property
+    def restarts(self) -> int:
+        return sum(running.restarts for running in self.running)
+
+    def by_role(self) -> dict[str, tuple[int, int]]:
+        """Role -> (alive, all), in the order of the table."""
+        counts: dict[str, tuple[int, int]] = {}
+        for running in self.running:
+            alive, every = counts.get(running.spec.role, (0, 0))
+            counts[running.spec.role] = (alive + running.alive, every + 1)
+        return counts
+
+    def start(self, role: str | None = None) -> None:
+        """Start the processes of a role, or all that have not been started."""
+        for running in self.running:
+            if running.process is None and running.due_s is None and role in (None, running.spec.role):
+                self._start(running)
+
+    def poll(self) -> list[Ending]:
+        """Reap what ended, start again what is due."""
+        endings = []
+        for running in self.running:
+            if running.process is not None and running.process.exitcode is not None:
+                endings.append(self._ended(running, running.process))
+            elif running.due_s is not None and time.monotonic() >= running.due_s:
+                running.restarts += 1
+                self._start(running)
+        return endings
+
+    def stop(
+        self,
+        while_waiting: Callable[[], None] = lambda: None,
+        before_role: Callable[[str], None] = lambda _: None,
+        hurry: Callable[[], bool] = lambda: False,
+    ) -> list[str]:
+        """End everything, role by role. Returns a sentence for each process that did not end as asked."""
+        for running in self.running:
+            running.due_s = None
+        roles = [*STOP_ORDER, *sorted({r.spec.role for r in self.running} - set(STOP_ORDER))]
+        failures = []
+        for role in roles:
+            of_role = [running for running in self.running if running.spec.role == role and running.alive]
+            if of_role:
+                before_role(role)
+                failures += self._stop(of_role, while_waiting, hurry)
+        return failures
+
+    def kill(self) -> None:
+        """End everything at once and without asking."""
+        for running in self.running:
+            running.due_s = None
+            if running.process is not None:
+                running.process.kill()
+                running.process.join(1.0)
+                self._forget(running)
+
+    def _start(self, running: Running) -> None:
+        listen, tell = self._context.Pipe(duplex=False)
+        spec = running.spec
+        process = self._context.Process(
+            target=run_child,
+            args=(spec.entry, self._setup_of(spec), self._log_dir / f"{spec.name}.log", tell),
+            name=spec.name,
+            daemon=True,  # should the launcher itself fail, multiprocessing ends them
+        )
+        with _without_main():
+            process.start()
+        tell.close()
+        running.process, running.words = process, listen
+        running.began_s, running.due_s = time.monotonic(), None
+
+    def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
+        """Decide what follows on an end that nobody asked for."""
+        words = self._last_words(running, process)
+        self._forget(running)
+        now_s = time.monotonic()
+        restart = running.spec.restart == "always"
+        if words.refused:
+            running.refusals += 1
+            # Whatever the first start refuses, the next will refuse too; later it may be the network.
+            restart = restart and running.restarts > 0 and running.refusals < REFUSALS_ALLOWED
+        wait_s = running.backoff.crashed(now_s - running.began_s) if restart else None
+        if wait_s is not None:
+            running.due_s = now_s + wait_s
+        return Ending(running.spec, words.sentence, words.exit_code, words.refused, wait_s, running.restarts + 1)
+
+    def _last_words(self, running: Running, process: ForkServerProcess) -> LastWords:
+        code = process.exitcode if process.exitcode is not None else 1
+        if code == 255 and process.pid is not None:
+            # The forkserver is gone, and with it the word of how its children fare: two of one id must not run.
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL)
+        with contextlib.suppress(EOFError, OSError):
+            if running.words is not None and running.words.poll():
+                words = running.words.recv()
+                assert isinstance(words, LastWords)
+                return words
+        if code < 0:
+            return LastWords(f"killed by {signal.Signals(-code).name}", 1, refused=False)
+        how = "ended by itself" if code == 0 else f"ended with exit code {code}"
+        return LastWords(how, 1, refused=False)
+
+    def _stop(
+        self, of_role: list[Running], while_waiting: Callable[[], None], hurry: Callable[[], bool]
+    ) -> list[str]:
+        for running in of_role:
+            assert running.process is not None
+            running.process.terminate()
+        deadline_s = time.monotonic() + STOP_GRACE_S
+        waiting = list(of_role)
+        while waiting and time.monotonic() < deadline_s and not hurry():
+            while_waiting()
+            waiting = [running for running in waiting if running.process and running.process.exitcode is None]
+        failures = []
+        for running in of_role:
+            process = running.process
+            assert process is not None
+            if running in waiting:
+                process.kill()
+                process.join(1.0)
+                failures.append(f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed")
+            elif process.exitcode not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
+                words = self._last_words(running, process)
+                failures.append(f"{running.spec.name} was asked to end, but {words.sentence}")
+            self._forget(running)
+        return failures
+
+    def _forget(self, running: Running) -> None:
+        if running.words is not None:
+            running.words.close()
+        if running.process is not None:
+            running.process.join(1.0)
+        running.process = running.words = None
+
+
+class WarmUp:
+    """Starts the forkserver and waits, on a thread, until it has loaded everything."""
+
+    def __init__(self, preload: list[str]) -> None:
+        forkserver.set_forkserver_preload(preload)
+        # The tracker's start unblocks signals, so it comes first.
+        resource_tracker.ensure_running()
+        # What is blocked here stays blocked in the server and in all that it forks: a Ctrl-C, which reaches the
+        # whole process group, or a SIGTERM to all of it, is for the launcher alone to act upon.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
+        try:
+            forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        self._failure: BaseException | None = None
+        self._thread = threading.Thread(target=self._probe, name="warm-up", daemon=True)
+
+    def begin(self) -> None:
+        self._thread.start()
+
+    def done(self, timeout_s: float) -> bool:
+        """True when the next process starts without delay."""
+        self._thread.join(timeout_s)
+        if self._failure is not None:
+            raise self._failure
+        return not self._thread.is_alive()
+
+    def _probe(self) -> None:
+        try:
+            with _without_main():
+                probe = multiprocessing.get_context("forkserver").Process(target=_nothing, daemon=True)
+                probe.start()
+            probe.join()
+        except BaseException as error:
+            self._failure = error
+
+
+def _nothing() -> None:
+    """What the probe runs."""
+
+
+@contextlib.contextmanager
+def _without_main() -> Iterator[None]:
+    """Keep multiprocessing from running the launcher's own script again in each child."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main

@@ -1,0 +1,156 @@
+"""From what a user typed to a scenario: names, overrides, endpoints and ports."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import errno
+import secrets
+import socket
+import time
+from pathlib import Path
+
+import msgspec
+
+from swarm.config import NetworkConfig, Scenario, TlsConfig, check_endpoint, load_scenario
+from swarm.errors import BusError, ConfigError, StoreError
+
+SCENARIOS = Path(__file__).parent / "scenarios"
+
+
+def find_scenario(name: str) -> Scenario:
+    """A built-in scenario by its name, or one from a file."""
+    path = Path(name)
+    if path.suffix == ".toml" or path.is_file():
+        return load_scenario(path)
+    built_in = SCENARIOS / f"{name}.toml"
+    if "/" not in name and built_in.is_file():
+        return load_scenario(built_in)
+    names = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    raise ConfigError(f"no scenario {name!r}{hint}; give a .toml file or one of: {', '.join(names)}")
+
+
+def with_network(
+    scenario: Scenario,
+    *,
+    connect: str | None = None,
+    listen: str | None = None,
+    namespace: str | None = None,
+    tls: TlsConfig | None = None,
+) -> Scenario:
+    """The scenario with other endpoints. Raises ConfigError where they would leave the machine in the clear."""
+    network = scenario.network
+    tls = tls or network.tls
+    changes: dict[str, object] = {"tls": tls}
+    for option, endpoint in (("--connect", connect), ("--listen", listen)):
+        if endpoint is not None:
+            check_endpoint(endpoint, tls is not None, option)
+            changes[option[2:]] = (endpoint,)
+    if namespace is not None:
+        changes["namespace"] = namespace
+    return msgspec.structs.replace(scenario, network=_replaced(network, changes))
+
+
+def _replaced(network: NetworkConfig, changes: dict[str, object]) -> NetworkConfig:
+    raw = {**msgspec.to_builtins(network), **msgspec.to_builtins(changes)}
+    try:
+        return msgspec.convert(raw, NetworkConfig)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"network: {error}") from error
+
+
+def tls_of(ca: str | None, certificate: str | None, key: str | None) -> TlsConfig | None:
+    """The three --tls options, all or none."""
+    if ca is None and certificate is None and key is None:
+        return None
+    if ca is None or certificate is None or key is None:
+        raise ConfigError("--tls-ca, --tls-cert and --tls-key belong together: give all three")
+    for option, file in (("--tls-ca", ca), ("--tls-cert", certificate), ("--tls-key", key)):
+        if not Path(file).is_file():
+            raise ConfigError(f"{option}: no file {file}")
+    return TlsConfig(ca=ca, certificate=certificate, key=key)
+
+
+def with_port(scenario: Scenario, port: int) -> Scenario:
+    """Router on `port`, live view on the two after it; 0 picks three free ones."""
+    ports = free_ports(3) if port == 0 else [port, port + 1, port + 2]
+    if ports[-1] > 65535:
+        raise ConfigError(f"--port {port}: the live view takes the two ports after it, so at most 65533")
+    endpoint = f"tcp/127.0.0.1:{ports[0]}"
+    network = msgspec.structs.replace(scenario.network, listen=(endpoint,), connect=(endpoint,))
+    monitor = msgspec.structs.replace(scenario.monitor, grpc_port=ports[1], web_port=ports[2])
+    return msgspec.structs.replace(scenario, network=network, monitor=monitor)
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of 127.0.0.1 that nobody listens on now."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in sockets]
+
+
+def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
+    """Raises BusError where something listens already on a port that this machine is to listen on."""
+    wanted: list[tuple[str, str, int]] = []
+    if "router" in roles:
+        wanted += [("the router", *host_port(endpoint)) for endpoint in scenario.network.listen]
+    if "monitor" in roles and scenario.monitor.live:
+        wanted += [("the live view", "127.0.0.1", scenario.monitor.grpc_port)]
+        wanted += [("the live view", "127.0.0.1", scenario.monitor.web_port)]
+    for who, host, port in wanted:
+        if port and _taken(host, port):
+            raise BusError(
+                f"port {port}, which {who} needs, is taken; choose others with --port N (N, N+1 and N+2 are used), "
+                "or let --port 0 pick free ones"
+            )
+
+
+def host_port(endpoint: str) -> tuple[str, int]:
+    """Of an endpoint such as tcp/[::1]:7447."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def listening(endpoint: str) -> bool:
+    """Whether something accepts connections there."""
+    try:
+        with socket.create_connection(host_port(endpoint), timeout=0.5):
+            return True
+    except OSError:
+        return False
+
+
+def _taken(host: str, port: int) -> bool:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            return error.errno == errno.EADDRINUSE
+    return False
+
+
+def new_run_id() -> str:
+    """Names a run: when it began, and four digits that tell it from another of the same second."""
+    return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
+
+
+def make_run_dir(runs: Path, name: str) -> Path:
+    """A new folder for a run. Raises StoreError if it cannot be made."""
+    try:
+        for suffix in ("", *(f"-{n}" for n in range(2, 100))):
+            run_dir = runs / f"{name}{suffix}"
+            try:
+                run_dir.mkdir(parents=True)
+                return run_dir.resolve()
+            except FileExistsError:
+                if not runs.is_dir():
+                    break
+    except OSError as error:
+        raise StoreError(f"cannot make a run folder in {runs}: {error.strerror or error}") from error
+    raise StoreError(f"cannot make a run folder in {runs}: it is no folder or holds this second's runs already")

@@ -1,0 +1,56 @@
+"""The launcher's terminal: a live table where there is one, plain lines where there is none."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from launch_scripts.live_table import live_table, plain_line
+from launch_scripts.record import LiveSummary
+
+_PLAIN_EVERY_S = 5.0
+_DRAW_EVERY_S = 0.25
+
+
+class Screen:
+    """Shows how a run goes. With `as_json`, standard output stays free for the report."""
+
+    def __init__(self, as_json: bool, plain: bool) -> None:
+        self._console = Console(stderr=as_json, highlight=False, soft_wrap=True)
+        self._table = self._console.is_terminal and not plain
+        self._live: Live | None = None
+        self._due_s = 0.0
+
+    def say(self, text: str, style: str | None = None) -> None:
+        """One line, above the table if there is one."""
+        self._console.print(Text(text, style=style or ""))
+        if not self._console.is_terminal:
+            sys.stdout.flush()
+
+    def due(self) -> bool:
+        """Whether it is time to show the next summary."""
+        return time.monotonic() >= self._due_s
+
+    def show(
+        self, title: str, summary: LiveSummary, processes: Mapping[str, tuple[int, int]], restarts: int
+    ) -> None:
+        self._due_s = time.monotonic() + (_DRAW_EVERY_S if self._table else _PLAIN_EVERY_S)
+        if not self._table:
+            self.say(plain_line(summary, processes, restarts))
+            return
+        table = live_table(summary, processes, restarts, title)
+        if self._live is None:
+            self._live = Live(table, console=self._console, auto_refresh=False, transient=False)
+            self._live.start()
+        self._live.update(table, refresh=True)
+
+    def close(self) -> None:
+        """Leave the table as it stands."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None

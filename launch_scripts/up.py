@@ -1,0 +1,271 @@
+"""One run on this machine, from the terrain to the report: what `swarm demo` and `swarm up` do."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from launch_scripts.local_swarm import Ending, LocalSwarm, WarmUp
+from launch_scripts.options import check_ports, listening, make_run_dir, new_run_id
+from launch_scripts.processes import ROLES, ProcessSpec, processes_of
+from launch_scripts.record import Recorder
+from launch_scripts.screen import Screen
+from launch_scripts.watcher import Watcher, ask_run
+from shared_map.terrain import Terrain, build_terrain, build_truth, save_prepared
+from swarm.bus import Bus
+from swarm.clock import MonotonicClock
+from swarm.config import Scenario
+from swarm.errors import BusError, SwarmError
+from swarm.membership import check_same_run
+from swarm.role import RoleSetup
+from swarm.zenoh_bus import open_bus
+
+PRELOAD = ("launch_scripts.warm_kernels",)
+
+_TURN_S = 0.05
+_LISTEN_WITHIN_S = 20.0
+_UP_WITHIN_S = 60.0
+_PATIENCE_S = 1.5
+_QUIET_NOTES = frozenset({"live_view"})
+
+
+@dataclass(frozen=True, slots=True)
+class UpOptions:
+    """What a user chose.
+
+    joins      there is a router elsewhere: none is started here
+    run_id     the run to take part in; if None, a new one, or that of the namespace where only `roles` are started
+    began_s    time.monotonic() at which the command was given
+    table      other processes than the scenario's
+    """
+
+    scenario: Scenario
+    runs: Path
+    roles: tuple[str, ...] = ROLES
+    joins: bool = False
+    run_id: str | None = None
+    as_json: bool = False
+    plain: bool = False
+    began_s: float = field(default_factory=time.monotonic)
+    preload: tuple[str, ...] = PRELOAD
+    table: tuple[ProcessSpec, ...] | None = None
+
+
+class _RefusedError(SwarmError):
+    """One of our processes said why it cannot run."""
+
+    def __init__(self, ending: Ending) -> None:
+        super().__init__(f"{ending.spec.name}: {ending.sentence}")
+        self.exit_code = ending.exit_code
+
+
+class _StopAsked:
+    """Counts the signals that ask for the end: the first ends the run in order, the second at once."""
+
+    def __init__(self) -> None:
+        self.times = 0
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._asked)
+
+    def _asked(self, number: int, frame: object) -> None:
+        self.times += 1
+
+    def __bool__(self) -> bool:
+        return self.times > 0
+
+    def hurry(self) -> bool:
+        return self.times > 1
+
+
+def run_swarm(options: UpOptions) -> int:
+    """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
+    if not options.joins:
+        check_ports(options.scenario, options.roles)
+    run_dir = make_run_dir(options.runs, time.strftime("%Y%m%d-%H%M%S"))
+    try:
+        return _Run(options, run_dir).run()
+    finally:
+        with contextlib.suppress(OSError):
+            run_dir.rmdir()  # only if nothing came to be in it
+
+
+class _Run:
+    """The run in hand, all of it on the main thread."""
+
+    def __init__(self, options: UpOptions, run_dir: Path) -> None:
+        self._options = options
+        self._scenario = options.scenario
+        self._run_dir = run_dir
+        self._run_id = options.run_id or new_run_id()
+        self._started_ns = time.time_ns()
+        self._screen = Screen(options.as_json, options.plain)
+        self._stop_asked = _StopAsked()
+        specs = list(options.table or processes_of(self._scenario, options.roles))
+        self._swarm = LocalSwarm(specs, self._setup_of, run_dir)
+        self._startup_s: float | None = None
+
+    def run(self) -> int:
+        # One thread each: the processes share the cores already, and idle helpers would be in the way of forking.
+        os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
+        warm_up = WarmUp(list(self._options.preload))
+        warm_up.begin()
+        self._terrain = self._prepare()
+        self._wait("loading kernels; the first start on a machine compiles them, about a minute", warm_up.done)
+        if self._stop_asked:
+            return 0
+        failures: list[str] = []
+        try:
+            if not self._options.joins and "router" in self._options.roles:
+                self._swarm.start("router")
+                self._wait("waiting for the router to listen", self._router_listens, _LISTEN_WITHIN_S)
+            with open_bus(self._scenario.network) as bus:
+                self._join(bus)
+                self._say_begin()
+                watcher = Watcher(bus, Recorder(self._scenario, self._terrain.grid), MonotonicClock())
+                watcher.begin()
+                try:
+                    self._swarm.start()
+                    seconds = self._watch(watcher)
+                finally:
+                    failures = self._stop(watcher)
+        finally:
+            self._screen.close()
+            self._swarm.kill()
+        self._report(watcher.recorder, seconds)
+        if self._startup_s is None and not self._stop_asked:
+            failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
+        for failure in failures:
+            self._screen.say(failure, "red")
+        return 1 if failures else 0
+
+    def _prepare(self) -> Terrain:
+        terrain = build_terrain(self._scenario)
+        save_prepared(self._run_dir, terrain, build_truth(self._scenario, terrain))
+        return terrain
+
+    def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
+        return RoleSetup(
+            scenario=self._scenario,
+            run_id=self._run_id,
+            role=spec.role,
+            id=spec.id,
+            incarnation=time.time_ns(),
+            started_ns=self._started_ns,
+            run_dir=self._run_dir,
+        )
+
+    def _wait(self, text: str, done: Callable[[float], bool], within_s: float = 600.0) -> None:
+        """Until `done(timeout_s)` or a signal; says what for if it takes long."""
+        began_s = time.monotonic()
+        said = False
+        while not self._stop_asked and not done(_TURN_S):
+            waited_s = time.monotonic() - began_s
+            if waited_s > within_s:
+                raise BusError(f"gave up {text} after {within_s:g} s; see {self._run_dir}")
+            if not said and waited_s > _PATIENCE_S:
+                said = True
+                self._screen.say(f"{text} ...")
+
+    def _router_listens(self, timeout_s: float) -> bool:
+        self._raise_refusals(self._swarm.poll())
+        if all(listening(endpoint) for endpoint in self._scenario.network.connect):
+            return True
+        time.sleep(timeout_s)
+        return False
+
+    def _join(self, bus: Bus) -> None:
+        """Refuse to share a namespace with another run; a part of a swarm belongs to the run that it finds."""
+        found = [info for info in ask_run(bus) if info.run_id != self._run_id] if self._options.joins else []
+        if found and self._options.run_id is None and not set(ROLES[1:]) <= set(self._options.roles):
+            self._run_id = found[0].run_id
+        mine = self._setup_of(ProcessSpec("launcher", "0", "")).info(self._terrain.grid, self._terrain.digest)
+        for other in found:
+            check_same_run(mine, other)
+
+    def _watch(self, watcher: Watcher) -> float:
+        """Until the time is over or somebody asks for the end. Returns how long the run lasted."""
+        began_s = time.monotonic()
+        while not self._stop_asked:
+            self._raise_refusals(self._swarm.poll())
+            watcher.listen(_TURN_S)
+            self._tell(watcher)
+            now_s = time.monotonic()
+            if self._startup_s is None and self._is_up(watcher):
+                self._startup_s = now_s - self._options.began_s
+                began_s = now_s
+                self._screen.say(
+                    f"all processes are alive and routes are served, {self._startup_s:.1f} s after launch"
+                )
+            # The time counts from when the swarm is up, but a swarm that never is must end, too.
+            limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
+            if now_s - began_s >= limit_s:
+                break
+        return time.monotonic() - began_s
+
+    def _is_up(self, watcher: Watcher) -> bool:
+        if self._missing(watcher):
+            return False
+        planners = "planner" in self._options.roles
+        return not planners or watcher.routes_served
+
+    def _missing(self, watcher: Watcher) -> list[str]:
+        specs = [running.spec for running in self._swarm.running]
+        return [spec.name for spec in specs if (spec.role, spec.id) not in watcher.ever_up]
+
+    def _tell(self, watcher: Watcher) -> None:
+        for note in watcher.take_notes():
+            if note.kind == "live_view":
+                self._screen.say(f"live view: {note.text}", "bold")
+            elif note.kind not in _QUIET_NOTES:
+                self._screen.say(f"{note.role}-{note.id}: {note.text}", "cyan")
+        if self._screen.due():
+            summary = watcher.recorder.summary(watcher.now_ns())
+            title = f"{self._scenario.name}, {summary.elapsed_s:.0f} s" + (
+                f", live view {watcher.live_view}" if watcher.live_view else ""
+            )
+            self._screen.show(title, summary, self._swarm.by_role(), self._swarm.restarts)
+
+    def _raise_refusals(self, endings: list[Ending]) -> None:
+        for ending in endings:
+            if ending.restart_in_s is None:
+                raise _RefusedError(ending)
+            if ending.times <= 3 or ending.times % 10 == 0:
+                again = f"starts again in {ending.restart_in_s:g} s" + (
+                    f", time {ending.times}" * (ending.times > 1)
+                )
+                self._screen.say(f"{ending.spec.name}: {ending.sentence}; {again}", "yellow")
+
+    def _stop(self, watcher: Watcher) -> list[str]:
+        """In order, hearing everybody's last words except the router's, which carries them."""
+        self._screen.say("stopping")
+        return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), hurry=self._stop_asked.hurry)
+
+    def _say_begin(self) -> None:
+        self._screen.say(
+            f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
+            f"{len(self._swarm.running)} processes, {self._terrain.grid.rows} x {self._terrain.grid.cols} cells"
+        )
+        self._screen.say(f"logs, recording and report: {self._run_dir}")
+
+    def _report(self, recorder: Recorder, seconds: float) -> None:
+        report = recorder.report(
+            run_id=self._run_id,
+            seconds=seconds,
+            processes=len(self._swarm.running),
+            restarts=self._swarm.restarts,
+            startup_s=self._startup_s,
+        )
+        self._write(report, recorder)
+        if self._options.as_json:
+            print(json.dumps(report, indent=2))
+
+    def _write(self, report: dict[str, Any], recorder: Recorder) -> None:
+        path = self._run_dir / "report.json"
+        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

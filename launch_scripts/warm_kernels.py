@@ -1,0 +1,44 @@
+"""Imported by the forkserver before it forks: loads what the roles need, so that each of them starts in a blink.
+
+Compiling on import is this module's whole job. Kernels that numba has cached on disk take seconds, new ones up to
+a minute; either is paid once for all processes instead of once for each.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import importlib
+import logging
+import signal
+import sys
+
+MODULES = (
+    "launch_scripts.child",
+    "launch_scripts.router",
+    "shared_map.main",
+    "vehicle_agent.main",
+    "launch_scripts.targets_main",
+    "planner_service.main",
+)
+
+_PR_SET_PDEATHSIG = 1
+
+
+def _die_with_launcher() -> None:
+    """kill -9 of the launcher while kernels compile must not leave this process behind."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _load() -> None:
+    for name in MODULES:
+        try:
+            importlib.import_module(name)
+        except Exception:  # the role itself will say it better, in its own log
+            logging.getLogger(__name__).debug("cannot preload %s", name, exc_info=True)
+
+
+_die_with_launcher()
+_load()
+gc.freeze()

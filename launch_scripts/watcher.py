@@ -1,0 +1,92 @@
+"""The launcher's ears: what it hears of the swarm, fed to the recorder."""
+
+from __future__ import annotations
+
+import time
+
+from launch_scripts.record import RECORDED_TOPICS, Recorder
+from swarm.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
+from swarm.clock import Clock
+from swarm.messages import Followed, Note, Nothing, PlannerStatus, RunInfo
+from swarm.process import Inbox
+from swarm.topics import RUN
+
+_TAG = "launcher-run"
+_ASK_TIMEOUT_S = 1.0
+
+
+class Watcher:
+    """Hears without being heard: no member of the run, so that its absence changes nothing."""
+
+    def __init__(self, bus: Bus, recorder: Recorder, clock: Clock) -> None:
+        self.recorder = recorder
+        self.notes: list[Note] = []
+        self.live_view: str | None = None
+        self.ever_up: set[tuple[str, str]] = set()
+        """(role, id) of those whose token has been up."""
+        self.routes_served = False
+        self._bus = bus
+        self._clock = clock
+        self._inbox = Inbox()
+
+    def begin(self) -> None:
+        for topic in RECORDED_TOPICS:
+            self._bus.subscribe(topic, self._inbox.post)
+        self._bus.watch_alive(self._inbox.post)
+
+    def listen(self, for_s: float) -> None:
+        """Take in what arrives, for so long."""
+        until_s = time.monotonic() + for_s
+        while True:
+            left_s = until_s - time.monotonic()
+            event = self._inbox.take(max(left_s, 0.0))
+            if event is not None:
+                self._take(event)
+            if left_s <= 0:
+                return
+
+    def now_ns(self) -> int:
+        return self._clock.now_ns()
+
+    def take_notes(self) -> list[Note]:
+        """What processes wanted a person to know since the last call."""
+        notes, self.notes = self.notes, []
+        return notes
+
+    def _take(self, event: Event) -> None:
+        now_ns = self._clock.now_ns()
+        match event:
+            case Heard(message=message, fields=fields):
+                match message:
+                    case Note():
+                        self._note(message)
+                    case Followed():
+                        self.routes_served = True
+                    case PlannerStatus(routes_served=served) if served:
+                        self.routes_served = True
+                self.recorder.heard(message, fields, now_ns)
+            case Appeared(peer):
+                self.ever_up.add((peer.role, peer.id))
+                self.recorder.alive(peer, True, now_ns)
+            case Disappeared(peer):
+                self.recorder.alive(peer, False, now_ns)
+
+    def _note(self, note: Note) -> None:
+        if note.kind == "live_view":
+            self.live_view = note.text
+        self.notes.append(note)
+
+
+def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S) -> list[RunInfo]:
+    """Who is in the namespace, as everybody there answers."""
+    inbox = Inbox()
+    bus.ask(RUN, Nothing(), inbox.post, tag=_TAG, timeout_s=timeout_s)
+    found: list[RunInfo] = []
+    deadline_s = time.monotonic() + timeout_s + 1.0
+    while time.monotonic() < deadline_s:
+        match inbox.take(0.1):
+            case Replied(message=RunInfo() as info):
+                found.append(info)
+            case AskEnded():
+                break
+    return found
