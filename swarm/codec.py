@@ -26,10 +26,9 @@ _UNPACK_LIMITS: dict[str, Any] = {
     "strict_map_key": False,
     "max_str_len": 1 << 16,
     "max_bin_len": MAX_PAYLOAD_BYTES,
-    "max_array_len": 1 << 18,
-    "max_map_len": 1 << 16,
     "max_ext_len": 0,
 }
+_MAX_ITEMS = 1 << 18
 
 
 def encode(message: Message) -> bytes:
@@ -42,7 +41,9 @@ def decode(payload: bytes, message_type: type[M]) -> M:
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ProtocolError(f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES}")
     try:
-        fields = msgpack.unpackb(payload, **_UNPACK_LIMITS)
+        # A list has room made for as many items as it claims: let it claim no more than there are bytes.
+        items = min(len(payload), _MAX_ITEMS)
+        fields = msgpack.unpackb(payload, max_array_len=items, max_map_len=items, **_UNPACK_LIMITS)
         return msgspec.convert(fields, message_type, builtin_types=(bytes,))
     except RecursionError as error:
         raise ProtocolError("nested too deeply") from error

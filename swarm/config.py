@@ -18,12 +18,13 @@ from msgspec import Meta
 from swarm.errors import ConfigError
 from swarm.explain import explain, nearest
 
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0, le=1e12)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
-Point = tuple[float, float]
+Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Point = tuple[Metres, Metres]
 
 Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
@@ -323,8 +324,8 @@ def _check(scenario: Scenario, source: str) -> None:
                 raise ConfigError(
                     f"{source}: groups: {group.name} chases {id!r}, which is no target{nearest(id, ids)}"
                 )
-    for key, endpoints in (("listen", scenario.network.listen), ("connect", scenario.network.connect)):
-        for endpoint in endpoints:
+    for key in ("listen", "connect", "peers"):
+        for endpoint in getattr(scenario.network, key):
             check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
 
 

@@ -1,0 +1,119 @@
+"""Cells, metres, tiles, regions and windows agree with each other on any grid."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm.errors import OutsideGridError
+from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec, Window, walk
+
+sizes = st.integers(1, 700)
+grids = st.builds(
+    GridSpec,
+    rows=sizes,
+    cols=sizes,
+    resolution_m=st.sampled_from([0.5, 1.0, 30.0, 90.0]),
+    west_m=st.sampled_from([0.0, 500_000.0, -1234.5]),
+    north_m=st.sampled_from([0.0, 4_000_000.0, -99.5]),
+)
+edges = st.integers(-3, 12)
+windows = st.builds(Window, edges, edges, edges, edges)
+
+
+@st.composite
+def grid_and_cell(draw: st.DrawFn) -> tuple[GridSpec, int]:
+    grid = draw(grids)
+    return grid, draw(st.integers(0, grid.cells - 1))
+
+
+@given(grid_and_cell())
+def test_row_col_and_metres_lead_back_to_the_cell(given_cell):
+    grid, cell = given_cell
+    row, col = grid.row_col(cell)
+    assert grid.cell(row, col) == cell
+    assert grid.cell_at_m(*grid.centre_m(cell)) == cell
+
+
+@given(grid_and_cell())
+def test_a_cell_lies_in_the_window_of_its_tile_and_a_tile_in_its_region(given_cell):
+    grid, cell = given_cell
+    row, col = grid.row_col(cell)
+    tile = grid.tile_of(cell)
+    assert grid.tile_window(tile).contains(row, col)
+    side = TILE_CELLS * REGION_TILES
+    assert grid.region_of(cell) == (row // side) * grid.region_cols + col // side
+    assert 0 <= grid.region_of(cell) < grid.regions
+
+
+@given(grids)
+def test_tiles_cover_the_grid_once(grid):
+    assert sum(grid.tile_window(tile).cells for tile in range(grid.tiles)) == grid.cells
+    assert {grid.region_of_tile(tile) for tile in range(grid.tiles)} == set(range(grid.regions))
+
+
+@given(grid_and_cell(), st.integers(0, 9))
+def test_neighbours_are_one_kings_move_away_and_windows_around_hold_them(given_cell, half):
+    grid, cell = given_cell
+    found = dict(grid.neighbours(cell))
+    row, col = grid.row_col(cell)
+    assert all(grid.distance_cells(cell, other) == 1 for other in found.values())
+    assert all(walk(grid, cell, bytes([d])) == [cell, other] for d, other in found.items())
+    assert len(found) == grid.around(cell, 1).cells - 1
+    window = grid.around(cell, half)
+    assert window.contains(row, col)
+    assert window.union(grid.window) == grid.window
+
+
+@given(windows, windows, windows)
+def test_the_union_of_windows_is_the_smallest_cover_in_any_order(a, b, c):
+    assert a.union(b).cells == b.union(a).cells
+    assert a.union(b).union(c).cells == a.union(b.union(c)).cells
+    for row in range(-3, 13):
+        for col in range(-3, 13):
+            if a.contains(row, col) or b.contains(row, col):
+                assert a.union(b).contains(row, col)
+
+
+@given(windows, windows)
+def test_windows_that_share_a_cell_touch(a, b):
+    shared = any(a.contains(r, c) and b.contains(r, c) for r in range(-3, 13) for c in range(-3, 13))
+    if shared:
+        assert a.touches(b)
+        assert b.touches(a)
+
+
+def test_row_zero_is_north():
+    grid = GridSpec(10, 20, 30.0, west_m=1000.0, north_m=5000.0)
+    assert grid.centre_m(0) == (1015.0, 4985.0)
+    assert grid.cell_at_m(1015.0, 4955.0) == 20
+
+
+@pytest.mark.parametrize("wrong", [-1, 6, 10**12])
+def test_a_cell_outside_the_grid_is_a_bug_that_raises(wrong):
+    grid = GridSpec(2, 3, 1.0)
+    for use in (grid.row_col, grid.tile_of, grid.centre_m, grid.region_of_tile, grid.tile_window):
+        with pytest.raises(OutsideGridError):
+            use(wrong)
+
+
+def test_places_off_the_grid_raise():
+    grid = GridSpec(2, 3, 1.0)
+    for x_m, y_m in ((-0.1, -0.5), (3.0, -0.5), (0.5, 0.1), (0.5, -2.0)):
+        with pytest.raises(OutsideGridError):
+            grid.cell_at_m(x_m, y_m)
+    with pytest.raises(OutsideGridError):
+        walk(grid, 0, bytes([0]))
+    with pytest.raises(ValueError, match="code 9"):
+        walk(grid, 0, bytes([9]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "cols", "resolution_m"), [(0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.0), (1, 1, math.nan)]
+)
+def test_a_grid_without_cells_or_size_cannot_be_made(rows, cols, resolution_m):
+    with pytest.raises(ValueError):
+        GridSpec(rows, cols, resolution_m)

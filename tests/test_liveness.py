@@ -1,0 +1,66 @@
+"""Who is alive does not depend on the order in which we hear of it."""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm.liveness import Leases, Peer, Roster
+
+
+def test_a_new_incarnation_may_appear_before_the_old_one_is_gone():
+    roster = Roster()
+    roster.appeared(Peer("planner", "t0", 1))
+    roster.appeared(Peer("planner", "t0", 2))
+    roster.gone(Peer("planner", "t0", 1))
+    assert roster.alive("planner") == {"t0": 2}
+    roster.gone(Peer("planner", "t0", 2))
+    assert not roster.is_alive("planner", "t0")
+
+
+def test_the_newest_incarnation_counts_and_roles_are_apart():
+    roster = Roster()
+    for peer in (Peer("agent", "a1", 5), Peer("agent", "a0", 9), Peer("agent", "a0", 3), Peer("keeper", "a0", 99)):
+        roster.appeared(peer)
+    assert list(roster.alive("agent").items()) == [("a0", 9), ("a1", 5)]
+
+
+peers = st.builds(Peer, st.sampled_from(["agent", "planner"]), st.sampled_from(["x", "y"]), st.integers(1, 3))
+
+
+@given(st.lists(peers, max_size=12), st.randoms(use_true_random=False))
+def test_repetition_and_order_of_tokens_do_not_matter(appeared, chance: random.Random):
+    one, other = Roster(), Roster()
+    for peer in appeared:
+        one.appeared(peer)
+    shuffled = appeared * 2
+    chance.shuffle(shuffled)
+    for peer in shuffled:
+        other.appeared(peer)
+    for role in ("agent", "planner"):
+        assert list(one.alive(role).items()) == list(other.alive(role).items())
+    for peer in shuffled:
+        other.gone(peer)
+    assert other.alive("agent") == other.alive("planner") == {}
+
+
+def test_a_token_that_was_never_up_may_fall():
+    roster = Roster()
+    roster.gone(Peer("agent", "a0", 1))
+    assert roster.alive("agent") == {}
+
+
+def test_a_lease_runs_out_once_and_a_word_renews_it():
+    leases = Leases(lease_ns=10)
+    leases.heard("a", 0)
+    leases.heard("b", 0)
+    leases.heard("a", 8)
+    assert leases.holds("a", 18)
+    assert not leases.holds("a", 19)
+    assert not leases.holds("c", 0)
+    assert leases.expired(10) == []
+    assert leases.expired(11) == ["b"]
+    assert leases.expired(30) == ["a"]
+    assert leases.expired(99) == []
