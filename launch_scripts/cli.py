@@ -20,16 +20,18 @@ app = typer.Typer(
     name="swarm",
     help="""A swarm of vehicles chases moving targets over real terrain.
 
-For every target a planner keeps the tree of cheapest paths from everywhere to it; vehicles follow their routes and
-mark what the map did not know; all of them meet only on Zenoh.
+For every target a planner keeps the tree of cheapest paths to it; vehicles
+follow their routes and mark what the map did not know; all meet on Zenoh.
 
-    swarm demo                               the whole swarm for a minute, on real mountains
+    swarm demo                         the whole swarm, for a minute
 
-    swarm up my.toml --port 0                a scenario of your own, on free ports
+    swarm up my.toml --port 0          your scenario, on free ports
 
-    swarm route --target t3 --row 40 --col 200       ask the running swarm for a route
+    swarm status                       who takes part in a running swarm
 
-    swarm simulate jacksboro --seed 7        the same swarm in one process, faster than real time
+    swarm route --target t3 --row 40 --col 200
+
+    swarm simulate jacksboro --seed 7  in one process, faster than real time
 """,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -80,7 +82,7 @@ def demo(
     plain: Plain = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 17 processes.
+    """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 18 processes.
 
     The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/TIME/ with run.rrd,
     report.json, report.png and a log file per process.
@@ -123,12 +125,22 @@ def up(
 
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
-    network = {
-        "connect": connect,
-        "namespace": namespace,
-        "tls": (tls_ca, tls_cert, tls_key),
-    }
-    _up(scenario, seconds, seed, runs, port, no_live, plain, as_json, only=only, run_id=run_id, **network)
+    tls = (tls_ca, tls_cert, tls_key)
+    _up(
+        scenario,
+        seconds,
+        seed,
+        runs,
+        port,
+        no_live,
+        plain,
+        as_json,
+        connect=connect,
+        namespace=namespace,
+        tls=tls,
+        only=only,
+        run_id=run_id,
+    )
 
 
 def _up(

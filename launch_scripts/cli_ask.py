@@ -53,8 +53,9 @@ def route(
     swarm route --target t3 --row 40 --col 200 --json | jq .routes[0].cost_s
     """
     from swarm.bus import AskEnded, Replied
+    from swarm.codec import encode_readable
     from swarm.errors import BusError, ConfigError
-    from swarm.messages import RouteReply, RouteRequest, encode_readable
+    from swarm.messages import RouteReply, RouteRequest
     from swarm.process import Inbox
     from swarm.topics import ROUTE
     from swarm.zenoh_bus import open_bus
@@ -112,7 +113,7 @@ def _strides(directions: bytes) -> str:
     """Runs of equal steps: 12 N, 3 NE, ..."""
     from itertools import groupby
 
-    from swarm.messages import COMPASS
+    from swarm.codec import COMPASS
 
     return (
         ", ".join(f"{len(list(steps))} {COMPASS[code]}" for code, steps in groupby(directions)) or "already there"
