@@ -158,7 +158,8 @@ class Recorder:
         if known is None or known.incarnation != pose.incarnation or pose.captures <= known.captures:
             return
         # Where it stood before: by now it may already have turned up elsewhere.
-        self.captures.append(Capture(self.seconds(now_ns), pose.target, *self.observed.place_m(known)))
+        capture = Capture(self.seconds(now_ns), pose.target, *self.observed.place_m(known))
+        self.captures += [capture] * (pose.captures - known.captures)
 
     def _certify(self, route: Followed) -> None:
         if 0 < route.lower_bound_s < math.inf and math.isfinite(route.cost_s):
@@ -287,11 +288,27 @@ class Recorder:
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
             "messages_out": total("messages_out"),
             "messages_in": total("messages_in"),
-            "messages_per_s": sum(rates) / len(rates) if rates else None,
+            "messages_per_s": _mean(rates),
             "payloads_dropped": total("payloads_dropped"),
             "ticks_dropped": total("ticks_dropped"),
         }
         return {name: _rounded(value) for name, value in fields.items()}
+
+    def series(self, points: int = 120) -> dict[str, list[Any]]:
+        """How it went, at no more than about so many instants: lists of one value each per `t_s`."""
+        samples = list(self.samples)
+        samples = samples[:: max(1, -(-len(samples) // points))]
+        names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
+        rates = {round(time_s, 6): rate for time_s, rate in messages_per_s(samples)}
+        fields: dict[str, list[Any]] = {
+            "t_s": [sample.time_s for sample in samples],
+            **{name: [getattr(sample, name) for sample in samples] for name in names},
+            **{state.name.lower(): [sample.states[state] for sample in samples] for state in VehicleState},
+            "gap_mean": [_mean(sample.gaps.values()) for sample in samples],
+            "growth_ms_mean": [_mean(sample.growth_ms.values()) for sample in samples],
+            "messages_per_s": [rates.get(round(sample.time_s, 6)) for sample in samples],
+        }
+        return {name: [_rounded(value) for value in values] for name, values in fields.items()}
 
     def _gap(self) -> dict[str, float | None]:
         """Driven cost over optimum, as the planners measured it.
@@ -338,6 +355,11 @@ def _excess(histogram: Histogram) -> dict[str, float | None]:
     """Of a histogram of gap - 1, the gaps."""
     values = {"mean": histogram.mean(), "p95": histogram.quantile(0.95), "max": histogram.quantile(1.0)}
     return {name: None if value is None else 1.0 + value for name, value in values.items()}
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    kept = list(values)
+    return sum(kept) / len(kept) if kept else None
 
 
 def _by_state(counts: Iterable[int]) -> dict[str, int]:

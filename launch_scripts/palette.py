@@ -1,0 +1,21 @@
+"""The colours of pictures and live view."""
+
+from __future__ import annotations
+
+from swarm.messages import VehicleState
+
+# Okabe and Ito's colours: told apart by nearly everybody, and of different lightness.
+GREEN, DARK_GREEN, RED, BLUE = "#009E73", "#00754f", "#D1330A", "#0072B2"
+ORANGE, SKY, PINK, VIOLET = "#E69F00", "#56B4E9", "#CC79A7", "#4a1486"
+YELLOW, BLACK, GREY = "#FFD21F", "#1b1b1b", "#b8bcc0"
+INK, FAINT, RULE = "#22272e", "#6b7480", "#d5dade"
+
+MARKED_LETHAL, MARKED_SLOW = VIOLET, ORANGE
+STATE_COLOURS = {
+    VehicleState.FOLLOWING: GREEN,
+    VehicleState.ARRIVED: BLUE,
+    VehicleState.WAITING: ORANGE,
+    VehicleState.IDLE: GREY,
+    VehicleState.STRANDED: PINK,
+    VehicleState.LOST: BLACK,
+}
