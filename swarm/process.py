@@ -145,6 +145,7 @@ class Process:
     def run(self) -> None:
         """Start, loop, stop. A tick that comes late is taken once and the missed ones are dropped."""
         counters = self._service.counters
+        counters.count("ticks_dropped", 0)
         self._service.start(self._clock.now_ns())
         due_ns = self._clock.now_ns()
         try:

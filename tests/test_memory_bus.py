@@ -2,53 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import pytest
 from bus_behaviour import *  # noqa: F403
 from bus_behaviour import Box, answering, asked, note, pose, run_info
+from memory_world import MemoryWorld
 
 from swarm.bus import AskEnded, Disappeared, Replied, WorkDone
 from swarm.clock import ManualClock
 from swarm.liveness import Peer
-from swarm.memory_bus import MemoryBus, MemoryNetwork, PerfectLinks
+from swarm.memory_bus import PerfectLinks
 from swarm.messages import Nothing
 from swarm.scheduler import InlineWorker, Scheduler
-from swarm.topics import NOTE, POSE, RUN, Topic
-
-
-class MemoryWorld:
-    def __init__(self, links: PerfectLinks | None = None) -> None:
-        self.scheduler = Scheduler(ManualClock(1_000_000_000))
-        self.deliveries: list[tuple[int, str, str, str, bytes]] = []
-        self.network = MemoryNetwork(
-            self.scheduler, links or PerfectLinks(), trace=lambda *delivery: self.deliveries.append(delivery)
-        )
-
-    def bus(self, name: str, namespace: str = "swarm") -> MemoryBus:
-        return self.network.bus(name, namespace)
-
-    def put_bytes(self, bus: MemoryBus, topic: Topic, payload: bytes, **fields: str) -> None:
-        bus.publish_bytes(topic, payload, fields)
-
-    def run_ms(self, ms: float) -> None:
-        self.scheduler.run_until(self.scheduler.clock.now_ns() + int(ms * 1e6))
-
-    def until(self, true: Callable[[], object], within_s: float = 5.0) -> None:
-        for _ in range(int(within_s * 1000)):
-            if true():
-                return
-            self.run_ms(1)
-        raise AssertionError(f"not within {within_s} s")
-
-    def settle(self) -> None:
-        self.run_ms(50)
-
-    def cut(self, bus: MemoryBus) -> None:
-        self.network.link_changed(bus.node, False)
-
-    def heal(self, bus: MemoryBus) -> None:
-        self.network.link_changed(bus.node, True)
+from swarm.topics import NOTE, POSE, RUN
 
 
 @pytest.fixture
