@@ -51,7 +51,7 @@ def test_members_of_one_run_get_along():
     [
         (
             {"run_id": "r2", "scenario": "other"},
-            "planner t1 belongs to run r2, but planner t0 in the same namespace belongs to run r1 (scenario demo): ",
+            "planner t1 belongs to run r2, but planner t0 in the same namespace belongs to run r1 (scenario ",
         ),
         (
             {"terrain": "bbbb", "rows": 8},
