@@ -1,0 +1,150 @@
+"""The vehicles that follow one target: where they are, and which route each was given last. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
+from swarm.messages import Fleet, Route, RouteStatus, column
+
+_STEP_ROW = np.array(STEP_ROW, np.int64)
+_STEP_COL = np.array(STEP_COL, np.int64)
+_NOWHERE = np.empty(0, np.int64)
+
+
+@dataclass(slots=True, eq=False)
+class Follower:
+    """One vehicle.
+
+    cell       where it is, by its last report or request
+    route      what it was given last; None if nothing was, by this incarnation of the planner
+    rows, cols of the cells of that route
+    stale      there may be a better route than the one it has
+    push_ns    it is not pushed another one before
+    stamp_ns   of its newest report, by its own clock
+    """
+
+    cell: int
+    max_cells: int
+    heard_ns: int
+    route: Route | None = None
+    rows: NDArray[np.int64] = _NOWHERE
+    cols: NDArray[np.int64] = _NOWHERE
+    stale: bool = False
+    push_ns: int = 0
+    stamp_ns: int = -1
+
+
+class Followers:
+    """Registered by a request that names them, or by a report that they chase this target; dropped when they
+    report another target or have been silent for the lease."""
+
+    def __init__(self, target: str, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
+        self._target = target
+        self._grid = grid
+        self._lease_ns = lease_ns
+        self._max_cells = max_cells
+        self._by_id: dict[str, Follower] = {}
+
+    def __len__(self) -> int:
+        return len(self._by_id)
+
+    def get(self, vehicle: str) -> Follower | None:
+        return self._by_id.get(vehicle)
+
+    @property
+    def cells(self) -> NDArray[np.int64]:
+        """Where they all are."""
+        return np.fromiter((follower.cell for follower in self._by_id.values()), np.int64, len(self._by_id))
+
+    def hear(self, fleet: Fleet, now_ns: int) -> None:
+        """Where an agent's vehicles are, and what they chase."""
+        index = fleet.target_ids.index(self._target) if self._target in fleet.target_ids else None
+        if index is None and not any(id in self._by_id for id in fleet.ids):
+            return
+        targets, cells = column(fleet.targets, "<u1").tolist(), column(fleet.cells, "<u4").tolist()
+        for id, cell, target in zip(fleet.ids, cells, targets, strict=True):
+            follower = self._by_id.get(id)
+            if follower is not None and fleet.stamp_ns < follower.stamp_ns:
+                continue
+            if target != index or cell >= self._grid.cells:
+                if follower is not None:
+                    del self._by_id[id]
+                continue
+            if follower is None:
+                follower = self._by_id[id] = Follower(cell, self._max_cells, now_ns)
+            follower.cell, follower.heard_ns, follower.stamp_ns = cell, now_ns, fleet.stamp_ns
+
+    def given(self, vehicle: str, route: Route, max_cells: int, now_ns: int, push_ns: int) -> None:
+        """A vehicle asked, and this is the answer."""
+        if route.status is RouteStatus.OUTSIDE:
+            return
+        follower = self._by_id.get(vehicle)
+        if follower is None:
+            follower = self._by_id[vehicle] = Follower(route.start, max_cells, now_ns)
+        follower.cell, follower.max_cells, follower.heard_ns = route.start, max_cells, now_ns
+        self.sent(follower, route, push_ns)
+
+    def sent(self, follower: Follower, route: Route, push_ns: int) -> None:
+        follower.route, follower.stale, follower.push_ns = route, False, push_ns
+        follower.rows, follower.cols = route_cells(self._grid, route)
+
+    def drop_silent(self, now_ns: int) -> None:
+        late = [id for id, follower in self._by_id.items() if now_ns - follower.heard_ns > self._lease_ns]
+        for id in late:
+            del self._by_id[id]
+
+    def touch(self, window: Window, changed: Sequence[Window]) -> None:
+        """The tree is new inside a window, and the map changed in others: whose route does that concern?"""
+        for follower in self._by_id.values():
+            if not follower.stale:
+                inside = not window.empty and window.contains(*self._grid.row_col(follower.cell))
+                follower.stale = inside or any(_crosses(follower, each) for each in changed)
+
+    def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
+        """Those with a stale route who may be pushed another one."""
+        return [(id, each) for id, each in self._by_id.items() if each.stale and now_ns >= each.push_ns]
+
+    def is_news(self, follower: Follower, route: Route) -> bool:
+        """Whether a route says anything that the follower does not know: other steps, or that there is no way."""
+        old = follower.route
+        if old is None or old.status is not route.status:
+            return True
+        if route.status is not RouteStatus.OK:
+            return False
+        row, col = self._grid.row_col(route.start)
+        at = np.flatnonzero((follower.rows == row) & (follower.cols == col))
+        if not len(at):
+            return True
+        rest = old.directions[int(at[0]) :]
+        # Of a route cut off after some steps, more of the same is no news before it nears its end.
+        if old.remaining_s > 0 and route.remaining_s > 0 and 2 * len(rest) >= len(route.directions):
+            return not route.directions.startswith(rest)
+        return rest != route.directions
+
+
+def route_cells(grid: GridSpec, route: Route) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(rows, cols) of the cells of a route, its start included."""
+    if route.status is not RouteStatus.OK:
+        return _NOWHERE, _NOWHERE
+    row, col = grid.row_col(route.start)
+    codes = np.frombuffer(route.directions, np.uint8)
+    rows, cols = np.empty(len(codes) + 1, np.int64), np.empty(len(codes) + 1, np.int64)
+    rows[0], cols[0] = row, col
+    rows[1:] = row + np.cumsum(_STEP_ROW[codes])
+    cols[1:] = col + np.cumsum(_STEP_COL[codes])
+    return rows, cols
+
+
+def _crosses(follower: Follower, window: Window) -> bool:
+    """Whether the route passes through a window or next to it: a diagonal step depends on the cells beside it."""
+    rows, cols = follower.rows, follower.cols
+    return bool(
+        (
+            (rows >= window.row0 - 1) & (rows <= window.row1) & (cols >= window.col0 - 1) & (cols <= window.col1)
+        ).any()
+    )

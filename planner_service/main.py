@@ -1,0 +1,33 @@
+"""The planner of one target, as a process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+
+from planner_service.service import PlannerService
+from shared_map.terrain import load_terrain
+from swarm.clock import MonotonicClock
+from swarm.errors import ConfigError
+from swarm.process import Inbox, Process, ThreadWorker, end_with
+from swarm.role import RoleSetup
+from swarm.zenoh_bus import open_bus
+
+
+def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+    """Plan for the target `setup.id` until SIGTERM, SIGINT or the end of the launcher."""
+    scenario = setup.scenario
+    if setup.id not in scenario.target_ids:
+        raise ConfigError(
+            f"scenario {scenario.name} has no target {setup.id}; it has {', '.join(scenario.target_ids)}"
+        )
+    terrain = load_terrain(setup)
+    clock = MonotonicClock()
+    inbox = Inbox()
+    with open_bus(scenario.network) as bus, closing(ThreadWorker("grow-tree", inbox, clock)) as worker:
+        service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
+        process = Process(service, inbox, clock, scenario.planner.tick_hz)
+        process.stop_on_signals()
+        if stop_when is not None:
+            end_with(stop_when, process.stop)
+        process.run()

@@ -1,0 +1,378 @@
+"""The planner of one target: when to grow, what to answer, whom to tell. Events in, actions out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from planner_service.events import (
+    Action,
+    AnswerCosts,
+    AnswerRoutes,
+    CostsAsked,
+    Event,
+    FleetHeard,
+    GrowTree,
+    PoseHeard,
+    Push,
+    RoutesAsked,
+    Tell,
+    TreeGrown,
+)
+from planner_service.followers import Follower, Followers
+from planner_service.strategies import GrownTree, TargetTree, Update
+from shared_map.cost_map import CostMap, merged
+from swarm.clock import NS_PER_S
+from swarm.config import PlannerConfig
+from swarm.grid import Window
+from swarm.messages import (
+    CostReply,
+    CostRequest,
+    PlannerStatus,
+    PushedRoute,
+    Route,
+    RouteReply,
+    RouteRequest,
+    RouteStatus,
+    TargetPose,
+    pack_column,
+)
+from swarm.stats import Counters
+
+FOLLOWER_LEASE_NS = 5 * NS_PER_S
+STATUS_NS = NS_PER_S // 2
+MODEL_NS_PER_CELL = 20
+"""What visiting a cell is taken to cost where no stopwatch is given."""
+
+COUNTS = ("routes_served", "growths", "window_growths", "routes_pushed", "costs_served", "growths_late")
+
+
+class Planner:
+    """Keeps the tree of one target, and answers from it.
+
+    Poses and map changes are taken in once per tick, however many there were; at most one full growth is under
+    way, and what changes meanwhile is made up for when it is adopted. Answers never wait for a growth: before the
+    first they are NO_TARGET. The cost map is its owner's, who applies marks to it between calls.
+
+    stopwatch       times growths on this thread; without one they take what a model says, as in a simulation
+    newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
+    """
+
+    def __init__(
+        self,
+        target: str,
+        incarnation: int,
+        config: PlannerConfig,
+        tree: TargetTree,
+        cost_map: CostMap,
+        counters: Counters,
+        *,
+        route_cells: int = 0,
+        stopwatch: Callable[[], int] | None = None,
+        newest_mark_ns: Callable[[], int | None] = lambda: None,
+    ) -> None:
+        self.target = target
+        self.tree = tree
+        self.counters = counters
+        self._incarnation = incarnation
+        self._config = config
+        self._grid = cost_map.grid
+        self._cost_map = cost_map
+        self._stopwatch = stopwatch
+        self._newest_mark_ns = newest_mark_ns
+        self._push_ns = int(config.push_s * NS_PER_S)
+        self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
+        self._pose: TargetPose | None = None
+        self._told: tuple[int, int] | None = None  # target cell and map version that the tree knows
+        self._growing_since_ns: int | None = None
+        self._dirty_since_snapshot: list[Window] = []
+        self._unseen_mark_ns: int | None = None
+        self._wants_full = False
+        self._full_due_ns = 0
+        self._forced: set[int] = set()
+        self._exact_ns: int | None = None
+        self._window: Window = Window(0, 0, 0, 0)
+        self._growth_ms = 0.0
+        self._gaps: tuple[float, float, float] | None = None
+        self._status_due_ns = 0
+        for name in COUNTS:
+            counters.count(name, 0)
+
+    def handle(self, event: Event, now_ns: int) -> list[Action]:
+        match event:
+            case PoseHeard(pose):
+                self._hear_pose(pose)
+            case FleetHeard(fleet):
+                self.followers.hear(fleet, now_ns)
+            case RoutesAsked(ask, request):
+                return [AnswerRoutes(ask, self._routes(request, now_ns))]
+            case CostsAsked(ask, request):
+                return [AnswerCosts(ask, self._costs(request, now_ns))]
+            case TreeGrown(grown, took_ns):
+                return self._adopt(grown, took_ns, now_ns)
+        return []
+
+    def tick(self, now_ns: int) -> list[Action]:
+        """Bring the tree up to date, push newer routes, tell how we are doing."""
+        actions = self._keep_up(now_ns)
+        self.followers.drop_silent(now_ns)
+        actions.extend(self._pushes(now_ns))
+        if now_ns >= self._status_due_ns:
+            self._status_due_ns = now_ns + STATUS_NS
+            actions.append(Tell(self.status(now_ns)))
+        return actions
+
+    def growth(self, action: GrowTree) -> Callable[[], GrownTree]:
+        """The long work of a `GrowTree`, on a snapshot of the map as it was decided on."""
+        snapshot = self._cost_map.snapshot()
+        if snapshot.version != action.map_version:
+            raise RuntimeError(f"growth was decided on map {action.map_version}, the map is at {snapshot.version}")
+        return self.tree.full_job(snapshot.pace_s_per_m, action.target_cell, action.map_version)
+
+    # --- the tree -----------------------------------------------------------------------------------------------
+
+    def _hear_pose(self, pose: TargetPose) -> None:
+        known = self._pose
+        if pose.target != self.target:
+            return
+        if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):
+            self._pose = pose
+
+    def _keep_up(self, now_ns: int) -> list[Action]:
+        """Take in the newest pose and all map changes since the last time, if there are any."""
+        if self._pose is None:
+            return []  # the first growth takes the map as it is then, whatever changed before
+        now_known = (self._pose.cell, self._cost_map.version)
+        if now_known != self._told:
+            self._take_in(now_known, now_ns)
+        if self._wants_full and self._growing_since_ns is None:
+            return [self._grow(now_ns)]
+        return []
+
+    def _take_in(self, news: tuple[int, int], now_ns: int) -> None:
+        dirty = self._take_dirty()
+        began_ns = self._now()
+        update = self.tree.update(self._cost_map.pace_s_per_m, news[0], dirty, news[1])
+        self._told = news
+        self._timed(update, self._now() - began_ns, now_ns)
+        self._changed(update, dirty, now_ns)
+
+    def _take_dirty(self) -> list[Window]:
+        dirty = self._cost_map.take_dirty()
+        if self._growing_since_ns is not None:
+            self._dirty_since_snapshot = merged([*self._dirty_since_snapshot, *dirty])
+        stamp_ns = self._newest_mark_ns()
+        if stamp_ns is not None:
+            self._unseen_mark_ns = max(stamp_ns, self._unseen_mark_ns or 0)
+        return dirty
+
+    def _grow(self, now_ns: int) -> GrowTree:
+        assert self._told is not None
+        self._growing_since_ns = now_ns
+        self._dirty_since_snapshot = []
+        self._wants_full = False
+        return GrowTree(*self._told)
+
+    def _adopt(self, grown: GrownTree, took_ns: int, now_ns: int) -> list[Action]:
+        """Replace the tree by what the worker grew, and make up for what happened meanwhile."""
+        if self._growing_since_ns is None or self._pose is None:
+            return []
+        snapshot_ns = self._growing_since_ns
+        news = (self._pose.cell, self._cost_map.version)
+        dirty = self._take_dirty()
+        self._growing_since_ns = None
+        update = self.tree.adopt(
+            grown,
+            self._cost_map.pace_s_per_m,
+            *(news[0], self._dirty_since_snapshot, news[1]),
+            self.followers.cells,
+        )
+        self._told = news
+        self._wants_full = False  # all that happened until now is in what `adopt` says
+        self._grown(took_ns)
+        if grown.map_version == news[1] and grown.target_cell == news[0]:
+            self._exact_ns = now_ns
+        else:
+            self.counters.count("growths_late")
+            self._exact_ns = snapshot_ns
+        self._measure_gaps()
+        self._changed(update, dirty, now_ns)
+        return [self._grow(now_ns)] if self._wants_full else []
+
+    def _changed(self, update: Update, dirty: Sequence[Window], now_ns: int) -> None:
+        """The tree is another than before."""
+        self._wants_full |= update.wants_full
+        self._forced.clear()
+        if not update.window.empty:
+            self._window = update.window
+        if not self.tree.ready:
+            return
+        self.followers.touch(update.window, dirty)
+        put_off = update.wants_full and update.kind == "none"
+        if self._unseen_mark_ns is not None and not put_off:
+            self.counters.observe("mark_to_tree_ms", max(now_ns - self._unseen_mark_ns, 0) / 1e6)
+            self._unseen_mark_ns = None
+
+    def _timed(self, update: Update, took_ns: int, now_ns: int) -> None:
+        """Note what work on this thread cost."""
+        if self._stopwatch is None:
+            took_ns = update.cells * MODEL_NS_PER_CELL
+        if update.kind == "full":
+            self._exact_ns = now_ns
+            self._grown(took_ns)
+            self._measure_gaps()
+        elif update.kind != "none":
+            self.counters.count("window_growths")
+            self.counters.observe("window_ms", took_ns / 1e6)
+
+    def _grown(self, took_ns: int) -> None:
+        self.counters.count("growths")
+        self._growth_ms = took_ns / 1e6
+        self.counters.observe("growth_ms", self._growth_ms)
+        if self._stopwatch is not None:
+            self.tree.observe_full_ns(took_ns)
+
+    def _measure_gaps(self) -> None:
+        gaps = self.tree.last_gaps
+        gaps = gaps[np.isfinite(gaps)]
+        if not len(gaps):
+            return
+        self._gaps = (float(gaps.mean()), float(np.quantile(gaps, 0.95)), float(gaps.max()))
+        for gap in gaps.tolist():
+            self.counters.observe("gap", gap)
+            self.counters.observe("gap_excess", max(gap - 1.0, 0.0))
+
+    def _now(self) -> int:
+        return 0 if self._stopwatch is None else self._stopwatch()
+
+    # --- answers ------------------------------------------------------------------------------------------------
+
+    def _routes(self, request: RouteRequest, now_ns: int) -> RouteReply:
+        cells = self._cells(request)
+        if request.force and self.tree.ready:
+            self._force(cells, now_ns)
+        routes = self.tree.routes(self._cost_map.pace_s_per_m, cells, request.max_cells)
+        self.counters.count("routes_served", len(routes))
+        self._certify(routes, now_ns)
+        for vehicle, route in zip(request.vehicles, routes, strict=False):
+            self.followers.given(vehicle, route, request.max_cells, now_ns, now_ns + self._push_ns)
+        return RouteReply(
+            target=self.target,
+            incarnation=self._incarnation,
+            target_cell=self.tree.target_cell,
+            map_version=max(self.tree.map_version, 0),
+            tree_age_ms=self._age_ms(now_ns),
+            rows=self._grid.rows,
+            cols=self._grid.cols,
+            routes=routes,
+        )
+
+    def _force(self, cells: list[int], now_ns: int) -> None:
+        """Cover cells, once each between two changes of the tree: asking again costs nothing."""
+        fresh = sorted({cell for cell in cells if 0 <= cell < self._grid.cells} - self._forced)
+        if not fresh:
+            return
+        began_ns = self._now()
+        update = self.tree.force(self._cost_map.pace_s_per_m, fresh)
+        self._timed(update, self._now() - began_ns, now_ns)
+        if update.kind != "none":
+            self._changed(update, (), now_ns)
+        self._wants_full |= update.wants_full
+        self._forced.update(fresh)
+
+    def _certify(self, routes: Sequence[Route], now_ns: int) -> None:
+        """Keep the books of proven gaps. One that is too wide asks for a full growth, now and then."""
+        widest = 1.0
+        for route in routes:
+            if route.status is RouteStatus.OK:
+                gap = route.gap
+                widest = max(widest, gap)
+                if math.isfinite(gap):
+                    self.counters.observe("certified_gap", gap)
+                    self.counters.observe("certified_gap_excess", gap - 1.0)
+        if widest > self._config.max_gap and now_ns >= self._full_due_ns:
+            self._full_due_ns = now_ns + self._push_ns
+            self._wants_full = True
+
+    def _costs(self, request: CostRequest, now_ns: int) -> CostReply:
+        cells = self._cells(request)
+        self.counters.count("costs_served", len(cells))
+        return CostReply(
+            target=self.target,
+            incarnation=self._incarnation,
+            target_cell=self.tree.target_cell,
+            map_version=max(self.tree.map_version, 0),
+            tree_age_ms=self._age_ms(now_ns),
+            cost_to_go_s=pack_column(self.tree.cost_to_go_at(cells), "<f4"),
+        )
+
+    def _cells(self, request: RouteRequest | CostRequest) -> list[int]:
+        """The cells asked for; a person's row and col come last, as -1 where they are outside."""
+        if request.row is None or request.col is None:
+            return request.cells
+        inside = self._grid.inside(request.row, request.col)
+        return [*request.cells, self._grid.cell(request.row, request.col) if inside else -1]
+
+    def _age_ms(self, now_ns: int) -> float:
+        return math.inf if self._exact_ns is None else (now_ns - self._exact_ns) / 1e6
+
+    # --- what is told unasked -----------------------------------------------------------------------------------
+
+    def _pushes(self, now_ns: int) -> list[Action]:
+        """Newer routes for those whom a change concerns and who have not had one for a while."""
+        target_cell = self.tree.target_cell
+        if not self.tree.ready or target_cell is None:
+            return []
+        due: dict[int, list[tuple[str, Follower]]] = {}
+        for id, follower in self.followers.due(now_ns):
+            due.setdefault(follower.max_cells, []).append((id, follower))
+        pushes: list[Action] = []
+        for max_cells, batch in due.items():
+            cells = [follower.cell for _, follower in batch]
+            routes = self.tree.routes(self._cost_map.pace_s_per_m, cells, max_cells)
+            for (id, follower), route in zip(batch, routes, strict=True):
+                follower.stale = False
+                if route.status not in _WORTH_PUSHING or not self.followers.is_news(follower, route):
+                    continue
+                self.followers.sent(follower, route, now_ns + self._push_ns)
+                pushes.append(Push(self._pushed(id, route, target_cell)))
+        self.counters.count("routes_pushed", len(pushes))
+        return pushes
+
+    def _pushed(self, vehicle: str, route: Route, target_cell: int) -> PushedRoute:
+        return PushedRoute(
+            vehicle=vehicle,
+            target=self.target,
+            incarnation=self._incarnation,
+            target_cell=target_cell,
+            map_version=max(self.tree.map_version, 0),
+            route=route,
+        )
+
+    def status(self, now_ns: int) -> PlannerStatus:
+        window, counts = self._window, self.counters.counts
+        mean, p95, highest = self._gaps or (None, None, None)
+        return PlannerStatus(
+            target=self.target,
+            incarnation=self._incarnation,
+            stamp_ns=now_ns,
+            strategy=self._config.strategy,
+            target_cell=None if self._pose is None else self._pose.cell,
+            map_version=max(self.tree.map_version, 0),
+            tree_age_ms=self._age_ms(now_ns),
+            window=[] if window.empty else [window.row0, window.col0, window.row1, window.col1],
+            growths=counts["growths"],
+            window_growths=counts["window_growths"],
+            growth_ms=self._growth_ms,
+            routes_served=counts["routes_served"],
+            following=len(self.followers),
+            gap_mean=mean,
+            gap_p95=p95,
+            gap_max=highest,
+        )
+
+
+_WORTH_PUSHING = (RouteStatus.OK, RouteStatus.UNREACHABLE)
+"""A vehicle wants to know of a way, and that there is none any more."""

@@ -1,0 +1,135 @@
+"""The planner's shell: the core's events from the bus, its actions to the bus and the worker."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from planner_service.events import (
+    Action,
+    AnswerCosts,
+    AnswerRoutes,
+    CostsAsked,
+    FleetHeard,
+    GrowTree,
+    PoseHeard,
+    Push,
+    RoutesAsked,
+    Tell,
+    TreeGrown,
+)
+from planner_service.planner import Planner
+from planner_service.strategies import GrownTree, TargetTree
+from shared_map.cost_map import CostMap
+from shared_map.feed import MapFeed
+from shared_map.replica import MapReplica
+from shared_map.terrain import Terrain
+from swarm.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
+from swarm.membership import Member
+from swarm.messages import CostRequest, Fleet, RouteRequest, TargetPose
+from swarm.role import RoleSetup
+from swarm.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, STATUS
+
+log = logging.getLogger(__name__)
+
+_GROW = "grow-tree"
+
+
+class PlannerService:
+    """Serves routes and costs to the target that the process is named after.
+
+    stopwatch  the clock that growths on this thread are timed with; a simulation gives none, and a model is used
+    """
+
+    def __init__(
+        self,
+        setup: RoleSetup,
+        terrain: Terrain,
+        bus: Bus,
+        post: Post,
+        worker: Worker,
+        stopwatch: Callable[[], int] | None = None,
+    ) -> None:
+        scenario = setup.scenario
+        self._target = setup.id
+        self._bus = bus
+        self._post = post
+        self._worker = worker
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self.counters = self._member.counters
+        self._cost_map = CostMap(terrain)
+        self._replica = MapReplica(terrain.grid, self._cost_map)
+        self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role)
+        self._planner = Planner(
+            setup.id,
+            setup.incarnation,
+            scenario.planner,
+            TargetTree(terrain.grid, scenario.planner),
+            self._cost_map,
+            self.counters,
+            route_cells=scenario.vehicles.route_cells,
+            stopwatch=stopwatch,
+            newest_mark_ns=self._replica.take_newest_stamp_ns,
+        )
+        self._asked: dict[int, Asked] = {}
+        self._asks = 0
+        self._served = False
+        self.counters.count("marks_merged", 0)
+
+    def start(self, now_ns: int) -> None:
+        self._member.join()
+        self._feed.start(now_ns)
+        self._bus.subscribe(POSE, self._post, target=self._target)
+        self._bus.subscribe(FLEET, self._post)
+        self._bus.serve(ROUTE, self._post, target=self._target)
+        self._bus.serve(COST, self._post, target=self._target)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if self._member.handle(event) or self._feed.handle(event, now_ns):
+            return
+        match event:
+            case Heard(message=TargetPose() as pose):
+                self._perform(self._planner.handle(PoseHeard(pose), now_ns))
+            case Heard(message=Fleet() as fleet):
+                self._perform(self._planner.handle(FleetHeard(fleet), now_ns))
+            case Asked(request=RouteRequest() as routes):
+                self._perform(self._planner.handle(RoutesAsked(self._remember(event), routes), now_ns))
+            case Asked(request=CostRequest() as costs):
+                self._perform(self._planner.handle(CostsAsked(self._remember(event), costs), now_ns))
+            case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag == _GROW:
+                self._perform(self._planner.handle(TreeGrown(grown, took_ns), now_ns))
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> None:
+        self._feed.tick(now_ns)
+        self._perform(self._planner.tick(now_ns))
+        self.counters.counts["marks_merged"] = self._replica.counts["marks_merged"]
+        if self._planner.tree.ready and not self._served:
+            self._served = True
+            log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
+        self._member.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        self._bus.publish(STATUS, self._planner.status(now_ns), target=self._target)
+        self._member.publish_stats(now_ns)
+
+    def _remember(self, asked: Asked) -> int:
+        self._asks += 1
+        self._asked[self._asks] = asked
+        return self._asks
+
+    def _perform(self, actions: list[Action]) -> None:
+        for action in actions:
+            match action:
+                case AnswerRoutes(ask, reply) | AnswerCosts(ask, reply):
+                    asked = self._asked.pop(ask)
+                    asked.answer(reply, target=self._target)
+                    asked.end()
+                case GrowTree():
+                    model_ns = self._planner.tree.measured_model_ns()
+                    self._worker.submit(_GROW, self._planner.growth(action), self._post, model_ns)
+                case Push(pushed):
+                    self._bus.publish(PUSHED_ROUTE, pushed, vehicle=pushed.vehicle)
+                case Tell(status):
+                    self._bus.publish(STATUS, status, target=self._target)
