@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 _PANEL = "Ask a running swarm"
+_CONNECT_S = 3.0
 _ROUTE_TIMEOUT_S = 5.0
 _STATUS_LISTEN_S = 1.5
 
@@ -28,10 +29,13 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def _network(connect: str, namespace: str, tls: tuple[str | None, str | None, str | None]) -> NetworkConfig:
+    import msgspec
+
     from launch_scripts.options import tls_of, with_network
     from swarm.config import Scenario
 
-    return with_network(Scenario(), connect=connect, namespace=namespace, tls=tls_of(*tls)).network
+    chosen = with_network(Scenario(), connect=connect, namespace=namespace, tls=tls_of(*tls)).network
+    return msgspec.structs.replace(chosen, connect_timeout_s=_CONNECT_S)
 
 
 @app.command(rich_help_panel=_PANEL)

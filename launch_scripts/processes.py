@@ -51,7 +51,7 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES) -> list[Pro
         "keeper": ["0"],
         "monitor": ["0"],
         "planner": scenario.target_ids,
-        "targets": ["0"],
+        "targets": ["0"] if any(target.walk != "external" for target in scenario.targets) else [],
         "agent": [plan.id for plan in plan_agents(scenario)],
     }
     return [ProcessSpec(role, id, ENTRIES[role]) for role in ROLES if role in roles for id in ids[role]]
