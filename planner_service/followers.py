@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,8 @@ class Follower:
     max_cells: int
     heard_ns: int
     route: Route | None = None
-    rows: NDArray[np.int64] = _NOWHERE
-    cols: NDArray[np.int64] = _NOWHERE
+    rows: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
+    cols: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
     stale: bool = False
     push_ns: int = 0
     stamp_ns: int = -1
