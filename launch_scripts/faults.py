@@ -1,0 +1,138 @@
+"""What goes wrong in a simulation: a plan that a seed makes, and the links that follow it.
+
+Nodes are named as processes are: "keeper-0", "planner-t3", "agent-a1". Times are seconds since the run began.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from swarm.clock import NS_PER_S
+
+RELINK_S = 0.3
+"""How long a client needs to find its router again: the retry period, and a session's start."""
+OBSERVER = "recorder-0"
+"""The node that writes the report: nothing goes wrong with it, or the report would."""
+_NS_PER_MS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Partition:
+    """These nodes and all others do not reach each other for a while; among themselves they do."""
+
+    from_s: float
+    until_s: float
+    nodes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Crash:
+    """A process is killed: nothing is said, nothing saved. It is started again after a backoff."""
+
+    at_s: float
+    node: str
+
+
+@dataclass(frozen=True, slots=True)
+class FaultPlan:
+    """Everything that goes wrong in one run.
+
+    drop        share of messages that are lost
+    duplicate   share that arrive twice
+    reorder     share that later ones overtake
+    delay_ms    every message takes this long, and up to jitter_ms more
+    quiet_s     from here on messages are neither lost, repeated nor reordered; None is never
+    skews_ms    how far a node's clock is off
+    """
+
+    drop: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    delay_ms: float = 0.2
+    jitter_ms: float = 0.0
+    quiet_s: float | None = None
+    partitions: tuple[Partition, ...] = ()
+    crashes: tuple[Crash, ...] = ()
+    skews_ms: Mapping[str, float] = field(default_factory=dict)
+
+
+class FaultyLinks:
+    """The `LinkModel` of a plan. Messages of one node to another keep their order, but those that are reordered."""
+
+    def __init__(self, plan: FaultPlan, chance: random.Random, began_ns: int, lease_s: float) -> None:
+        self._plan = plan
+        self._chance = chance
+        self._began_ns = began_ns
+        self._lease_s = lease_s
+        self._last_ns: dict[tuple[str, str], int] = {}
+
+    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
+        plan, chance = self._plan, self._chance
+        if OBSERVER in (source, destination):
+            return (_NS_PER_MS,)
+        at_s = (now_ns - self._began_ns) / NS_PER_S
+        if any(_apart(each, source, destination) and self._cut(each, at_s) for each in plan.partitions):
+            return ()
+        quiet = plan.quiet_s is not None and at_s >= plan.quiet_s
+        if not quiet and plan.drop and chance.random() < plan.drop:
+            return ()
+        delay_ns = int((plan.delay_ms + chance.random() * plan.jitter_ms) * _NS_PER_MS)
+        if not quiet and plan.reorder and chance.random() < plan.reorder:
+            return (delay_ns + int((1 + chance.random() * 99) * _NS_PER_MS),)
+        link = (source, destination)
+        arrival_ns = max(now_ns + delay_ns, self._last_ns.get(link, 0))
+        self._last_ns[link] = arrival_ns
+        if not quiet and plan.duplicate and chance.random() < plan.duplicate:
+            return (arrival_ns - now_ns, arrival_ns - now_ns + int(chance.random() * 100 * _NS_PER_MS))
+        return (arrival_ns - now_ns,)
+
+    def connected(self, source: str, destination: str, now_ns: int) -> bool:
+        at_s = (now_ns - self._began_ns) / NS_PER_S
+        return not any(
+            _apart(each, source, destination) and self.noticed(each) and self._known_cut(each, at_s)
+            for each in self._plan.partitions
+            if OBSERVER not in (source, destination)
+        )
+
+    def noticed(self, partition: Partition) -> bool:
+        """Whether it lasts longer than the lease, so that sessions end and tokens fall."""
+        return partition.until_s - partition.from_s > self._lease_s
+
+    def _cut(self, partition: Partition, at_s: float) -> bool:
+        back_s = partition.until_s + (RELINK_S if self.noticed(partition) else 0.0)
+        return partition.from_s <= at_s < back_s
+
+    def _known_cut(self, partition: Partition, at_s: float) -> bool:
+        return partition.from_s + self._lease_s <= at_s < partition.until_s + RELINK_S
+
+
+def _apart(partition: Partition, source: str, destination: str) -> bool:
+    return (source in partition.nodes) != (destination in partition.nodes)
+
+
+def random_plan(seed: int, nodes: Sequence[str], seconds: float) -> FaultPlan:
+    """A plan for a run of these nodes: faults in its first two thirds, quiet in the last."""
+    chance = random.Random(f"faults/{seed}")
+    quiet_s = seconds * 2 / 3
+    partitions = []
+    for _ in range(chance.randrange(3)):
+        from_s = chance.uniform(0.1, 0.7) * quiet_s
+        lasts_s = min(chance.choice((0.5, 4.0)), quiet_s - from_s)
+        cut_off = chance.sample(sorted(nodes), chance.randint(1, max(1, len(nodes) // 3)))
+        partitions.append(Partition(from_s, from_s + lasts_s, tuple(sorted(cut_off))))
+    crashes = [
+        Crash(chance.uniform(0.1, 0.95) * quiet_s, chance.choice(sorted(nodes))) for _ in range(chance.randrange(4))
+    ]
+    return FaultPlan(
+        drop=chance.choice((0.0, 0.01, 0.1)),
+        duplicate=chance.choice((0.0, 0.01, 0.1)),
+        reorder=chance.choice((0.0, 0.01, 0.1)),
+        delay_ms=chance.choice((0.2, 5.0)),
+        jitter_ms=chance.choice((0.0, 1.0, 30.0)),
+        quiet_s=quiet_s,
+        partitions=tuple(partitions),
+        crashes=tuple(sorted(crashes, key=lambda crash: (crash.at_s, crash.node))),
+        skews_ms={node: chance.uniform(-200, 200) for node in sorted(nodes) if chance.random() < 0.3},
+    )
