@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
+from typing import Any
 
 from rich.console import Console
 from rich.live import Live
+from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.live_table import live_table, plain_line
@@ -15,6 +17,28 @@ from launch_scripts.record import LiveSummary
 
 _PLAIN_EVERY_S = 5.0
 _DRAW_EVERY_S = 0.25
+
+REPORTED = {
+    "seconds": "seconds",
+    "startup_s": "start-up, s",
+    "processes": "processes",
+    "restarts": "restarts",
+    "vehicles_routed": "vehicles that had a route",
+    "captures": "captures",
+    "marks": "marks",
+    "reroute_requests": "re-route requests",
+    "routes_served": "routes served",
+    "stranded": "stranded at the end",
+    "lost": "lost at the end",
+    "collisions": "collisions",
+    "lethal_entries": "lethal cells entered",
+    "gap": "gap to the optimum",
+    "growth_ms": "growing a tree, ms",
+    "route_query_ms": "asking for a route, ms",
+    "mark_to_tree_ms": "from mark to tree, ms",
+    "messages_per_s": "messages/s",
+    "payloads_dropped": "payloads dropped",
+}
 
 
 class Screen:
@@ -49,8 +73,24 @@ class Screen:
             self._live.start()
         self._live.update(table, refresh=True)
 
+    def report(self, numbers: Mapping[str, Any]) -> None:
+        """What a run came to."""
+        table = Table(show_header=False, box=None, pad_edge=False)
+        for name, value in numbers.items():
+            if name in REPORTED:
+                table.add_row(REPORTED[name], _plain(value))
+        self._console.print(table)
+
     def close(self) -> None:
         """Leave the table as it stands."""
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return "not measured"
+    if isinstance(value, dict):
+        return "  ".join(f"{name} {_plain(part)}" for name, part in value.items())
+    return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"

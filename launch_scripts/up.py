@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from launch_scripts.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.options import check_ports, listening, make_run_dir, new_run_id
 from launch_scripts.processes import ROLES, ProcessSpec, processes_of
 from launch_scripts.record import Recorder
+from launch_scripts.report import write_report
 from launch_scripts.screen import Screen
 from launch_scripts.watcher import Watcher, ask_run
 from shared_map.terrain import Terrain, build_terrain, build_truth, save_prepared
@@ -147,7 +147,8 @@ class _Run:
 
     def _prepare(self) -> Terrain:
         terrain = build_terrain(self._scenario)
-        save_prepared(self._run_dir, terrain, build_truth(self._scenario, terrain))
+        self._truth = build_truth(self._scenario, terrain)
+        save_prepared(self._run_dir, terrain, self._truth)
         return terrain
 
     def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
@@ -255,17 +256,20 @@ class _Run:
         self._screen.say(f"logs, recording and report: {self._run_dir}")
 
     def _report(self, recorder: Recorder, seconds: float) -> None:
-        report = recorder.report(
+        report = write_report(
+            self._run_dir,
+            recorder,
+            self._terrain,
+            truth=self._truth,
             run_id=self._run_id,
             seconds=seconds,
             processes=len(self._swarm.running),
             restarts=self._swarm.restarts,
             startup_s=self._startup_s,
         )
-        self._write(report, recorder)
+        numbers = {name: value for name, value in report.items() if name != "series"}
         if self._options.as_json:
-            print(json.dumps(report, indent=2))
-
-    def _write(self, report: dict[str, Any], recorder: Recorder) -> None:
-        path = self._run_dir / "report.json"
-        path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+            print(json.dumps(numbers, indent=2))
+        else:
+            self._screen.report(numbers)
+            self._screen.say(f"report: {self._run_dir / 'report.json'}, picture: {self._run_dir / 'report.png'}")
