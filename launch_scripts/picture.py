@@ -31,6 +31,7 @@ from launch_scripts.palette import (
 )
 from launch_scripts.plots import draw_plots, halo
 from launch_scripts.record import Recorder
+from launch_scripts.relief import hillshade
 from shared_map.terrain import Terrain
 from swarm.messages import MarkKind
 
@@ -173,20 +174,6 @@ def _ground(terrain: Terrain) -> NDArray[np.float32]:
     paled = 0.55 * (0.65 * photo + 0.35 * grey) + 0.45
     lit: NDArray[np.float32] = np.clip(paled * (0.62 + 0.55 * shade[..., None]), 0, 1).astype(np.float32)
     return lit
-
-
-def hillshade(elevation_m: NDArray[np.float32], resolution_m: float) -> NDArray[np.float32]:
-    """0 to 1: the light of a low sun in the north-west on each cell; 0.7 in voids."""
-    if min(elevation_m.shape) < 2:
-        return np.full(elevation_m.shape, 0.7, np.float32)
-    south, east = np.gradient(elevation_m.astype(np.float64), resolution_m)
-    steep = np.nanpercentile(np.hypot(south, east), 98) if np.isfinite(south).any() else 0.0
-    stretch = 0.9 / steep if steep > 0 else 0.0  # gentle land would look flat, and mountains black and white
-    south, east = south * stretch, east * stretch
-    sun = np.array([-1.0, -1.0, 1.4]) / math.sqrt(1 + 1 + 1.4**2)
-    light = (-east * sun[0] - south * sun[1] + sun[2]) / np.sqrt(1 + east**2 + south**2)
-    shade: NDArray[np.float32] = np.nan_to_num(np.clip(light, 0, 1), nan=0.7).astype(np.float32)
-    return shade
 
 
 def _draw_unknown(axes: Axes, terrain: Terrain, truth: NDArray[np.float32]) -> None:

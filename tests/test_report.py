@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from launch_scripts import picture
 from launch_scripts.record import Recorder
+from launch_scripts.relief import hillshade
 from launch_scripts.report import write_report
 from shared_map.terrain import Terrain, terrain_of_pace
 from swarm.config import Scenario, parse_scenario
@@ -153,6 +154,6 @@ def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenari
 
 def test_a_slope_that_faces_the_sun_is_brighter_than_one_that_does_not() -> None:
     across = np.arange(20, dtype=np.float32)[None, :].repeat(20, 0) * 5
-    rising_east, falling_east = picture.hillshade(across, 10.0), picture.hillshade(-across, 10.0)
+    rising_east, falling_east = hillshade(across, 10.0), hillshade(-across, 10.0)
     assert rising_east.mean() > falling_east.mean() + 0.3
-    assert np.isfinite(picture.hillshade(np.full((5, 5), np.nan, np.float32), 10.0)).all()
+    assert np.isfinite(hillshade(np.full((5, 5), np.nan, np.float32), 10.0)).all()

@@ -1,0 +1,69 @@
+"""How the live view is arranged."""
+
+from __future__ import annotations
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from launch_scripts.monitor.scene import Ground
+
+BACKGROUND = (17, 22, 28)
+TRAIL_S = 25.0
+
+
+def make_blueprint(ground: Ground) -> rrb.Blueprint:
+    """The mountains on the left; figures, plots and the log on the right."""
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            _view_3d(ground),
+            rrb.Vertical(
+                rrb.TextDocumentView(origin="/summary", name="Now"),
+                _plot("captures_and_marks", "Captures, marks"),
+                _plot("states", "Vehicles by state"),
+                _plot("gap", "Gap to optimum, %"),
+                _plot("growth_ms", "Growth of the trees, ms"),
+                _plot("messages", "Messages per second"),
+                rrb.TextLogView(origin="/log", name="Log"),
+                row_shares=[1.5, 1, 1, 1, 1, 1, 1.1],
+            ),
+            column_shares=[2.5, 1],
+        ),
+        rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="following"),
+        rrb.BlueprintPanel(state="hidden"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.TopPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _view_3d(ground: Ground) -> rrb.Spatial3DView:
+    middle = (ground.width_m / 2, -ground.depth_m / 2, float(ground.heights_m.mean()))
+    far = max(ground.width_m, ground.depth_m)
+    trail = rr.VisibleTimeRange(
+        "sim_time",
+        start=rr.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
+        end=rr.TimeRangeBoundary.cursor_relative(),
+    )
+    return rrb.Spatial3DView(
+        origin="/world",
+        name="Swarm",
+        background=rrb.Background(color=BACKGROUND),
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=(middle[0] - 0.08 * far, middle[1] - 0.82 * far, middle[2] + 0.74 * far),
+            look_target=(middle[0], middle[1] - 0.03 * far, middle[2]),
+            eye_up=(0, 0, 1),
+        ),
+        overrides={
+            "/world/trails/vehicles": rrb.VisibleTimeRanges([trail]),
+            "/world/trails/targets": rrb.VisibleTimeRanges([trail]),
+        },
+    )
+
+
+def _plot(name: str, title: str) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=f"/plots/{name}", name=title, plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
+    )

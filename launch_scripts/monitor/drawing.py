@@ -1,0 +1,172 @@
+"""The only place that speaks rerun's language: arrays of the scene in, log calls out.
+
+Few entities with many instances each, arrays instead of lists, style logged once: see what was measured in
+docs/architecture.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from launch_scripts import palette
+from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, Ground, MeshTile, Points
+from launch_scripts.record import Sample
+from swarm.messages import VehicleState
+
+_ROUTE_COLOUR = (120, 255, 190, 90)
+_TRAIL_COLOUR = (0, 190, 110)
+_TARGET_TRAIL_COLOUR = (255, 70, 70)
+_WINDOW_COLOUR = (255, 200, 60)
+_PLOT_COLOURS = [
+    tuple(int(colour[n : n + 2], 16) for n in (1, 3, 5))
+    for colour in (
+        *(palette.SKY, palette.ORANGE, palette.GREEN, "#F0E442", palette.PINK, "#D55E00", "#8DA0CB", "#66C2A5"),
+        *("#E5C494", "#B3B3B3", "#A6D854", "#FC8D62"),
+    )
+]
+
+
+class Drawing:
+    """Tells one recording stream what the scene is."""
+
+    def __init__(self, rec: rr.RecordingStream, ground: Ground, target_ids: Sequence[str]) -> None:
+        self._rec = rec
+        self._ground = ground
+        self._target_ids = list(target_ids)
+        self._vehicle_ids: list[str] = []
+        self._vehicle_colours: Bytes = np.empty((0, 3), np.uint8)
+        self._target_ids_drawn: list[str] = []
+
+    def set_time(self, frame: int, seconds: float) -> None:
+        """When all that follows happened. What is logged before the first call shows on no timeline."""
+        self._rec.set_time("tick", sequence=frame)
+        self._rec.set_time("sim_time", duration=seconds)
+
+    def begin(self) -> None:
+        """The ground's shape, and how everything will look."""
+        rec, ground = self._rec, self._ground
+        rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for tile in ground.mesh_tiles():
+            self._tile(tile)
+        thin, line = _screen_points(0.7), _screen_points(1.2)
+        rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [_TRAIL_COLOUR], [line]), static=True)
+        rec.log(
+            "world/trails/targets",
+            _style(rr.LineStrips3D, [_TARGET_TRAIL_COLOUR], [_screen_points(2.2)]),
+            static=True,
+        )
+        rec.log("world/windows", _style(rr.LineStrips3D, [_WINDOW_COLOUR], [line]), static=True)
+        rec.log("world/targets/poles", _style(rr.LineStrips3D, [_TARGET_TRAIL_COLOUR], [line]), static=True)
+        for id in self._target_ids:
+            rec.log(f"world/routes/{id}", _style(rr.LineStrips3D, [_ROUTE_COLOUR], [thin]), static=True)
+        states = [state.name.lower() for state in VehicleState]
+        self._series("states", states, list(STATE_COLOURS.values()))
+        self._series("captures_and_marks", ["captures", "marks / 100"], [(255, 210, 31), (170, 110, 240)])
+        for plot in ("gap", "growth_ms"):
+            self._series(plot, self._target_ids, self._colours())
+        self._series("messages", ["all processes"], [(86, 180, 233)])
+
+    def _colours(self) -> list[tuple[int, ...]]:
+        return [_PLOT_COLOURS[n % len(_PLOT_COLOURS)] for n in range(len(self._target_ids))]
+
+    def _tile(self, tile: MeshTile) -> None:
+        self._rec.log(
+            f"world/ground/{tile.index}",
+            rr.Mesh3D.from_fields(
+                vertex_positions=tile.vertices,
+                triangle_indices=tile.triangles,
+                vertex_texcoords=tile.texcoords,
+            ),
+            static=True,
+        )
+
+    def _series(self, plot: str, names: list[str], colours: Sequence[tuple[int, ...]]) -> None:
+        self._rec.log(f"plots/{plot}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
+
+    def texture(self, tile: int, image: Bytes) -> None:
+        """The photo of a tile, marks and all. Not static: a late viewer gets what was sent of late."""
+        height, width, _ = image.shape
+        self._rec.log(
+            f"world/ground/{tile}",
+            rr.Mesh3D.from_fields(
+                albedo_texture_buffer=np.ascontiguousarray(image).tobytes(),
+                albedo_texture_format=rr.components.ImageFormat(
+                    width=width, height=height, color_model="RGB", channel_datatype="U8"
+                ),
+            ),
+        )
+
+    def vehicles(self, points: Points) -> None:
+        """Places each time, colours and ids only where they changed."""
+        same = points.ids == self._vehicle_ids
+        if same and np.array_equal(points.colours, self._vehicle_colours):
+            self._rec.log("world/vehicles", rr.Points3D.from_fields(positions=points.positions))
+            return
+        self._vehicle_ids, self._vehicle_colours = points.ids, points.colours
+        radii = None if same else [_screen_points(4.0)]
+        self._rec.log(
+            "world/vehicles",
+            rr.Points3D.from_fields(positions=points.positions, colors=points.colours, radii=radii),
+        )
+
+    def targets(self, points: Points, poles: list[Floats]) -> None:
+        self._rec.log("world/targets/poles", rr.LineStrips3D.from_fields(strips=poles))
+        if points.ids == self._target_ids_drawn:
+            self._rec.log("world/targets", rr.Points3D.from_fields(positions=points.positions))
+            return
+        self._target_ids_drawn = points.ids
+        self._rec.log(
+            "world/targets",
+            rr.Points3D(
+                points.positions,
+                colors=points.colours,
+                radii=_screen_points(6.5),
+                labels=points.ids,
+                show_labels=len(points.ids) <= 40,
+            ),
+        )
+
+    def trails(self, who: str, strips: list[Floats]) -> None:
+        """The newest piece of everybody's trail; the view shows the pieces of the last seconds together."""
+        if strips:
+            self._rec.log(f"world/trails/{who}", rr.LineStrips3D.from_fields(strips=strips))
+
+    def routes(self, target: str, strips: list[Floats]) -> None:
+        self._rec.log(f"world/routes/{target}", rr.LineStrips3D.from_fields(strips=strips))
+
+    def windows(self, strips: list[Floats]) -> None:
+        self._rec.log("world/windows", rr.LineStrips3D.from_fields(strips=strips))
+
+    def plots(self, sample: Sample, messages_per_s: float | None) -> None:
+        log = self._scalars
+        log("states", [float(n) for n in sample.states])
+        marks = None if sample.marks is None else sample.marks / 100
+        log("captures_and_marks", [sample.captures, marks])
+        excess = {id: (gap - 1) * 100 for id, gap in sample.gaps.items()}
+        log("gap", [excess.get(id) for id in self._target_ids])
+        log("growth_ms", [sample.growth_ms.get(id) for id in self._target_ids])
+        log("messages", [messages_per_s])
+
+    def _scalars(self, plot: str, values: Sequence[float | None]) -> None:
+        if any(value is not None for value in values):
+            numbers = np.array([math.nan if value is None else value for value in values])
+            self._rec.log(f"plots/{plot}", rr.Scalars(numbers))
+
+    def summary(self, markdown: str) -> None:
+        self._rec.log("summary", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+
+    def note(self, text: str, level: str) -> None:
+        self._rec.log("log", rr.TextLog(text, level=level))
+
+
+def _style(archetype: type[rr.LineStrips3D], colours: list[tuple[int, ...]], radii: list[float]) -> rr.LineStrips3D:
+    return archetype.from_fields(colors=colours, radii=radii)
+
+
+def _screen_points(radius: float) -> float:
+    """A radius that looks the same at every zoom: rerun takes negative ones for points of the screen."""
+    return -radius

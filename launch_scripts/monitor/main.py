@@ -1,0 +1,38 @@
+"""The monitor as a process."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.outlets import Outlets, new_recording_path
+from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.service import MonitorService
+from shared_map.terrain import load_terrain
+from swarm.clock import MonotonicClock
+from swarm.process import Inbox, Process, end_with
+from swarm.role import RoleSetup
+from swarm.zenoh_bus import open_bus
+
+
+def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+    """Record and show the run until SIGTERM, SIGINT or the end of the launcher."""
+    config = setup.scenario.monitor
+    terrain = load_terrain(setup)
+    ground = Ground(terrain)
+    path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
+    inbox = Inbox()
+    with contextlib.ExitStack() as stack:
+        bus = stack.enter_context(open_bus(setup.scenario.network))
+        recording_id = f"{setup.run_id}.{setup.incarnation:x}"
+        outlets = Outlets(recording_id, path, config, make_blueprint(ground))
+        stack.callback(outlets.close)
+        service = MonitorService(
+            setup, terrain, bus, inbox.post, outlets.rec, ground=ground, live_url=outlets.live_url
+        )
+        process = Process(service, inbox, MonotonicClock(), config.frame_hz)
+        process.stop_on_signals()
+        if stop_when is not None:
+            end_with(stop_when, process.stop)
+        process.run()

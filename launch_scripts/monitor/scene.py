@@ -1,0 +1,287 @@
+"""What the live view shows, as arrays: no rerun, no bus, no clock.
+
+The view's metres: x to the east and y to the north of the grid's north-west corner, so y is never positive; z up,
+stretched so that gentle land still looks like land.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.observed import VehicleNow
+from launch_scripts.relief import hillshade
+from shared_map.terrain import Terrain
+from swarm.grid import GridSpec, Window
+from swarm.messages import VehicleState
+
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+MESH_TILE = 64
+"""Side of a mesh tile in texels: a changed mark sends one tile's texture again."""
+_MOST_TEXELS = 1 << 20
+_MOST_VERTICES = 1 << 17
+_RELIEF = 0.09
+"""The highest peak over the lowest valley, as a share of the terrain's width, that looks like mountains."""
+
+STATE_COLOURS = {
+    VehicleState.IDLE: (150, 178, 158),
+    VehicleState.WAITING: (20, 140, 90),
+    VehicleState.FOLLOWING: (0, 230, 118),
+    VehicleState.ARRIVED: (196, 255, 92),
+    VehicleState.STRANDED: (150, 150, 20),
+    VehicleState.LOST: (40, 84, 60),
+}
+TARGET_COLOUR = (255, 46, 46)
+LETHAL_MARK = (86, 22, 150)
+SLOW_MARK = (235, 150, 0)
+FAST_MARK = (90, 200, 250)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshTile:
+    """A piece of the ground.
+
+    window     cells whose photo covers it, one row and column more than its own, so that pieces join without seams
+    vertices   float32 (n, 3); triangles uint32 (m, 3); texcoords float32 (n, 2), 0..1 over the window's photo
+    """
+
+    index: int
+    window: Window
+    vertices: Floats
+    triangles: NDArray[np.uint32]
+    texcoords: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """positions float32 (n, 3), colours uint8 (n, 3), in order of ids."""
+
+    ids: list[str]
+    positions: Floats
+    colours: Bytes
+
+
+class Ground:
+    """The terrain as the view has it."""
+
+    def __init__(self, terrain: Terrain) -> None:
+        self.grid = terrain.grid
+        heights = np.array(terrain.elevation_m, np.float32)
+        voids = ~np.isfinite(heights)
+        lowest = float(heights[~voids].min()) if not voids.all() else 0.0
+        heights[voids] = lowest
+        heights -= lowest
+        self.width_m = self.grid.cols * self.grid.resolution_m
+        self.depth_m = self.grid.rows * self.grid.resolution_m
+        relief_m = float(heights.max())
+        wanted = _RELIEF * max(self.width_m, self.depth_m) / relief_m if relief_m > 0 else 1.0
+        self.stretch = min(max(wanted, 1.0), 8.0)
+        self.heights_m = heights * np.float32(self.stretch)
+        self.photo = _lit_photo(terrain)
+        self.texel = max(1, math.ceil(math.sqrt(self.grid.cells / _MOST_TEXELS)))
+        self.step = self.texel * max(2, math.ceil(math.sqrt(self.grid.cells / self.texel**2 / _MOST_VERTICES)))
+        self.tile_cells = max(MESH_TILE * self.texel // self.step, 1) * self.step
+        self.tile_cols = -(-self.grid.cols // self.tile_cells)
+        self.tile_rows = -(-self.grid.rows // self.tile_cells)
+
+    @property
+    def scale_m(self) -> float:
+        """A length that looks the same share of any terrain."""
+        return max(self.width_m, self.depth_m) / 100
+
+    def place(self, east_m: Floats, south_m: Floats, above_m: float = 0.0) -> Floats:
+        """Points on the ground, lifted by some metres of the view."""
+        east_m, south_m = np.asarray(east_m, np.float32), np.asarray(south_m, np.float32)
+        resolution_m = self.grid.resolution_m
+        rows = np.clip(south_m / resolution_m - 0.5, 0, self.grid.rows - 1)
+        cols = np.clip(east_m / resolution_m - 0.5, 0, self.grid.cols - 1)
+        row0, col0 = rows.astype(np.intp), cols.astype(np.intp)
+        row1, col1 = np.minimum(row0 + 1, self.grid.rows - 1), np.minimum(col0 + 1, self.grid.cols - 1)
+        down, right = rows - row0, cols - col0
+        h = self.heights_m
+        upper = h[row0, col0] * (1 - right) + h[row0, col1] * right
+        lower = h[row1, col0] * (1 - right) + h[row1, col1] * right
+        up = upper * (1 - down) + lower * down + above_m
+        return np.stack([east_m, -south_m, up], axis=-1).astype(np.float32)
+
+    def place_cells(self, cells: NDArray[np.integer], above_m: float = 0.0) -> Floats:
+        """The middles of cells."""
+        rows, cols = np.divmod(np.asarray(cells, np.int64), self.grid.cols)
+        resolution_m = np.float32(self.grid.resolution_m)
+        return self.place(
+            ((cols + 0.5) * resolution_m).astype(np.float32),
+            ((rows + 0.5) * resolution_m).astype(np.float32),
+            above_m,
+        )
+
+    def mesh_tiles(self) -> list[MeshTile]:
+        """The whole ground."""
+        return [self._mesh_tile(index) for index in range(self.tile_rows * self.tile_cols)]
+
+    def tile_window(self, index: int) -> Window:
+        tile_row, tile_col = divmod(index, self.tile_cols)
+        row0, col0 = tile_row * self.tile_cells, tile_col * self.tile_cells
+        return Window(
+            row0,
+            col0,
+            min(row0 + self.tile_cells + self.step, self.grid.rows),
+            min(col0 + self.tile_cells + self.step, self.grid.cols),
+        )
+
+    def tiles_touching(self, window: Window) -> list[int]:
+        """Tiles whose photo shows cells of a window."""
+        reach = self.step
+        rows = range(max(window.row0 - reach, 0) // self.tile_cells, (window.row1 - 1) // self.tile_cells + 1)
+        cols = range(max(window.col0 - reach, 0) // self.tile_cells, (window.col1 - 1) // self.tile_cells + 1)
+        return [row * self.tile_cols + col for row in rows for col in cols]
+
+    def _mesh_tile(self, index: int) -> MeshTile:
+        window = self.tile_window(index)
+        rows = _stepped(window.row0, window.row1, self.step, self.tile_cells)
+        cols = _stepped(window.col0, window.col1, self.step, self.tile_cells)
+        grid_rows, grid_cols = np.meshgrid(rows, cols, indexing="ij")
+        vertices = self.place_cells((grid_rows * self.grid.cols + grid_cols).reshape(-1))
+        height, width = window.row1 - window.row0, window.col1 - window.col0
+        texcoords = np.stack(
+            [(grid_cols - window.col0 + 0.5) / width, (grid_rows - window.row0 + 0.5) / height], axis=-1
+        )
+        return MeshTile(
+            index=index,
+            window=window,
+            vertices=vertices,
+            triangles=_triangles(len(rows), len(cols)),
+            texcoords=texcoords.reshape(-1, 2).astype(np.float32),
+        )
+
+    def texture(self, window: Window, pace: Floats, prior: Floats) -> Bytes:
+        """The photo of a window with what the map has learnt laid over: `pace` is believed now, `prior` was."""
+        part = (slice(window.row0, window.row1), slice(window.col0, window.col1))
+        photo: Bytes = self.photo[part].copy()
+        now, before = pace[part], prior[part]
+        lethal = np.isinf(now) & ~np.isinf(before)
+        slow, fast = np.isfinite(now) & (now > before), np.isfinite(now) & (now < before)
+        for where, colour, share in ((lethal, LETHAL_MARK, 0.85), (slow, SLOW_MARK, 0.75), (fast, FAST_MARK, 0.75)):
+            blend = (1 - share) * photo[where] + share * np.array(colour)
+            photo[where] = blend.astype(np.uint8)
+        return photo[:: self.texel, :: self.texel]
+
+
+def _stepped(first: int, end: int, step: int, tile_cells: int) -> NDArray[np.int64]:
+    """Every step-th index from `first` to the next tile's first, or to the last before `end` at the border."""
+    last = min(first + tile_cells, end - 1)
+    indices = np.arange(first, last + 1, step)
+    return indices if indices[-1] == last else np.append(indices, last)
+
+
+def _triangles(rows: int, cols: int) -> NDArray[np.uint32]:
+    corner = (np.arange(rows - 1)[:, None] * cols + np.arange(cols - 1)[None, :]).reshape(-1)
+    north_west, north_east, south_west, south_east = corner, corner + 1, corner + cols, corner + cols + 1
+    faces = np.concatenate(
+        [np.stack([north_west, south_west, north_east], 1), np.stack([north_east, south_west, south_east], 1)]
+    )
+    return faces.astype(np.uint32)
+
+
+def _lit_photo(terrain: Terrain) -> Bytes:
+    shade = hillshade(terrain.elevation_m, terrain.grid.resolution_m)
+    lit = terrain.photo.astype(np.float32) * (0.5 + 0.75 * shade[..., None])
+    return np.clip(lit, 0, 255).astype(np.uint8)
+
+
+# --- what moves -------------------------------------------------------------------------------------------------
+
+
+def vehicle_points(ground: Ground, vehicles: Mapping[str, VehicleNow]) -> Points:
+    """All vehicles, coloured by state."""
+    now = list(vehicles.values())
+    positions = ground.place(
+        np.array([vehicle.east_m for vehicle in now], np.float32),
+        np.array([vehicle.south_m for vehicle in now], np.float32),
+        0.15 * ground.scale_m,
+    )
+    colours = np.array([STATE_COLOURS[vehicle.state] for vehicle in now], np.uint8).reshape(-1, 3)
+    return Points(list(vehicles), positions.reshape(-1, 3), colours)
+
+
+def target_points(ground: Ground, places_m: Mapping[str, tuple[float, float]]) -> Points:
+    """All targets, on top of poles that show over the hills."""
+    east_south = np.array(list(places_m.values()), np.float32).reshape(-1, 2)
+    positions = ground.place(east_south[:, 0], east_south[:, 1], 2.2 * ground.scale_m)
+    return Points(list(places_m), positions, np.tile(np.array(TARGET_COLOUR, np.uint8), (len(positions), 1)))
+
+
+def poles(ground: Ground, targets: Points) -> list[Floats]:
+    """A line from each target's place down to the ground."""
+    feet = ground.place(targets.positions[:, 0], -targets.positions[:, 1])
+    return [np.stack([foot, top]) for foot, top in zip(feet, targets.positions, strict=True)]
+
+
+def window_outline(ground: Ground, window: Window) -> Floats:
+    """The border of a window, laid over the ground."""
+    rows = np.clip([window.row0, window.row1 - 1], 0, ground.grid.rows - 1)
+    cols = np.clip([window.col0, window.col1 - 1], 0, ground.grid.cols - 1)
+    east, west = (np.full(_along(rows), col) for col in (cols[1], cols[0]))
+    north, south = (np.full(_along(cols), row) for row in (rows[0], rows[1]))
+    across, down = (np.linspace(ends[0], ends[1], _along(ends)).astype(int) for ends in (cols, rows))
+    row_path = np.concatenate([north, down, south, down[::-1]])
+    col_path = np.concatenate([across, east, across[::-1], west])
+    return ground.place_cells(row_path * ground.grid.cols + col_path, 0.25 * ground.scale_m)
+
+
+def _along(ends: NDArray[np.integer]) -> int:
+    return int(min(max((ends[1] - ends[0]) // 4, 1) + 1, 65))
+
+
+def route_strip(ground: Ground, cells: NDArray[np.integer], most: int = 64) -> Floats:
+    """A route over the ground, with few enough points that a hundred of them weigh little."""
+    if len(cells) > most:
+        cells = cells[np.unique(np.linspace(0, len(cells) - 1, most).astype(int))]
+    return ground.place_cells(cells, 0.2 * ground.scale_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RouteNow:
+    """A route that a vehicle has begun, as the cells it leads over."""
+
+    target: str
+    cells: NDArray[np.int64]
+
+    def ahead_of(self, cell: int) -> NDArray[np.int64]:
+        """What is left of it from a cell on; all of it if the cell is not on it."""
+        found = np.flatnonzero(self.cells == cell)
+        return self.cells[found[-1] :] if len(found) else self.cells
+
+
+def cell_at(grid: GridSpec, east_m: float, south_m: float) -> int:
+    """The cell at a place, the nearest one if it is outside."""
+    row = min(max(int(south_m // grid.resolution_m), 0), grid.rows - 1)
+    col = min(max(int(east_m // grid.resolution_m), 0), grid.cols - 1)
+    return row * grid.cols + col
+
+
+class Trails:
+    """Where each thing went since it was last drawn: one strip each, that joins the one drawn before."""
+
+    def __init__(self, longest_m: float) -> None:
+        self._longest_m = longest_m
+        self._last: dict[str, Floats] = {}
+
+    def advance(self, ids: Iterable[str], positions: Floats) -> list[Floats]:
+        """Strips from the last places to these; none for what stands still, is new, or jumped."""
+        strips = []
+        for id, position in zip(ids, positions, strict=True):
+            last = self._last.get(id)
+            if last is not None:
+                moved_m = float(np.hypot(*(position - last)[:2]))
+                if moved_m == 0:
+                    continue
+                if moved_m <= self._longest_m:
+                    strips.append(np.stack([last, position]))
+            self._last[id] = position
+        return strips

@@ -1,0 +1,243 @@
+"""The monitor's shell: everything that is said in the swarm, told to rerun frame by frame.
+
+It only listens. It may be late, stalled, killed or absent; nobody waits for it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from launch_scripts.monitor.drawing import Drawing
+from launch_scripts.monitor.scene import (
+    Ground,
+    RouteNow,
+    Trails,
+    cell_at,
+    poles,
+    route_strip,
+    target_points,
+    vehicle_points,
+    window_outline,
+)
+from launch_scripts.monitor.summary import level_of, summary_markdown
+from launch_scripts.observed import VehicleNow
+from launch_scripts.record import RECORDED_TOPICS, Recorder, messages_per_s
+from shared_map.cost_map import CostMap
+from shared_map.feed import MapFeed
+from shared_map.replica import MapReplica
+from shared_map.terrain import Terrain
+from swarm.bus import Appeared, Bus, Disappeared, Event, Heard, Post
+from swarm.clock import NS_PER_S
+from swarm.grid import Window, walk
+from swarm.liveness import Peer
+from swarm.membership import Member
+from swarm.messages import Fleet, Followed, Note, PlannerStatus, TargetPose
+from swarm.role import RoleSetup
+from swarm.stats import Counters
+from swarm.topics import MARKS
+
+_TRAILS_NS = NS_PER_S // 2
+_ROUTES_NS = 3 * NS_PER_S // 2
+"""How long until the routes to every target were drawn anew."""
+_TEXTURES_PER_FRAME = 8
+_REFRESH_NS = NS_PER_S
+_ROUTES_SHOWN = 400
+_ANNOUNCE_NS = NS_PER_S // 2
+
+
+class MonitorService:
+    """Shows a run on a recording stream.
+
+    rec       whose sinks are set already
+    live_url  where people can watch; told to everybody once
+    """
+
+    def __init__(
+        self,
+        setup: RoleSetup,
+        terrain: Terrain,
+        bus: Bus,
+        post: Post,
+        rec: rr.RecordingStream,
+        *,
+        ground: Ground | None = None,
+        live_url: str | None = None,
+    ) -> None:
+        self.recorder = Recorder(setup.scenario, terrain.grid)
+        self._setup = setup
+        self._terrain = terrain
+        self._bus = bus
+        self._post = post
+        self._live_url = live_url
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self.counters: Counters = self._member.counters
+        self._cost_map = CostMap(terrain)
+        replica = MapReplica(terrain.grid, self._cost_map)
+        self._feed = MapFeed(replica, bus, post, setup.scenario.map, setup.role)
+        self._ground = ground or Ground(terrain)
+        self._target_ids = setup.scenario.target_ids
+        self._drawing = Drawing(rec, self._ground, self._target_ids)
+        scale = setup.scenario.time_scale
+        quickest_m = 4 * scale * max(setup.scenario.cost.road_speed_m_per_s, 1.0)
+        self._vehicle_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
+        self._target_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
+        self._routes: dict[str, RouteNow] = {}
+        self._stale_tiles: dict[int, None] = {}
+        self._fleets_new = self._targets_new = self._windows_new = False
+        self._frame = 0
+        self._newest_stamp_ns = setup.started_ns
+        self._started_ns = 0
+        self._trails_due_ns = self._routes_due_ns = self._refresh_due_ns = 0
+        self._next_route_target = self._next_refresh = 0
+        self._last_sample_s = -1.0
+
+    def start(self, now_ns: int) -> None:
+        self._started_ns = now_ns
+        self._member.join()
+        for topic in RECORDED_TOPICS:
+            if topic is not MARKS:
+                self._bus.subscribe(topic, self._post)
+        self._bus.watch_alive(self._post)
+        self._feed.start(now_ns)
+        self._drawing.set_time(0, 0.0)
+        self._drawing.begin()
+        self._stale_tiles = dict.fromkeys(range(self._ground.tile_rows * self._ground.tile_cols))
+        self._draw_textures(len(self._stale_tiles))
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if isinstance(event, Appeared | Disappeared):
+            self._alive(event.peer, isinstance(event, Appeared), now_ns)
+            return
+        if self._member.handle(event) or self._feed.handle(event, now_ns):
+            return
+        if not isinstance(event, Heard):
+            return
+        self.recorder.heard(event.message, event.fields, now_ns)
+        match event.message:
+            case Fleet(stamp_ns=stamp_ns):
+                self._fleets_new = True
+                self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
+            case TargetPose(stamp_ns=stamp_ns):
+                self._targets_new = True
+                self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
+            case PlannerStatus():
+                self._windows_new = True
+            case Followed() as followed:
+                self._follow(followed)
+            case Note() as note:
+                self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
+
+    def tick(self, now_ns: int) -> None:
+        """One frame."""
+        self._feed.tick(now_ns)
+        self._member.tick(now_ns)
+        self._announce(now_ns)
+        self._frame += 1
+        self._drawing.set_time(self._frame, self._seconds())
+        for window in self._cost_map.take_dirty():
+            self._stale_tiles.update(dict.fromkeys(self._ground.tiles_touching(window)))
+        if not self._stale_tiles and now_ns >= self._refresh_due_ns:
+            self._refresh(now_ns)
+        self._draw_textures(_TEXTURES_PER_FRAME)
+        self._draw_movers(now_ns)
+        self._draw_plots(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        self._member.publish_stats(now_ns)
+
+    # --- in -----------------------------------------------------------------------------------------------------
+
+    def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
+        self.recorder.alive(peer, up, now_ns)
+        if now_ns - self._started_ns > 2 * NS_PER_S:  # not everybody who was there before
+            text = f"{peer.role} {peer.id} is {'up' if up else 'gone'}"
+            self._drawing.note(text, "INFO" if up else "WARN")
+
+    def _follow(self, followed: Followed) -> None:
+        try:
+            cells = walk(self._terrain.grid, followed.start, followed.directions)
+        except ValueError:  # also a cell outside: somebody's bug, but no reason to go blind
+            self.counters.count("routes_unreadable")
+            return
+        self._routes[followed.vehicle] = RouteNow(followed.target, np.array(cells, np.int64))
+
+    def _announce(self, now_ns: int) -> None:
+        """Say where to watch, once the links have had time to learn who listens."""
+        if self._live_url is not None and now_ns - self._started_ns >= _ANNOUNCE_NS:
+            self._member.note(now_ns, "live_view", self._live_url)
+            self._live_url = None
+
+    def _seconds(self) -> float:
+        return max(self._newest_stamp_ns - self._setup.started_ns, 0) / NS_PER_S
+
+    # --- out ----------------------------------------------------------------------------------------------------
+
+    def _refresh(self, now_ns: int) -> None:
+        """Send one texture again: a viewer that joins late has only what the server still holds."""
+        self._refresh_due_ns = now_ns + _REFRESH_NS
+        self._stale_tiles[self._next_refresh] = None
+        self._next_refresh = (self._next_refresh + 1) % (self._ground.tile_rows * self._ground.tile_cols)
+
+    def _draw_textures(self, most: int) -> None:
+        for tile in list(self._stale_tiles)[:most]:
+            del self._stale_tiles[tile]
+            window = self._ground.tile_window(tile)
+            image = self._ground.texture(window, self._cost_map.ground_s_per_m, self._terrain.ground_s_per_m)
+            self._drawing.texture(tile, image)
+
+    def _draw_movers(self, now_ns: int) -> None:
+        trails_due = now_ns >= self._trails_due_ns
+        if trails_due:
+            self._trails_due_ns = now_ns + _TRAILS_NS
+        if self._fleets_new:
+            self._fleets_new = False
+            vehicles = self.recorder.observed.vehicles()
+            points = vehicle_points(self._ground, vehicles)
+            self._drawing.vehicles(points)
+            if trails_due:
+                self._drawing.trails("vehicles", self._vehicle_trails.advance(points.ids, points.positions))
+            self._draw_routes(now_ns, vehicles)
+        if self._targets_new:
+            self._targets_new = False
+            targets = target_points(self._ground, self.recorder.observed.targets())
+            feet = poles(self._ground, targets)
+            self._drawing.targets(targets, feet)
+            if trails_due:
+                places = np.array([pole[0] for pole in feet], np.float32)
+                self._drawing.trails("targets", self._target_trails.advance(targets.ids, places))
+        if self._windows_new:
+            self._windows_new = False
+            self._draw_windows()
+
+    def _draw_windows(self) -> None:
+        """Which part of its tree each planner grew last; the whole terrain is no news."""
+        windows = [Window(*status.window) for _, status in sorted(self.recorder.observed.status.items())]
+        parts = [window for window in windows if not window.empty and window.cells < self._terrain.grid.cells]
+        self._drawing.windows([window_outline(self._ground, window) for window in parts])
+
+    def _draw_routes(self, now_ns: int, vehicles: dict[str, VehicleNow]) -> None:
+        """The routes to one target after the other, each what is left of it."""
+        if now_ns < self._routes_due_ns or not self._target_ids:
+            return
+        self._routes_due_ns = now_ns + _ROUTES_NS // len(self._target_ids)
+        target = self._target_ids[self._next_route_target % len(self._target_ids)]
+        self._next_route_target += 1
+        strips = []
+        for id in list(vehicles)[:_ROUTES_SHOWN]:
+            vehicle, route = vehicles[id], self._routes.get(id)
+            if route is None or route.target != target or vehicle.target != target:
+                continue
+            ahead = route.ahead_of(cell_at(self._terrain.grid, vehicle.east_m, vehicle.south_m))
+            if len(ahead) > 1:
+                strips.append(route_strip(self._ground, ahead))
+        self._drawing.routes(target, strips)
+
+    def _draw_plots(self, now_ns: int) -> None:
+        samples = self.recorder.samples
+        if not samples or samples[-1].time_s == self._last_sample_s:
+            return
+        self._last_sample_s = samples[-1].time_s
+        rates = messages_per_s(list(samples)[-2:])
+        self._drawing.plots(samples[-1], rates[-1][1] if rates else None)
+        self._drawing.summary(summary_markdown(self._setup, self.recorder.summary(now_ns)))
