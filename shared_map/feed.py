@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from shared_map.digest import Held
@@ -93,13 +93,13 @@ class MapFeed:
         """True if the event was about the map and nobody else's business."""
         match event:
             case Heard(topic=topic, message=MarkSet() as heard) if topic is MARKS:
-                self._merge(heard, measured=True)
+                self._merge(heard, event.fields, measured=True)
             case Heard(topic=topic, message=Digest() as digest) if topic is DIGEST:
                 self._hear_digest(digest, now_ns)
             case Replied(tag=tag, message=MarkSet() as reply) if tag == _JOIN:
-                self._merge(reply, measured=False)
+                self._merge(reply, event.fields, measured=False)
             case Replied(tag=tag, message=MarkSet() as reply) if tag.startswith(_RESYNC):
-                self._merge(reply, measured=True)
+                self._merge(reply, event.fields, measured=True)
             case AskEnded(tag=tag) if tag == _JOIN:
                 self._join_ended(event, now_ns)
             case AskEnded(tag=tag) if tag.startswith(_RESYNC):
@@ -147,7 +147,10 @@ class MapFeed:
         region = self.replica.grid.region_of_tile(mark_set.tile)
         self._bus.publish(MARKS, mark_set, region=region, tile=mark_set.tile, author=mark_set.author)
 
-    def _merge(self, mark_set: MarkSet, *, measured: bool) -> None:
+    def _merge(self, mark_set: MarkSet, key: Mapping[str, str], *, measured: bool) -> None:
+        if key.get("author") != mark_set.author or key.get("tile") != str(mark_set.tile):
+            self.replica.counts["sets_refused"] += 1  # access is granted by key: nobody speaks for another
+            return
         changed = self.replica.merge(mark_set, measured=measured)
         if changed is not None and self._on_accepted is not None:
             self._on_accepted(mark_set)
@@ -159,8 +162,7 @@ class MapFeed:
             author = self.replica.author
         for each in self.replica.answer(request, author):
             region = self.replica.grid.region_of_tile(each.tile)
-            if _matches(asked, region, each.tile):
-                asked.answer(each, region=region, tile=each.tile, author=each.author)
+            asked.answer(each, region=region, tile=each.tile, author=each.author)
         asked.end()
 
     # --- late join ------------------------------------------------------------------------------------------
@@ -218,10 +220,3 @@ class MapFeed:
         heard_ns = self._heard_ns.get(author, self._started_ns)
         return author != self.replica.author and now_ns - heard_ns > 3 * self._digest_ns
 
-
-def _matches(asked: Asked, region: int, tile: int) -> bool:
-    """Whether a set lies under the asked key: a reply outside it would be refused by the network."""
-    return asked.fields.get("region", "*") in ("*", str(region)) and asked.fields.get("tile", "*") in (
-        "*",
-        str(tile),
-    )

@@ -41,6 +41,8 @@ class KeeperService:
             held=self._keeper.committed.held,
             on_accepted=self._keeper.accept,
         )
+        for name in ("sets_saved", "saves_failed", "sets_refused", "marks_merged"):
+            self.counters.count(name, 0)
         self._save_due_ns = 0
         self._noted_ns: int | None = None
         store.bind(terrain.digest)
