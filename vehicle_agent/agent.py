@@ -1,0 +1,400 @@
+"""Many vehicles behind one session: who drives where, who asks whom. Events in, actions out."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.clock import NS_PER_S
+from swarm.config import AgentPlan, Scenario
+from swarm.grid import GridSpec
+from swarm.messages import Claims, PushedRoute, Route, RouteReply, RouteStatus, TargetPose, VehicleState
+from vehicle_agent.assignment import choose
+from vehicle_agent.avoidance import Resumption, RightOfWay
+from vehicle_agent.follower import route_cells
+from vehicle_agent.placement import nearest_free
+from vehicle_agent.sensor import Findings, Sensor, compare
+from vehicle_agent.traffic import Traffic
+from vehicle_agent.vehicle import (
+    AskRoute,
+    Assigned,
+    Follow,
+    NoAnswer,
+    NoWay,
+    PlannerBack,
+    PlannerGone,
+    RouteCut,
+    RouteGiven,
+    RouteRefused,
+    TargetJumped,
+    TargetLeft,
+    TargetReached,
+    Vehicle,
+    VehicleAction,
+)
+
+_LONGEST_STEP_S = 0.5
+_RETRY_NS = NS_PER_S // 2
+_STRANDED_RETRY_NS = 3 * NS_PER_S
+_STALE_CELLS = 8
+"""A route that ends so far from where the target was last seen is of an older tree: ask again."""
+
+
+@dataclass(frozen=True, slots=True)
+class AskRoutes:
+    """One request to one target's planner, for all vehicles that need a route now."""
+
+    request: int
+    target: str
+    vehicles: tuple[str, ...]
+    cells: tuple[int, ...]
+    force: bool
+    reroutes: int
+
+
+@dataclass(frozen=True, slots=True)
+class AskCosts:
+    """One request to every planner: the cost-to-go of these cells."""
+
+    request: int
+    vehicles: tuple[str, ...]
+    cells: tuple[int, ...]
+
+
+AgentAction = AskRoutes | AskCosts | Follow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalMap:
+    """What an agent looks at; all float32 (rows, cols) in s/m and changed in place by their owners.
+
+    pace    what may be driven, with marks and inflation
+    ground  the same without inflation; prior is the ground without marks
+    physics the pace at which the ground is really driven
+    """
+
+    grid: GridSpec
+    pace: NDArray[np.float32]
+    ground: NDArray[np.float32]
+    prior: NDArray[np.float32]
+    physics: NDArray[np.float32]
+
+
+class Agent:
+    """The vehicles of one agent process. Call `placed_by` once, then in each tick `drive` until it returns None,
+    writing down what it found, and `decide`."""
+
+    def __init__(
+        self,
+        plan: AgentPlan,
+        scenario: Scenario,
+        ground: LocalMap,
+        sensor: Sensor,
+        spawns: Mapping[str, Mapping[str, int]],
+        incarnation: int,
+    ) -> None:
+        self.plan = plan
+        self.vehicles: dict[str, Vehicle] = {}
+        self.targets = list(plan.group.targets) or scenario.target_ids
+        self.rights = RightOfWay(plan.id, incarnation, spawns)
+        self.blocked_ticks = 0
+        self._spawns = spawns[plan.id]
+        self._config = scenario.vehicles
+        self._time_scale = scenario.time_scale
+        self._map = ground
+        self._sensor = sensor
+        chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
+        self._traffic = Traffic(
+            ground.grid,
+            ground.pace,
+            self.rights,
+            claim_cells=self._config.claim_cells,
+            patience_s=self._config.patience_s,
+            time_scale=scenario.time_scale,
+            neighbours=scenario.planner.neighbours,
+            corner_cutting=scenario.planner.corner_cutting,
+            chance=chance,
+        )
+        self._planners: dict[str, int] = {}
+        self._poses: dict[str, TargetPose] = {}
+        self._homeless: dict[str, int] = {}
+        self._requests = 0
+        self._route_requests: dict[int, AskRoutes] = {}
+        self._cost_request: AskCosts | None = None
+        self._costs: dict[str, NDArray[np.float32]] = {}
+        # Agents ask one after the other, not all at once.
+        self._reassign_ns = int(self._config.reassign_s * NS_PER_S)
+        self._assign_due_ns = 0
+        self._stagger_ns = int(chance.random() * self._reassign_ns)
+        self._driven_ns: int | None = None
+        self._left_s: dict[str, float] = {}
+        self._look_from: dict[int, None] = {}
+
+    # --- where everybody starts -----------------------------------------------------------------------------
+
+    def placed_by(self, known: Resumption) -> None:
+        """Put the vehicles where they last stood, as far as anybody knows, else where they start."""
+        for claims in known.others:
+            self.rights.heard(claims)
+        last = known.last_words
+        if last is not None:
+            self.rights.heard(last)
+        for id in self.plan.vehicle_ids:
+            cell = self._spawns[id]
+            if last is not None and last.holds.get(id):
+                cell = last.holds[id][0]
+            if not 0 <= cell < self._map.grid.cells or self.rights.holder(cell) is not None:
+                self._homeless[id] = min(max(cell, 0), self._map.grid.cells - 1)
+            else:
+                self._place(id, cell)
+
+    def _place(self, id: str, cell: int) -> None:
+        if not self.rights.holds(id):
+            self.rights.place(id, cell)
+        self.vehicles[id] = Vehicle(id, self._map.grid, cell)
+        self._look_from[cell] = None
+
+    def _house(self) -> None:
+        """Those whose last place somebody else may stand on take the nearest cell that they are granted."""
+        for id, wish in list(self._homeless.items()):
+            held = self.rights.holds(id)
+            if held:
+                del self._homeless[id]
+                self._place(id, held[0])
+                continue
+            wanted = self.rights.wants(id)
+            if wanted and self.rights.holder(wanted[0]) is None:
+                continue
+            free = nearest_free(self._map.grid, wish, self._is_free)
+            if free is not None:
+                self.rights.ask(id, [free])
+
+    def _is_free(self, cell: int) -> bool:
+        return not self._traffic.closed(cell) and self.rights.holder(cell) is None
+
+    # --- driving --------------------------------------------------------------------------------------------
+
+    def begin_drive(self, now_ns: int) -> None:
+        """Give every vehicle the time that has passed since it was last driven."""
+        elapsed_s = 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / NS_PER_S
+        self._driven_ns = now_ns
+        seconds = min(elapsed_s, _LONGEST_STEP_S) * self._time_scale
+        self._left_s = dict.fromkeys(self.vehicles, seconds)
+
+    def drive(self, now_ns: int) -> Findings | None:
+        """Let vehicles drive until they come to another cell; returns what they find there, to be written down
+        before they drive on. None when the time is over."""
+        for id in list(self._left_s):
+            vehicle = self.vehicles[id]
+            left_s = self._drive(vehicle, self._left_s[id], now_ns)
+            if left_s > 0.0:
+                self._left_s[id] = left_s
+            else:
+                del self._left_s[id]
+        if not self._look_from:
+            return None
+        sight = self._sensor.look(list(self._look_from))
+        self._look_from = {}
+        return compare(sight, self._map.ground, self._map.prior)
+
+    def _drive(self, vehicle: Vehicle, left_s: float, now_ns: int) -> float:
+        """One vehicle up to its next cell. Returns the seconds it has left then."""
+        motion = vehicle.motion
+        physics = self._map.physics.reshape(-1)
+        while left_s > 0.0:
+            if motion.at_rest:
+                cell = self._traffic.next_cell(vehicle, now_ns)
+                if cell is None or self.rights.holds(vehicle.id)[1:2] != [cell] or self._traffic.closed(cell):
+                    return 0.0
+                motion.set_out(cell)
+            before = vehicle.cell
+            left_s = motion.advance(left_s, float(physics[motion.head]))
+            if vehicle.cell != before:
+                self.rights.moved(vehicle.id, vehicle.cell)
+                vehicle.route.moved(vehicle.cell)
+                self._look_from[vehicle.cell] = None
+                # Even with no time left it has to look before it drives on.
+                return left_s
+        return 0.0
+
+    def map_changed(self, now_ns: int, *, look: bool = False) -> None:
+        """The map is another: end routes before what is closed now.
+
+        look  somebody else changed it, so what is in sight may need another look
+        """
+        pace = self._map.pace.reshape(-1)
+        for vehicle in self.vehicles.values():
+            ahead = vehicle.route.ahead()
+            if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._traffic.closed):
+                vehicle.handle(RouteCut(), now_ns)
+            if look:
+                self._look_from[vehicle.cell] = None
+
+    # --- deciding -------------------------------------------------------------------------------------------
+
+    def decide(self, now_ns: int) -> list[AgentAction]:
+        """What each vehicle does next: whom to ask, which cells to claim."""
+        self._house()
+        actions: list[AgentAction] = []
+        asks: dict[tuple[str, bool], list[AskRoute]] = {}
+        self.blocked_ticks = 0
+        for vehicle in self.vehicles.values():
+            self._check_reach(vehicle, now_ns)
+            for action in vehicle.tick(now_ns):
+                if isinstance(action, AskRoute):
+                    asks.setdefault((action.target, action.force), []).append(action)
+            in_reach = partial(self._in_reach, vehicle.target)
+            self.blocked_ticks += self._traffic.steer(vehicle, in_reach, now_ns)
+        for (target_id, force), batch in asks.items():
+            self._requests += 1
+            request = AskRoutes(
+                self._requests,
+                target_id,
+                tuple(ask.vehicle for ask in batch),
+                tuple(ask.cell for ask in batch),
+                force,
+                sum(ask.reason.is_reroute for ask in batch),
+            )
+            self._route_requests[request.request] = request
+            actions.append(request)
+        if now_ns >= self._assign_due_ns and self._cost_request is None and self.vehicles:
+            actions.append(self._ask_costs(now_ns))
+        return actions
+
+    def _ask_costs(self, now_ns: int) -> AskCosts:
+        self._requests += 1
+        self._costs = {}
+        cells = tuple(vehicle.cell for vehicle in self.vehicles.values())
+        self._cost_request = AskCosts(self._requests, tuple(self.vehicles), cells)
+        first = self._assign_due_ns == 0
+        self._assign_due_ns = now_ns + (self._stagger_ns if first else self._reassign_ns)
+        return self._cost_request
+
+    def _in_reach(self, target: str | None, cell: int) -> bool:
+        pose = self._poses.get(target) if target is not None else None
+        if pose is None:
+            return False
+        grid = self._map.grid
+        rows = cell // grid.cols - pose.cell // grid.cols
+        cols = cell % grid.cols - pose.cell % grid.cols
+        return math.hypot(rows, cols) * grid.resolution_m <= self._config.capture_range_m
+
+    def _check_reach(self, vehicle: Vehicle, now_ns: int) -> None:
+        near = self._in_reach(vehicle.target, vehicle.cell)
+        if near != vehicle.in_reach:
+            vehicle.handle(TargetReached() if near else TargetLeft(), now_ns)
+
+    # --- what is heard --------------------------------------------------------------------------------------
+
+    def hear_claims(self, claims: Claims) -> None:
+        self.rights.heard(claims)
+
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
+        known = self._poses.get(pose.target)
+        if known is not None and (pose.incarnation, pose.seq) <= (known.incarnation, known.seq):
+            return
+        if not 0 <= pose.cell < self._map.grid.cells:
+            return
+        self._poses[pose.target] = pose
+        if known is not None and pose.jumps != known.jumps:
+            for vehicle in self.vehicles.values():
+                if vehicle.target == pose.target:
+                    self._check_reach(vehicle, now_ns)
+                    vehicle.handle(TargetJumped(), now_ns)
+            self._assign_due_ns = min(self._assign_due_ns, now_ns + _RETRY_NS)
+
+    def set_planners(self, alive: Mapping[str, int], now_ns: int) -> None:
+        """Which planners are there now, and in which incarnation."""
+        before, self._planners = self._planners, dict(alive)
+        for vehicle in self.vehicles.values():
+            target = vehicle.target
+            if target is None:
+                continue
+            if target not in alive and not vehicle.planner_gone:
+                vehicle.handle(PlannerGone(), now_ns)
+            elif target in alive and (vehicle.planner_gone or before.get(target) != alive[target]):
+                vehicle.handle(PlannerBack(), now_ns)
+        if any(target not in before for target in alive):
+            self._assign_due_ns = min(self._assign_due_ns, now_ns + _RETRY_NS)
+
+    def routes_given(self, request: int, reply: RouteReply, now_ns: int) -> list[VehicleAction]:
+        asked = self._route_requests.pop(request, None)
+        if asked is None:
+            return []
+        actions: list[VehicleAction] = []
+        pose = self._poses.get(asked.target)
+        stale = (
+            pose is not None
+            and reply.target_cell is not None
+            and 0 <= reply.target_cell < self._map.grid.cells
+            and self._map.grid.distance_cells(pose.cell, reply.target_cell) > _STALE_CELLS
+        )
+        for index, id in enumerate(asked.vehicles):
+            vehicle = self.vehicles[id]
+            if index >= len(reply.routes) or stale:
+                vehicle.handle(NoAnswer(), now_ns)
+            else:
+                actions += self._take(vehicle, asked.target, reply.routes[index], now_ns, pushed=False)
+        return actions
+
+    def routes_ended(self, request: int, now_ns: int) -> None:
+        """Nobody will answer any more."""
+        asked = self._route_requests.pop(request, None)
+        for id in asked.vehicles if asked is not None else ():
+            self.vehicles[id].handle(NoAnswer(), now_ns)
+
+    def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[VehicleAction]:
+        vehicle = self.vehicles.get(pushed.vehicle)
+        if vehicle is None:
+            return []
+        return self._take(vehicle, pushed.target, pushed.route, now_ns, pushed=True)
+
+    def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[VehicleAction]:
+        if route.status is not RouteStatus.OK:
+            return [] if pushed else vehicle.handle(RouteRefused(target, route.status), now_ns)
+        cells = route_cells(self._map.grid, route.start, route.directions)
+        if cells is None:
+            return [] if pushed else vehicle.handle(NoAnswer(), now_ns)
+        partial = route.remaining_s > 0.0
+        given = RouteGiven(target, cells, route.cost_s, route.lower_bound_s, partial, pushed)
+        actions = vehicle.handle(given, now_ns)
+        if actions and vehicle.route.cut(self._traffic.closed):
+            vehicle.handle(RouteCut(), now_ns)
+        return actions
+
+    def costs_given(self, request: int, target: str, costs_s: NDArray[np.float32]) -> None:
+        asked = self._cost_request
+        if asked is not None and asked.request == request and len(costs_s) == len(asked.cells):
+            self._costs[target] = costs_s
+
+    def costs_ended(self, request: int, now_ns: int) -> None:
+        """All planners have answered that will: each vehicle takes the cheapest target."""
+        asked = self._cost_request
+        if asked is None or asked.request != request:
+            return
+        self._cost_request = None
+        stuck = not self._costs
+        for index, id in enumerate(asked.vehicles):
+            vehicle = self.vehicles[id]
+            costs = {target: float(column[index]) for target, column in self._costs.items()}
+            given_up = vehicle.planner_gone and not vehicle.route.left
+            given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
+            choice = choose(
+                costs, self.targets, self._planners, vehicle.target, self._config.hysteresis, not given_up
+            )
+            if choice.target is not None:
+                vehicle.handle(Assigned(choice.target), now_ns)
+                if vehicle.target not in self._planners and not vehicle.planner_gone:
+                    vehicle.handle(PlannerGone(), now_ns)
+            elif choice.settled:
+                vehicle.handle(NoWay(), now_ns)
+            stuck = stuck or vehicle.state in (VehicleState.IDLE, VehicleState.STRANDED)
+        if stuck:
+            retry_ns = _RETRY_NS if not self._costs else _STRANDED_RETRY_NS
+            self._assign_due_ns = min(self._assign_due_ns, now_ns + retry_ns)

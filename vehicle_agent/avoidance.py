@@ -1,0 +1,323 @@
+"""Who may enter which cell now: right of way among agents that hear only each other's newest claims.
+
+The rule is Ricart and Agrawala's (1981) on messages that each carry their sender's whole state, so that loss,
+repetition and reordering do no harm. A vehicle may enter a cell when every other live agent has echoed the message
+in which the want first stood, and in nobody's newest claims the cell is held, or wanted with a lower
+(ticket, agent, vehicle).
+
+Why no two get the same cell: of two wants, say A's has the lower ticket. B needs a message of A that echoes B's
+want. A sent it after it had heard B's clock, so a want that A made later has a higher ticket than B's; and one that
+A had made earlier stands in that very message, as a want with the lower ticket or as a hold. Either way B waits.
+
+What a dead agent held or wanted stays forbidden until a newer incarnation of it speaks: each cell that it may
+stand on was wanted in a message that all who lived then had echoed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from swarm.messages import Claims, Want
+
+Rank = tuple[int, str, str]
+"""(ticket, agent, vehicle): the lower goes first."""
+
+
+@dataclass(slots=True)
+class _Wanted:
+    """A want of ours. `seq` is that of the first message in which it stands."""
+
+    cell: int
+    ticket: int
+    seq: int
+
+
+@dataclass(slots=True)
+class _Mine:
+    """One of our vehicles: the cells that it holds, its own first, and those that it wants after them."""
+
+    holds: list[int] = field(default_factory=list)
+    wants: list[_Wanted] = field(default_factory=list)
+
+
+class _Other:
+    """Another agent's newest claims, by cell."""
+
+    def __init__(self, claims: Claims) -> None:
+        self.claims = claims
+        self.held: dict[int, str] = {}
+        for vehicle, cells in claims.holds.items():
+            for cell in cells:
+                self.held[cell] = vehicle
+        self.wanted: dict[int, Rank] = {}
+        for want in claims.wants:
+            rank = (want.ticket, claims.agent, want.vehicle)
+            if want.cell not in self.wanted or rank < self.wanted[want.cell]:
+                self.wanted[want.cell] = rank
+
+
+@dataclass(frozen=True, slots=True)
+class Wanter:
+    """Who wants a cell: `stands_on` is None of a vehicle that stands nowhere yet."""
+
+    rank: Rank
+    stands_on: int | None
+
+
+class RightOfWay:
+    """The claims of one agent's vehicles beside everybody else's.
+
+    spawns  agent -> vehicle -> cell where each agent of the run puts its vehicles when it first starts: held for
+            those that have not spoken yet
+    """
+
+    def __init__(self, agent: str, incarnation: int, spawns: Mapping[str, Mapping[str, int]]) -> None:
+        self.agent = agent
+        self.incarnation = incarnation
+        self._seq = 0
+        self._clock = 0
+        self._mine: dict[str, _Mine] = {}
+        self._held_by: dict[int, str] = {}
+        self._others: dict[str, _Other] = {}
+        self._alive: dict[str, int] = {}
+        self._changed = True
+        for other, vehicles in spawns.items():
+            if other != agent:
+                holds = {vehicle: [cell] for vehicle, cell in vehicles.items()}
+                claims = Claims(agent=other, incarnation=0, seq=0, clock=0, holds=holds, wants=[], seen={})
+                self._others[other] = _Other(claims)
+
+    # --- what the others say --------------------------------------------------------------------------------
+
+    def heard(self, claims: Claims) -> None:
+        """Take in another agent's claims; only the newest of an agent count. Sequence 0 says "not placed yet"."""
+        if claims.agent == self.agent:
+            if claims.incarnation < self.incarnation:
+                self._clock = max(self._clock, claims.clock)
+            return
+        if claims.seq == 0:
+            return
+        known = self._others.get(claims.agent)
+        if known is not None and (claims.incarnation, claims.seq) <= _stamp(known.claims):
+            return
+        self._others[claims.agent] = _Other(claims)
+        self._clock = max(self._clock, claims.clock)
+        self._changed = self._changed or bool(claims.wants)
+
+    def set_alive(self, agents: Mapping[str, int]) -> None:
+        """Which agents live, and in which incarnation. A dead one is not waited for; its claims stand."""
+        self._alive = {agent: incarnation for agent, incarnation in agents.items() if agent != self.agent}
+
+    # --- what our vehicles do -------------------------------------------------------------------------------
+
+    def place(self, vehicle: str, cell: int) -> None:
+        """Put a vehicle where nobody else can be: its spawn cell, or where it last stood."""
+        if cell in self._held_by:
+            raise ValueError(f"{vehicle} and {self._held_by[cell]} are both placed on cell {cell}")
+        self._mine[vehicle] = _Mine(holds=[cell])
+        self._held_by[cell] = vehicle
+        self._changed = True
+
+    def ask(self, vehicle: str, ahead: Sequence[int]) -> None:
+        """Want exactly these cells, in this order; what was held or wanted besides is given up at once."""
+        mine = self._mine.setdefault(vehicle, _Mine())
+        base = 1 if mine.holds else 0
+        kept = 0
+        while kept < len(ahead) and base + kept < len(mine.holds) and mine.holds[base + kept] == ahead[kept]:
+            kept += 1
+        if base + kept < len(mine.holds) and base:
+            for cell in mine.holds[base + kept :]:
+                del self._held_by[cell]
+            del mine.holds[base + kept :]
+            self._changed = True
+        wanted = ahead[kept:]
+        if [want.cell for want in mine.wants] == list(wanted):
+            return
+        old = {want.cell: want for want in mine.wants}
+        if any(cell not in old for cell in wanted):
+            self._clock += 1
+        mine.wants = [old.get(cell) or _Wanted(cell, self._clock, self._seq + 1) for cell in wanted]
+        self._changed = True
+
+    def moved(self, vehicle: str, cell: int) -> None:
+        """The vehicle stands on a cell that it holds: those before it are free."""
+        mine = self._mine[vehicle]
+        index = mine.holds.index(cell)
+        for passed in mine.holds[:index]:
+            del self._held_by[passed]
+        del mine.holds[:index]
+        self._changed = True
+
+    def grant(self) -> bool:
+        """Turn wants into holds wherever the rule allows; True if any was. A vehicle gets its cells in order."""
+        echoed = self._echoed()
+        firsts: dict[int, Rank] = {}
+        for vehicle, mine in self._mine.items():
+            for want in mine.wants:
+                rank = (want.ticket, self.agent, vehicle)
+                if want.cell not in firsts or rank < firsts[want.cell]:
+                    firsts[want.cell] = rank
+        any_granted = False
+        for vehicle, mine in self._mine.items():
+            while mine.wants:
+                want = mine.wants[0]
+                rank = (want.ticket, self.agent, vehicle)
+                if want.seq > echoed or want.cell in self._held_by or firsts[want.cell] < rank:
+                    break
+                if self._others_forbid(want.cell, rank):
+                    break
+                mine.holds.append(want.cell)
+                self._held_by[want.cell] = vehicle
+                del mine.wants[0]
+                any_granted = self._changed = True
+        return any_granted
+
+    def speak(self) -> Claims:
+        """Our whole state, under the next sequence number. Publish it: a want counts from here on."""
+        self._seq += 1
+        self._changed = False
+        return Claims(
+            agent=self.agent,
+            incarnation=self.incarnation,
+            seq=self._seq,
+            clock=self._clock,
+            holds={vehicle: list(mine.holds) for vehicle, mine in self._mine.items() if mine.holds},
+            wants=[
+                Want(vehicle=vehicle, cell=want.cell, ticket=want.ticket)
+                for vehicle, mine in self._mine.items()
+                for want in mine.wants
+            ],
+            seen={agent: _stamp(other.claims) for agent, other in self._others.items() if other.claims.seq},
+        )
+
+    # --- what one may ask -----------------------------------------------------------------------------------
+
+    @property
+    def restless(self) -> bool:
+        """Whether somebody waits to hear from us: our state changed, or wants stand open on either side."""
+        return self._changed or any(mine.wants for mine in self._mine.values())
+
+    def holds(self, vehicle: str) -> list[int]:
+        """The cells of a vehicle, the one that it stands on first; empty of one that stands nowhere yet."""
+        mine = self._mine.get(vehicle)
+        return mine.holds if mine else []
+
+    def wants(self, vehicle: str) -> list[int]:
+        return [want.cell for want in self._mine[vehicle].wants]
+
+    def rank(self, vehicle: str) -> Rank | None:
+        """The rank of what the vehicle wants next, None if it wants nothing."""
+        mine = self._mine[vehicle]
+        return (mine.wants[0].ticket, self.agent, vehicle) if mine.wants else None
+
+    def holder(self, cell: int) -> str | None:
+        """Who holds a cell, as far as we know; of a dead agent also who wanted it."""
+        if cell in self._held_by:
+            return self._held_by[cell]
+        for agent, other in self._others.items():
+            if cell in other.held:
+                return other.held[cell]
+            if cell in other.wanted and self._dead(agent, other):
+                return other.wanted[cell][2]
+        return None
+
+    def wanter(self, cell: int, besides: str) -> Wanter | None:
+        """Who, except the vehicle `besides`, is first in line for a cell."""
+        best: Wanter | None = None
+        for vehicle, mine in self._mine.items():
+            if vehicle != besides:
+                for want in mine.wants:
+                    rank = (want.ticket, self.agent, vehicle)
+                    if want.cell == cell and (best is None or rank < best.rank):
+                        best = Wanter(rank, mine.holds[0] if mine.holds else None)
+        for agent, other in self._others.items():
+            found = other.wanted.get(cell)
+            if found is not None and (best is None or found < best.rank) and not self._dead(agent, other):
+                stands = other.claims.holds.get(found[2])
+                best = Wanter(found, stands[0] if stands else None)
+        return best
+
+    def answers(self) -> list[Claims]:
+        """What a starting agent is told: where we are now, and the last words of all who cannot tell it."""
+        last_words = [
+            other.claims for agent, other in self._others.items() if other.claims.seq and self._dead(agent, other)
+        ]
+        changed = self._changed
+        mine = self.speak()
+        self._changed = changed  # the others have not heard it
+        return [*last_words, mine]
+
+    def _dead(self, agent: str, other: _Other) -> bool:
+        return self._alive.get(agent) != other.claims.incarnation
+
+    def _echoed(self) -> int:
+        """The newest sequence number of ours that every live agent has seen."""
+        echoed = self._seq
+        for agent, incarnation in self._alive.items():
+            other = self._others.get(agent)
+            if other is None or other.claims.incarnation != incarnation:
+                return -1
+            seen = other.claims.seen.get(self.agent)
+            if seen is None or seen[0] != self.incarnation:
+                return -1
+            echoed = min(echoed, seen[1])
+        return echoed
+
+    def _others_forbid(self, cell: int, rank: Rank) -> bool:
+        for agent, other in self._others.items():
+            if cell in other.held:
+                return True
+            wanted = other.wanted.get(cell)
+            if wanted is not None and (wanted < rank or self._dead(agent, other)):
+                return True
+        return False
+
+
+class Resumption:
+    """What a starting agent gathers before it puts its vehicles anywhere: everybody's claims, its own last ones
+    among them."""
+
+    def __init__(self, agent: str) -> None:
+        self._agent = agent
+        self._newest: dict[str, Claims] = {}
+        self._answered: dict[str, Claims] = {}
+
+    def heard(self, claims: Claims) -> None:
+        known = self._newest.get(claims.agent)
+        if claims.seq and (known is None or _stamp(claims) > _stamp(known)):
+            self._newest[claims.agent] = claims
+
+    def answered(self, claims: Claims) -> None:
+        """As `heard`, of what came in reply to our question."""
+        self.heard(claims)
+        answered = self._answered.get(claims.agent)
+        if answered is None or _stamp(claims) >= _stamp(answered):
+            self._answered[claims.agent] = claims
+
+    def complete(self, alive: Mapping[str, int]) -> bool:
+        """Whether each live agent has answered, and the last words that any of them has heard have come through."""
+        for agent, incarnation in alive.items():
+            if agent == self._agent:
+                continue
+            claims = self._answered.get(agent)
+            if claims is None or claims.incarnation != incarnation:
+                return False
+            for other, stamp in claims.seen.items():
+                silent = other == self._agent or alive.get(other) != stamp[0]
+                if silent and (other not in self._newest or _stamp(self._newest[other]) < tuple(stamp)):
+                    return False
+        return True
+
+    @property
+    def last_words(self) -> Claims | None:
+        """The claims of our earlier incarnation, if anybody heard it."""
+        return self._newest.get(self._agent)
+
+    @property
+    def others(self) -> list[Claims]:
+        return [claims for agent, claims in self._newest.items() if agent != self._agent]
+
+
+def _stamp(claims: Claims) -> tuple[int, int]:
+    return claims.incarnation, claims.seq

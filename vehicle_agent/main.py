@@ -1,0 +1,26 @@
+"""The agent process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from shared_map.terrain import load_terrain, load_truth
+from swarm.clock import MonotonicClock
+from swarm.process import Inbox, Process, end_with
+from swarm.role import RoleSetup
+from swarm.zenoh_bus import open_bus
+from vehicle_agent.service import AgentService
+
+
+def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
+    """Drive the vehicles of one agent until told to stop."""
+    terrain = load_terrain(setup)
+    truth = load_truth(setup, terrain)
+    with open_bus(setup.scenario.network) as bus:
+        inbox = Inbox()
+        service = AgentService(setup, terrain, truth, bus, inbox.post)
+        process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz)
+        process.stop_on_signals()
+        if stop_when is not None:
+            end_with(stop_when, process.stop)
+        process.run()

@@ -1,0 +1,101 @@
+"""Where every vehicle of a run starts: the same answer in every process, so that no two choose one cell."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.config import GroupConfig, Scenario, plan_agents
+from swarm.errors import ConfigError
+from swarm.grid import GridSpec
+
+_STREAM = 77
+"""Of the scenario's seed: apart from what terrain and targets draw from it."""
+
+
+def spawn_cells(
+    scenario: Scenario, grid: GridSpec, prior: NDArray[np.float32], truth: NDArray[np.float32]
+) -> dict[str, dict[str, int]]:
+    """agent -> vehicle -> cell, of the whole fleet; all cells differ and lie in one connected part.
+
+    Raises ConfigError for a place outside the terrain or on lethal ground, or if there is not enough room.
+    """
+    passable = np.isfinite(prior) & np.isfinite(truth)
+    homes = _largest_part(passable).reshape(-1)
+    explicit = {group.name: _explicit_cells(group, grid, passable) for group in scenario.groups}
+    taken: dict[int, str] = {}
+    for name, cells in explicit.items():
+        for cell in cells:
+            if cell in taken:
+                raise ConfigError(f"groups: {name}: cell {list(grid.row_col(cell))} is given twice")
+            taken[cell] = name
+    homes[list(taken)] = False
+    placed: dict[str, list[int]] = {}
+    for group in scenario.groups:
+        chosen = explicit[group.name]
+        chosen += _choose(group, group.vehicles - len(chosen), grid, homes, scenario.seed)
+        homes[chosen] = False
+        placed[group.name] = chosen
+    return {
+        plan.id: dict(zip(plan.vehicle_ids, placed[plan.group.name][plan.first :], strict=False))
+        for plan in plan_agents(scenario)
+    }
+
+
+def nearest_free(grid: GridSpec, wish: int, is_free: Callable[[int], bool], reach: int = 8) -> int | None:
+    """The free cell next to `wish`, in rings around it; None if there is none within reach."""
+    for half in range(reach + 1):
+        near = grid.around(wish, half)
+        for row in range(near.row0, near.row1):
+            for cell in range(row * grid.cols + near.col0, row * grid.cols + near.col1):
+                if grid.distance_cells(wish, cell) == half and is_free(cell):
+                    return cell
+    return None
+
+
+def _largest_part(passable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    # Imported here: it takes a tenth of a second, and nothing else in a vehicle needs it.
+    from scipy import ndimage
+
+    labels, count = ndimage.label(passable)
+    if count == 0:
+        return passable.copy()
+    part: NDArray[np.bool_] = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
+    return part
+
+
+def _explicit_cells(group: GroupConfig, grid: GridSpec, passable: NDArray[np.bool_]) -> list[int]:
+    if len(group.cells) > group.vehicles:
+        raise ConfigError(f"groups: {group.name}: {len(group.cells)} cells for {group.vehicles} vehicles")
+    cells = []
+    for row, col in group.cells:
+        if not grid.inside(row, col):
+            shape = f"{grid.rows} x {grid.cols}"
+            raise ConfigError(f"groups: {group.name}: cell [{row}, {col}] is outside the terrain of {shape} cells")
+        if not passable[row, col]:
+            raise ConfigError(f"groups: {group.name}: cell [{row}, {col}] is lethal; choose a passable cell")
+        cells.append(grid.cell(row, col))
+    return cells
+
+
+def _choose(group: GroupConfig, count: int, grid: GridSpec, homes: NDArray[np.bool_], seed: int) -> list[int]:
+    free = np.flatnonzero(homes)
+    if len(free) < count:
+        raise ConfigError(
+            f"groups: {group.name}: {group.vehicles} vehicles, but only {len(free)} connected passable cells left"
+        )
+    rng = np.random.default_rng([seed, _STREAM, zlib.crc32(group.name.encode())])
+    if count == 0:
+        return []
+    if group.start == "spread":
+        return [int(cell) for cell in rng.choice(free, count, replace=False)]
+    centre = int(rng.choice(free))
+    south = np.abs(free // grid.cols - centre // grid.cols)
+    east = np.abs(free % grid.cols - centre % grid.cols)
+    # Every other cell first, so that whoever stands in the middle can get out.
+    crowded = (south % 2 + east % 2) > 0
+    distance = np.hypot(south, east) + np.where(crowded, 2.0 * np.sqrt(count), 0.0)
+    return [int(cell) for cell in free[np.argsort(distance, kind="stable")[:count]]]

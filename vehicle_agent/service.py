@@ -1,0 +1,295 @@
+"""The agent's shell: its vehicles on the bus."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.cost_map import CostMap
+from shared_map.feed import MapFeed
+from shared_map.replica import MapReplica
+from shared_map.terrain import Terrain
+from swarm.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
+from swarm.clock import NS_PER_S
+from swarm.config import plan_agents
+from swarm.errors import ConfigError
+from swarm.liveness import Roster
+from swarm.membership import Member
+from swarm.messages import (
+    Claims,
+    CostReply,
+    CostRequest,
+    Followed,
+    Nothing,
+    PushedRoute,
+    RouteReply,
+    RouteRequest,
+    TargetPose,
+    VehicleState,
+    column,
+)
+from swarm.role import RoleSetup
+from swarm.topics import CLAIMS, COST, FLEET, FOLLOWED, POSE, PUSHED_ROUTE, ROUTE
+from vehicle_agent.agent import Agent, AgentAction, AskCosts, AskRoutes, LocalMap
+from vehicle_agent.avoidance import Resumption
+from vehicle_agent.fleet import FleetReport, directions_of
+from vehicle_agent.placement import spawn_cells
+from vehicle_agent.sensor import TruthSensor
+from vehicle_agent.vehicle import Follow, VehicleAction
+
+log = logging.getLogger(__name__)
+
+_SETTLE_NS = NS_PER_S // 5
+"""So long a starting agent lets the others learn of it before it asks where everybody stands: from then on they
+wait for its word before they enter anything."""
+_RESUME_TIMEOUT_S = 2.0
+_ASK_AGAIN_NS = NS_PER_S // 10
+_MOURN_NS = NS_PER_S // 2
+"""An agent whose token fell is waited for a little longer: if our own link is cut, word of that may come later."""
+_CLAIMS_IDLE_NS = NS_PER_S // 2
+
+
+class AgentService:
+    """Drives the vehicles of one agent plan, marks what they find, and tells where they are."""
+
+    def __init__(
+        self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
+    ) -> None:
+        scenario = setup.scenario
+        plan = next((plan for plan in plan_agents(scenario) if plan.id == setup.id), None)
+        if plan is None:
+            ids = ", ".join(plan.id for plan in plan_agents(scenario)[:20])
+            raise ConfigError(f"scenario {scenario.name} has no agent {setup.id}; it has {ids}")
+        grid = terrain.grid
+        spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth)
+        self._member = Member(setup.info(grid, terrain.digest), bus, post)
+        self.counters = self._member.counters
+        for name in ("reroute_requests", "routes_received", "marks", "blocked_ticks"):
+            self.counters.count(name, 0)
+        self._bus = bus
+        self._post = post
+        self._setup = setup
+        self._cost_map = CostMap(terrain)
+        self._replica = MapReplica(
+            grid, self._cost_map, author=setup.author, group=plan.group.name, publish_hz=scenario.map.publish_hz
+        )
+        self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role)
+        pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
+        local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth)
+        sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
+        self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation)
+        self._fleet = FleetReport(grid, setup.author, plan.group.name)
+        self._resumption: Resumption | None = Resumption(plan.id)
+        self._resume_due_ns: int | None = None
+        self._roster = Roster()
+        self._mourned_ns: dict[str, int] = {}
+        self._link_up = True
+        self._trust_roster_ns = 0
+        self._lease_ns = int(scenario.network.lease_s * NS_PER_S)
+        self._claims_due_ns = 0
+        self._asked_ns: dict[str, int] = {}
+
+    @property
+    def agent(self) -> Agent:
+        return self._agent
+
+    def start(self, now_ns: int) -> None:
+        self._bus.subscribe(CLAIMS, self._post)
+        self._bus.serve(CLAIMS, self._post)
+        self._bus.watch_alive(self._post, role="agent")
+        self._bus.watch_alive(self._post, role="planner")
+        self._member.join()
+        self._feed.start(now_ns)
+        self._bus.subscribe(POSE, self._post)
+        for vehicle in self._agent.plan.vehicle_ids:
+            self._bus.subscribe(PUSHED_ROUTE, self._post, vehicle=vehicle)
+        self._resume_due_ns = now_ns + _SETTLE_NS
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if self._member.handle(event) or self._feed.handle(event, now_ns):
+            return
+        agent = self._agent
+        match event:
+            case Heard(message=Claims() as claims):
+                if self._resumption is not None:
+                    self._resumption.heard(claims)
+                agent.hear_claims(claims)
+            case Heard(message=TargetPose() as pose):
+                agent.hear_pose(pose, now_ns)
+            case Heard(message=PushedRoute() as pushed):
+                self.counters.count("routes_pushed")
+                self._publish_followed(agent.route_pushed(pushed, now_ns))
+            case Replied(tag=tag, message=RouteReply() as reply):
+                self._observe_query(tag, now_ns)
+                self.counters.count("routes_received", len(reply.routes))
+                self._publish_followed(agent.routes_given(_number(tag), reply, now_ns))
+            case Replied(tag=tag, message=CostReply() as reply) if reply.target_cell is not None:
+                agent.costs_given(_number(tag), reply.target, column(reply.cost_to_go_s, "<f4"))
+            case Replied(message=Claims() as claims):
+                if self._resumption is not None:
+                    self._resumption.answered(claims)
+            case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
+                self._asked_ns.pop(tag, None)
+                agent.routes_ended(_number(tag), now_ns)
+            case AskEnded(tag=tag, topic=topic) if topic is COST:
+                agent.costs_ended(_number(tag), now_ns)
+            case AskEnded(topic=topic) if topic is CLAIMS:
+                self._place_if_known(now_ns)
+            case Asked(topic=topic) if topic is CLAIMS:
+                self._answer(event)
+            case Appeared(peer):
+                self._roster.appeared(peer)
+                self._mourned_ns.pop(peer.id if peer.role == "agent" else "", None)
+                self._roster_changed(now_ns)
+            case Disappeared(peer):
+                self._roster.gone(peer)
+                if peer.role == "agent" and not self._roster.is_alive("agent", peer.id):
+                    self._mourned_ns[peer.id] = now_ns + _MOURN_NS
+                self._roster_changed(now_ns)
+            case LinkChanged(up=up):
+                # Cut off, we hear no wants: nobody enters anything new before the others are heard of again.
+                self._link_up = up
+                self._trust_roster_ns = now_ns + self._lease_ns
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> None:
+        self._member.tick(now_ns)
+        self._feed.tick(now_ns)
+        if self._resumption is not None:
+            if self._resume_due_ns is not None and now_ns >= self._resume_due_ns:
+                self._resume_due_ns = None
+                tag = f"claims-{now_ns}"
+                self._bus.ask(CLAIMS, Nothing(), self._post, tag=tag, timeout_s=_RESUME_TIMEOUT_S)
+            return
+        agent = self._agent
+        self._note_map(now_ns)
+        if any(due_ns <= now_ns for due_ns in self._mourned_ns.values()):
+            self._mourned_ns = {id: due_ns for id, due_ns in self._mourned_ns.items() if due_ns > now_ns}
+            self._roster_changed(now_ns)
+        may_enter = self._link_up and now_ns >= self._trust_roster_ns
+        if may_enter:
+            agent.rights.grant()
+        agent.begin_drive(now_ns)
+        while (findings := agent.drive(now_ns)) is not None:
+            if len(findings):
+                self.counters.count("marks", len(findings))
+                self._feed.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
+                agent.map_changed(now_ns)
+        self._perform(agent.decide(now_ns), now_ns)
+        self.counters.count("blocked_ticks", agent.blocked_ticks)
+        for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
+            self._bus.publish(FLEET, fleet, region=region, author=self._setup.author)
+        if agent.rights.restless or now_ns >= self._claims_due_ns:
+            self._claims_due_ns = now_ns + _CLAIMS_IDLE_NS
+            self._bus.publish(CLAIMS, agent.rights.speak(), agent=self._setup.id)
+        self._gauge()
+
+    def stop(self, now_ns: int) -> None:
+        self._member.publish_stats(now_ns)
+
+    # --- where everybody starts -----------------------------------------------------------------------------
+
+    def _place_if_known(self, now_ns: int) -> None:
+        """All have been asked where they stand: place the vehicles, or ask again if somebody has not answered."""
+        known = self._resumption
+        if known is None:
+            return
+        agents = self._roster.alive("agent")
+        if not known.complete(agents):
+            self._resume_due_ns = now_ns + _ASK_AGAIN_NS
+            return
+        self._resumption = None
+        self._agent.rights.set_alive(agents)
+        self._agent.placed_by(known)
+        self._agent.set_planners(self._roster.alive("planner"), now_ns)
+        count = len(self._agent.vehicles)
+        if known.last_words is None:
+            log.info("%d vehicles start", count)
+        else:
+            log.info("%d vehicles go on where they last stood", count)
+            text = f"agent {self._setup.id} is back: {count} vehicles go on where they last stood"
+            self._member.note(now_ns, "resumed", text)
+
+    def _answer(self, asked: Asked) -> None:
+        if self._resumption is not None:
+            # Present, but nothing is placed yet: sequence 0 takes nobody's claims back.
+            present = Claims(
+                agent=self._setup.id,
+                incarnation=self._setup.incarnation,
+                seq=0,
+                clock=0,
+                holds={},
+                wants=[],
+                seen={},
+            )
+            answers = [present]
+        else:
+            answers = self._agent.rights.answers()
+        for claims in answers:
+            asked.answer(claims, agent=claims.agent)
+        asked.end()
+
+    def _roster_changed(self, now_ns: int) -> None:
+        agents = self._roster.alive("agent")
+        for id in self._mourned_ns:
+            agents.setdefault(id, 0)
+        self._agent.rights.set_alive(agents)
+        self._agent.set_planners(self._roster.alive("planner"), now_ns)
+
+    # --- doing what was decided -----------------------------------------------------------------------------
+
+    def _note_map(self, now_ns: int) -> None:
+        if self._cost_map.take_dirty():
+            self._agent.map_changed(now_ns, look=True)
+
+    def _perform(self, actions: list[AgentAction], now_ns: int) -> None:
+        for action in actions:
+            match action:
+                case AskRoutes(request, target, vehicles, cells, force, reroutes):
+                    self.counters.count("reroute_requests", reroutes)
+                    asking = RouteRequest(
+                        cells=list(cells),
+                        vehicles=list(vehicles),
+                        max_cells=self._setup.scenario.vehicles.route_cells,
+                        force=force,
+                    )
+                    tag = f"route-{request}"
+                    self._asked_ns[tag] = now_ns
+                    self._bus.ask(ROUTE, asking, self._post, tag=tag, target=target)
+                case AskCosts(request, _, cells):
+                    costs = CostRequest(cells=list(cells))
+                    self._bus.ask(COST, costs, self._post, tag=f"cost-{request}")
+                case Follow():
+                    self._publish_followed([action])
+
+    def _publish_followed(self, actions: list[VehicleAction]) -> None:
+        for action in actions:
+            if isinstance(action, Follow):
+                followed = Followed(
+                    vehicle=action.vehicle,
+                    target=action.target,
+                    start=action.cells[0],
+                    directions=directions_of(action.cells, self._cost_map.grid.cols),
+                    cost_s=action.cost_s,
+                    lower_bound_s=action.lower_bound_s,
+                )
+                self._bus.publish(FOLLOWED, followed, vehicle=action.vehicle)
+
+    def _observe_query(self, tag: str, now_ns: int) -> None:
+        asked_ns = self._asked_ns.pop(tag, None)
+        if asked_ns is not None:
+            self.counters.observe("route_query_ms", (now_ns - asked_ns) / 1e6)
+
+    def _gauge(self) -> None:
+        states = [vehicle.state for vehicle in self._agent.vehicles.values()]
+        for state in VehicleState:
+            self.counters.gauge(f"vehicles_{state.name.lower()}", float(states.count(state)))
+        self.counters.gauge("stranded", float(states.count(VehicleState.STRANDED)))
+        self.counters.gauge("lost", float(states.count(VehicleState.LOST)))
+
+
+def _number(tag: str) -> int:
+    return int(tag.rpartition("-")[2])
