@@ -22,7 +22,6 @@ CRASHED = 70
 """Exit code of a process that ended by a bug."""
 
 _GRACE_S = 4.0
-LOG_FORMAT = "%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +91,16 @@ def _redirect(log_path: Path) -> None:
     os.dup2(file, 2)
     os.close(file)
     faulthandler.enable()
-    logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, datefmt="%H:%M:%S", stream=sys.stderr, force=True)
+    log_to(None)
+
+
+def log_to(path: Path | None) -> None:
+    """Log into a file, or where there is none on standard error."""
+    handler = logging.StreamHandler(sys.stderr) if path is None else logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(
+        logging.Formatter("%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
+    )
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
 
 
 def _leave(code: int) -> None:

@@ -137,7 +137,7 @@ def _run(
     import msgspec
 
     from launch_scripts import options
-    from launch_scripts.child import LOG_FORMAT, load_entry
+    from launch_scripts.child import load_entry, log_to
     from launch_scripts.processes import ENTRIES, processes_of
     from swarm.errors import ConfigError, StoreError
     from swarm.role import RoleSetup
@@ -155,7 +155,7 @@ def _run(
     ids = [spec.id for spec in processes_of(scenario, (role,))]
     if id not in ids:
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
-    logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, datefmt="%H:%M:%S")
+    log_to(None)
     if run_id is None:
         run_id = options.new_run_id() if role == "router" else _found_run_id(scenario)
     run_dir = runs / run_id

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Mapping
@@ -14,6 +15,8 @@ from rich.text import Text
 
 from launch_scripts.live_table import live_table, plain_line
 from launch_scripts.record import LiveSummary
+
+log = logging.getLogger(__name__)
 
 _PLAIN_EVERY_S = 5.0
 _DRAW_EVERY_S = 0.25
@@ -51,7 +54,8 @@ class Screen:
         self._due_s = 0.0
 
     def say(self, text: str, style: str | None = None) -> None:
-        """One line, above the table if there is one."""
+        """One line, above the table if there is one, and in the launcher's log."""
+        log.info("%s", text)
         self._console.print(Text(text, style=style or ""))
         if not self._console.is_terminal:
             sys.stdout.flush()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
+import logging
 import os
 import signal
 import time
@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from launch_scripts.child import log_to
 from launch_scripts.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.options import check_ports, listening, make_run_dir, new_run_id
 from launch_scripts.processes import ROLES, ProcessSpec, processes_of
@@ -18,7 +19,7 @@ from launch_scripts.record import Recorder
 from launch_scripts.report import write_report
 from launch_scripts.screen import Screen
 from launch_scripts.watcher import Watcher, ask_run
-from shared_map.terrain import Terrain, build_terrain, build_truth, save_prepared
+from shared_map.terrain import prepare
 from swarm.bus import Bus
 from swarm.clock import MonotonicClock
 from swarm.config import Scenario
@@ -26,6 +27,8 @@ from swarm.errors import BusError, SwarmError
 from swarm.membership import check_same_run
 from swarm.role import RoleSetup
 from swarm.zenoh_bus import open_bus
+
+log = logging.getLogger(__name__)
 
 PRELOAD = ("launch_scripts.warm_kernels",)
 
@@ -89,11 +92,9 @@ def run_swarm(options: UpOptions) -> int:
     if not options.joins:
         check_ports(options.scenario, options.roles)
     run_dir = make_run_dir(options.runs, time.strftime("%Y%m%d-%H%M%S"))
-    try:
-        return _Run(options, run_dir).run()
-    finally:
-        with contextlib.suppress(OSError):
-            run_dir.rmdir()  # only if nothing came to be in it
+    log_to(run_dir / "launcher.log")
+    log.info("began %.2f s ago", time.monotonic() - options.began_s)
+    return _Run(options, run_dir).run()
 
 
 class _Run:
@@ -116,8 +117,10 @@ class _Run:
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         warm_up = WarmUp(list(self._options.preload))
         warm_up.begin()
-        self._terrain = self._prepare()
+        self._terrain, self._truth = prepare(self._run_dir, self._scenario)
+        log.info("terrain is ready")
         self._wait("loading kernels; the first start on a machine compiles them, about a minute", warm_up.done)
+        log.info("kernels are loaded")
         if self._stop_asked:
             return 0
         failures: list[str] = []
@@ -125,6 +128,7 @@ class _Run:
             if not self._options.joins and "router" in self._options.roles:
                 self._swarm.start("router")
                 self._wait("waiting for the router to listen", self._router_listens, _LISTEN_WITHIN_S)
+            log.info("the router listens")
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
                 self._say_begin()
@@ -132,6 +136,7 @@ class _Run:
                 watcher.begin()
                 try:
                     self._swarm.start()
+                    log.info("all processes are started")
                     seconds = self._watch(watcher)
                 finally:
                     failures = self._stop(watcher)
@@ -144,12 +149,6 @@ class _Run:
         for failure in failures:
             self._screen.say(failure, "red")
         return 1 if failures else 0
-
-    def _prepare(self) -> Terrain:
-        terrain = build_terrain(self._scenario)
-        self._truth = build_truth(self._scenario, terrain)
-        save_prepared(self._run_dir, terrain, self._truth)
-        return terrain
 
     def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
         return RoleSetup(
