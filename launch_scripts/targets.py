@@ -163,14 +163,16 @@ class TargetWorld:
     def _catcher(self, fleet: Fleet, id: str, target: _Target) -> str | None:
         """The first vehicle in a report that has this target, which it chases, within reach.
 
-        A vehicle that says ARRIVED is believed to twice the range: the target may have moved on since it looked.
+        A vehicle that says ARRIVED is believed at twice the range: it compares cells, and the target may have moved
+        on since it looked.
         """
         chasing, arrived = chasers(fleet, id)
         if not len(chasing):
             return None
         east_m = column(fleet.east_m, "<f4")[chasing] - (target.x_m - self._grid.west_m)
         south_m = column(fleet.south_m, "<f4")[chasing] - (self._grid.north_m - target.y_m)
-        reach_m = np.where(arrived, 2 * self._capture_range_m, self._capture_range_m)
+        range_m = self._capture_range_m
+        reach_m = np.where(arrived, range_m + max(range_m, 2 * self._grid.resolution_m), range_m)
         near = np.flatnonzero(np.hypot(east_m, south_m) <= reach_m)
         return fleet.ids[int(chasing[near[0]])] if len(near) else None
 
