@@ -42,10 +42,12 @@ class ZoneConfig(Section, frozen=True, kw_only=True):
 
     kind       forbidden is lethal; preferred halves the pace; road sets the road pace; rough doubles the pace
     polygon_m  [east, south] corners in metres from the north-west corner of the terrain
+    mask       instead of a polygon: an image as large as the terrain, painted wherever it is not 0
     """
 
     kind: Literal["forbidden", "preferred", "road", "rough"]
-    polygon_m: Annotated[tuple[Point, ...], Meta(min_length=3)]
+    polygon_m: Annotated[tuple[Point, ...], Meta(min_length=3)] | None = None
+    mask: str | None = None
     name: str = ""
 
 
@@ -61,15 +63,22 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Where elevation and photo come from.
 
-    source        "jacksboro" (built in), "synthetic", or a path to .tif, .hgt, .asc, .npz or .map
+    source        "jacksboro" (built in), "synthetic", or a file: .tif, .hgt, .asc, .npz, .png, .map or a ROS .yaml
     photo         a colour GeoTIFF on the same ground, or nothing
+    labels        a TOML file of labelled polygons and points, from which to learn what the photo shows
     resolution_m  cell size to bring everything to; the source's own if not given
+    crs           coordinate system of the source where the file does not say it, such as "EPSG:32632"
+    height_scale  metres per unit of height, where the file does not say it (.png)
+    nodata        voids are lethal, or filled from their surroundings
     roads         how many roads to lay between seeded places, as there is no map of them
     """
 
     source: str = "jacksboro"
     photo: str | None = None
+    labels: str | None = None
     resolution_m: Positive | None = None
+    crs: str | None = None
+    height_scale: Positive | None = None
     nodata: Literal["lethal", "fill"] = "lethal"
     roads: Annotated[int, Meta(ge=0, le=200)] = 0
     rows: Annotated[int, Meta(ge=1, le=16384)] = 256
@@ -315,6 +324,15 @@ def _check(scenario: Scenario, source: str) -> None:
     doubled = sorted({id for id in ids if ids.count(id) > 1})
     if doubled:
         raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    for key, zones in (
+        ("cost.zones", scenario.cost.zones),
+        ("terrain.hidden.zones", scenario.terrain.hidden.zones),
+    ):
+        for n, zone in enumerate(zones):
+            if zone.polygon_m is None and zone.mask is None:
+                raise ConfigError(f"{source}: {key}[{n}]: missing required field `polygon_m` (or `mask`)")
+            if zone.polygon_m is not None and zone.mask is not None:
+                raise ConfigError(f"{source}: {key}[{n}]: polygon_m and mask exclude each other")
     names = [group.name for group in scenario.groups]
     if len(set(names)) < len(names):
         raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
@@ -357,13 +375,22 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
     if source not in BUILT_IN_TERRAINS:
         source = str(base / source)
     photo = None if terrain.photo is None else str(base / terrain.photo)
+    labels = None if terrain.labels is None else str(base / terrain.labels)
+    hidden = msgspec.structs.replace(terrain.hidden, zones=_anchored_zones(terrain.hidden.zones, base))
+    cost = msgspec.structs.replace(scenario.cost, zones=_anchored_zones(scenario.cost.zones, base))
     network = scenario.network
     if network.tls is not None:
         tls = network.tls
         tls = TlsConfig(ca=str(base / tls.ca), certificate=str(base / tls.certificate), key=str(base / tls.key))
         network = msgspec.structs.replace(network, tls=tls)
-    terrain = msgspec.structs.replace(terrain, source=source, photo=photo)
-    return msgspec.structs.replace(scenario, terrain=terrain, network=network)
+    terrain = msgspec.structs.replace(terrain, source=source, photo=photo, labels=labels, hidden=hidden)
+    return msgspec.structs.replace(scenario, terrain=terrain, cost=cost, network=network)
+
+
+def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConfig, ...]:
+    return tuple(
+        zone if zone.mask is None else msgspec.structs.replace(zone, mask=str(base / zone.mask)) for zone in zones
+    )
 
 
 BUILT_IN_TERRAINS = ("jacksboro", "synthetic")
