@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TextLogColumn
 
 from launch_scripts.monitor.scene import Ground
 
@@ -18,15 +19,17 @@ def make_blueprint(ground: Ground) -> rrb.Blueprint:
             _view_3d(ground),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/summary", name="Now"),
-                _plot("captures_and_marks", "Captures, marks"),
-                _plot("states", "Vehicles by state"),
-                _plot("gap", "Gap to optimum, %"),
-                _plot("growth_ms", "Growth of the trees, ms"),
-                _plot("messages", "Messages per second"),
-                rrb.TextLogView(origin="/log", name="Log"),
-                row_shares=[1.5, 1, 1, 1, 1, 1, 1.1],
+                _plot("captures_and_marks", "Captures and marks"),
+                _plot("gap", "Gap to optimum of each target, %", legend=False),
+                rrb.Tabs(
+                    _plot("messages", "Messages per second", legend=False),
+                    _plot("growth_ms", "Growth of the trees, ms", legend=False),
+                    _plot("states", "Vehicles by state"),
+                ),
+                _log(),
+                row_shares=[3.1, 1.15, 1.15, 1.25, 1.5],
             ),
-            column_shares=[2.5, 1],
+            column_shares=[2.6, 1],
         ),
         rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="following"),
         rrb.BlueprintPanel(state="hidden"),
@@ -52,8 +55,8 @@ def _view_3d(ground: Ground) -> rrb.Spatial3DView:
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=(middle[0] - 0.08 * far, middle[1] - 0.82 * far, middle[2] + 0.74 * far),
-            look_target=(middle[0], middle[1] - 0.03 * far, middle[2]),
+            position=(middle[0] - 0.06 * far, middle[1] - 0.84 * far, middle[2] + 0.7 * far),
+            look_target=(middle[0], middle[1] - 0.125 * far, middle[2]),
             eye_up=(0, 0, 1),
         ),
         overrides={
@@ -63,7 +66,22 @@ def _view_3d(ground: Ground) -> rrb.Spatial3DView:
     )
 
 
-def _plot(name: str, title: str) -> rrb.TimeSeriesView:
+def _plot(name: str, title: str, legend: bool = True) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
-        origin=f"/plots/{name}", name=title, plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
+        origin=f"/plots/{name}",
+        name=title,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+    )
+
+
+def _log() -> rrb.TextLogView:
+    columns = [
+        TextLogColumn("EntityPath", visible=False),
+        TextLogColumn("LogLevel", visible=True),
+        TextLogColumn("Body", visible=True),
+    ]
+    return rrb.TextLogView(
+        origin="/log",
+        name="Log",
+        columns=rrb.TextLogColumns(text_log_columns=columns, timeline_columns=["sim_time"]),
     )

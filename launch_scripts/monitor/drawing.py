@@ -17,8 +17,9 @@ from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, Ground, M
 from launch_scripts.record import Sample
 from swarm.messages import VehicleState
 
-_ROUTE_COLOUR = (120, 255, 190, 90)
-_TRAIL_COLOUR = (0, 190, 110)
+_NAMES_SHOWN = 40
+_ROUTE_COLOUR = (150, 235, 255)
+_TRAIL_COLOUR = (0, 200, 110)
 _TARGET_TRAIL_COLOUR = (255, 70, 70)
 _WINDOW_COLOUR = (255, 200, 60)
 _PLOT_COLOURS = [
@@ -52,11 +53,11 @@ class Drawing:
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for tile in ground.mesh_tiles():
             self._tile(tile)
-        thin, line = _screen_points(0.7), _screen_points(1.2)
-        rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [_TRAIL_COLOUR], [line]), static=True)
+        thin, line, thick = _screen_points(0.5), _screen_points(1.3), _screen_points(2.2)
+        rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [_TRAIL_COLOUR], [thick]), static=True)
         rec.log(
             "world/trails/targets",
-            _style(rr.LineStrips3D, [_TARGET_TRAIL_COLOUR], [_screen_points(2.2)]),
+            _style(rr.LineStrips3D, [_TARGET_TRAIL_COLOUR], [thick]),
             static=True,
         )
         rec.log("world/windows", _style(rr.LineStrips3D, [_WINDOW_COLOUR], [line]), static=True)
@@ -107,28 +108,28 @@ class Drawing:
             self._rec.log("world/vehicles", rr.Points3D.from_fields(positions=points.positions))
             return
         self._vehicle_ids, self._vehicle_colours = points.ids, points.colours
-        radii = None if same else [_screen_points(4.0)]
+        radii = None if same else [_screen_points(4.6)]
         self._rec.log(
             "world/vehicles",
             rr.Points3D.from_fields(positions=points.positions, colors=points.colours, radii=radii),
         )
 
-    def targets(self, points: Points, poles: list[Floats]) -> None:
-        self._rec.log("world/targets/poles", rr.LineStrips3D.from_fields(strips=poles))
+    def targets(self, points: Points, poles: list[Floats], names: Floats) -> None:
+        """Balls on poles, and above each its name at `names`."""
+        rec = self._rec
+        rec.log("world/targets/poles", rr.LineStrips3D.from_fields(strips=poles))
         if points.ids == self._target_ids_drawn:
-            self._rec.log("world/targets", rr.Points3D.from_fields(positions=points.positions))
+            rec.log("world/targets/balls", rr.Points3D.from_fields(positions=points.positions))
+            rec.log("world/targets/names", rr.Points3D.from_fields(positions=names))
             return
         self._target_ids_drawn = points.ids
-        self._rec.log(
-            "world/targets",
-            rr.Points3D(
-                points.positions,
-                colors=points.colours,
-                radii=_screen_points(6.5),
-                labels=points.ids,
-                show_labels=len(points.ids) <= 40,
-            ),
-        )
+        radius = _screen_points(6.5)
+        rec.log("world/targets/balls", rr.Points3D(points.positions, colors=points.colours, radii=radius))
+        if len(points.ids) <= _NAMES_SHOWN:
+            labels = rr.Points3D(
+                names, colors=(255, 205, 200), radii=_screen_points(0.1), labels=points.ids, show_labels=True
+            )
+            rec.log("world/targets/names", labels)
 
     def trails(self, who: str, strips: list[Floats]) -> None:
         """The newest piece of everybody's trail; the view shows the pieces of the last seconds together."""

@@ -31,9 +31,9 @@ _RELIEF = 0.09
 
 STATE_COLOURS = {
     VehicleState.IDLE: (150, 178, 158),
-    VehicleState.WAITING: (20, 140, 90),
-    VehicleState.FOLLOWING: (0, 230, 118),
-    VehicleState.ARRIVED: (196, 255, 92),
+    VehicleState.WAITING: (0, 150, 96),
+    VehicleState.FOLLOWING: (0, 255, 136),
+    VehicleState.ARRIVED: (205, 255, 80),
     VehicleState.STRANDED: (150, 150, 20),
     VehicleState.LOST: (40, 84, 60),
 }
@@ -190,8 +190,11 @@ def _triangles(rows: int, cols: int) -> NDArray[np.uint32]:
 
 def _lit_photo(terrain: Terrain) -> Bytes:
     shade = hillshade(terrain.elevation_m, terrain.grid.resolution_m)
-    lit = terrain.photo.astype(np.float32) * (0.5 + 0.75 * shade[..., None])
-    return np.clip(lit, 0, 255).astype(np.uint8)
+    photo = terrain.photo.astype(np.float32)
+    grey = photo.mean(axis=2, keepdims=True)  # on full colours green vehicles would drown
+    lit: Floats = (0.42 * photo + 0.53 * grey) * (0.42 + 0.78 * shade[..., None])
+    lit_bytes: Bytes = np.clip(lit, 0, 255).astype(np.uint8)
+    return lit_bytes
 
 
 # --- what moves -------------------------------------------------------------------------------------------------
@@ -214,6 +217,12 @@ def target_points(ground: Ground, places_m: Mapping[str, tuple[float, float]]) -
     east_south = np.array(list(places_m.values()), np.float32).reshape(-1, 2)
     positions = ground.place(east_south[:, 0], east_south[:, 1], 2.2 * ground.scale_m)
     return Points(list(places_m), positions, np.tile(np.array(TARGET_COLOUR, np.uint8), (len(positions), 1)))
+
+
+def label_places(ground: Ground, targets: Points) -> Floats:
+    """Where the names of targets stand: above them."""
+    names: Floats = targets.positions + np.array([0, 0, 3.4 * ground.scale_m], np.float32)
+    return names
 
 
 def poles(ground: Ground, targets: Points) -> list[Floats]:

@@ -14,6 +14,7 @@ from launch_scripts.monitor.scene import (
     RouteNow,
     Trails,
     cell_at,
+    label_places,
     poles,
     route_strip,
     target_points,
@@ -202,7 +203,7 @@ class MonitorService:
             self._targets_new = False
             targets = target_points(self._ground, self.recorder.observed.targets())
             feet = poles(self._ground, targets)
-            self._drawing.targets(targets, feet)
+            self._drawing.targets(targets, feet, label_places(self._ground, targets))
             if trails_due:
                 places = np.array([pole[0] for pole in feet], np.float32)
                 self._drawing.trails("targets", self._target_trails.advance(targets.ids, places))
