@@ -226,16 +226,28 @@ def _print_status(
         console.print(trees)
 
 
-def simulate(scenario: str, seed: int | None, seconds: float | None, trace: Path | None, as_json: bool) -> None:
+def simulate(name: str, seed: int | None, seconds: float | None, trace: Path | None, as_json: bool) -> None:
     """See `swarm simulate`."""
-    import msgspec
+    import contextlib
 
-    from launch_scripts import simulate as simulation
     from launch_scripts.options import find_scenario
+    from launch_scripts.screen import Screen
+    from launch_scripts.simulate import simulate as run_simulation
+    from swarm.errors import StoreError
 
-    chosen = find_scenario(scenario)
-    if seed is not None:
-        chosen = msgspec.structs.replace(chosen, seed=seed)
-    if seconds is not None:
-        chosen = msgspec.structs.replace(chosen, seconds=seconds)
-    raise NotImplementedError(simulation, trace, as_json)
+    scenario = find_scenario(name)
+    screen = Screen(as_json, plain=True)
+    with contextlib.ExitStack() as stack:
+        try:
+            log = None if trace is None else stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
+        except OSError as error:
+            raise StoreError(f"cannot write {trace}: {error.strerror or error}") from error
+        result = run_simulation(scenario, seed=seed, seconds=seconds, trace=log)
+    if as_json:
+        typer.echo(json.dumps(result.report, indent=2))
+    else:
+        screen.report(result.report)
+    screen.say(
+        f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
+        f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
+    )
