@@ -127,6 +127,8 @@ class Node:
             return
         if self.ticking:
             self.service.tick(self.now_ns())
+            for look in self._simulation.after_tick:
+                look(self)
         self._simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
 
     def crash(self) -> None:
@@ -150,7 +152,10 @@ class Node:
 
 
 class Simulation:
-    """A run that can be advanced, looked into and disturbed. `simulate` is the short way."""
+    """A run that can be advanced, looked into and disturbed. `simulate` is the short way.
+
+    after_tick  told of a node after each of its ticks, to look into it
+    """
 
     def __init__(
         self,
@@ -172,6 +177,7 @@ class Simulation:
         self.links = FaultyLinks(self.faults, chance, EPOCH_NS, scenario.network.lease_s)
         self.network = MemoryNetwork(self.scheduler, self.links, self.log.delivery)
         self.nodes: dict[str, Node] = {}
+        self.after_tick: list[Callable[[Node], None]] = []
         phases = random.Random(f"phases/{scenario.seed}")
         for spec in processes_of(scenario, SIMULATED_ROLES):
             skew_ns = int(self.faults.skews_ms.get(spec.name, 0.0) * 1e6)
