@@ -1,0 +1,346 @@
+"""The monitor: listens, records, serves on loopback, and is in nobody's way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from fake_run import fake_run
+
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.outlets import Outlets, new_recording_path
+from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.service import MonitorService
+from shared_map.terrain import Terrain, terrain_of_pace
+from swarm.bus import Event
+from swarm.clock import NS_PER_S, ManualClock
+from swarm.config import MonitorConfig, Scenario, parse_scenario
+from swarm.errors import BusError, StoreError
+from swarm.liveness import Peer
+from swarm.memory_bus import MemoryBus, MemoryNetwork, PerfectLinks
+from swarm.messages import Fleet, Followed, MarkSet, Message, Note, PlannerStatus, Stats, TargetPose
+from swarm.role import RoleSetup
+from swarm.scheduler import Scheduler
+from swarm.topics import FLEET, FOLLOWED, MARKS, NOTE, POSE, STATS, STATUS, TOPICS
+
+SILENT = MonitorConfig(live=False)
+LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0, memory_mib=16)
+FRAME_NS = NS_PER_S // 10
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return parse_scenario(
+        'name = "little"\nseed = 3\nseconds = 6.0\ntime_scale = 10\n[[targets]]\nname = "t"\ncount = 2\n'
+        "[[groups]]\nvehicles = 10\n[monitor]\nlive = false\n"
+    )
+
+
+@pytest.fixture(scope="module")
+def terrain() -> Terrain:
+    rows, cols = np.mgrid[0:80, 0:100].astype(np.float32)
+    elevation_m = (40 * np.sin(rows / 9) + 30 * np.cos(cols / 7)).astype(np.float32)
+    return terrain_of_pace(np.full((80, 100), 0.1, np.float32), 25.0, elevation_m)
+
+
+class Rig:
+    """A monitor on a memory bus, and somebody else who speaks."""
+
+    def __init__(
+        self, scenario: Scenario, terrain: Terrain, path: Path | None, live_url: str | None = None
+    ) -> None:
+        self.scheduler = Scheduler(ManualClock(0))
+        self.said: set[str] = set()
+
+        def trace(now_ns: int, source: str, destination: str, what: str, payload: bytes) -> None:
+            if source == "monitor":
+                self.said.add(what)
+
+        network = MemoryNetwork(self.scheduler, PerfectLinks(), trace)
+        self.speaker, bus = network.bus("speaker"), network.bus("monitor")
+        self.network, self.terrain, self.scenario = network, terrain, scenario
+        setup = RoleSetup(scenario, "run", "monitor", "0", incarnation=1, started_ns=0)
+        ground = Ground(terrain)
+        self.outlets = Outlets("run.1", path, SILENT, make_blueprint(ground))
+
+        def post(event: Event) -> None:
+            self.service.handle(event, self.scheduler.clock.now_ns())
+
+        self.service = MonitorService(setup, terrain, bus, post, self.outlets.rec, ground=ground, live_url=live_url)
+        self.service.start(0)
+
+    def play(self, told: Iterator[tuple[int, Message | Peer]]) -> None:
+        for now_ns, message in told:
+            self.until(now_ns)
+            if isinstance(message, Peer):
+                self.speaker.declare_alive(message)
+            else:
+                say(self.speaker, self.terrain, message)
+        self.until(self.scheduler.clock.now_ns() + NS_PER_S)
+
+    def until(self, end_ns: int) -> None:
+        """Frames up to a moment."""
+        while self.scheduler.clock.now_ns() < end_ns:
+            now_ns = self.scheduler.clock.now_ns()
+            self.scheduler.run_until(min(now_ns + FRAME_NS - now_ns % FRAME_NS, end_ns))
+            if self.scheduler.clock.now_ns() % FRAME_NS == 0:
+                self.service.tick(self.scheduler.clock.now_ns())
+
+    def close(self) -> None:
+        self.service.stop(self.scheduler.clock.now_ns())
+        self.outlets.close()
+
+
+def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
+    match message:
+        case Fleet():
+            bus.publish(FLEET, message, region=message.region, author=message.author)
+        case TargetPose():
+            bus.publish(POSE, message, target=message.target)
+        case PlannerStatus():
+            bus.publish(STATUS, message, target=message.target)
+        case Stats():
+            bus.publish(STATS, message, role=message.role, id=message.id)
+        case Note():
+            bus.publish(NOTE, message, role=message.role, id=message.id)
+        case Followed():
+            bus.publish(FOLLOWED, message, vehicle=message.vehicle)
+        case MarkSet():
+            region = terrain.grid.region_of_tile(message.tile)
+            bus.publish(MARKS, message, region=region, tile=message.tile, author=message.author)
+
+
+def rows_by_entity(path: Path) -> dict[str, int]:
+    """Entity -> rows logged over time, without what is static."""
+    from rerun.chunk import RrdReader
+
+    counts: dict[str, int] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a file without a footer
+        for chunk in RrdReader(str(path)).stream():
+            if not chunk.is_static:
+                counts[str(chunk.entity_path)] = counts.get(str(chunk.entity_path), 0) + chunk.num_rows
+    return counts
+
+
+def hidden_truth(terrain: Terrain) -> np.ndarray:
+    truth = np.array(terrain.pace_s_per_m)
+    truth[30:34, 20:80] = np.inf
+    return truth
+
+
+def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
+    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
+    tiles = rig.service._ground.tile_rows * rig.service._ground.tile_cols
+    rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
+    rig.close()
+    rows = rows_by_entity(tmp_path / "run.rrd")
+    assert rows["/world/vehicles"] >= 12
+    assert rows["/world/targets/balls"] >= 12
+    for name in ("world/targets/poles", "world/trails/vehicles", "world/windows", "summary"):
+        assert rows[f"/{name}"] >= 3, name
+    for name in ("world/routes/t0", "world/routes/t1", "log"):
+        assert rows[f"/{name}"] >= 1, name
+    for plot in ("states", "captures_and_marks", "gap", "growth_ms", "messages"):
+        assert rows[f"/plots/{plot}"] >= 3, plot
+    textures = [rows[f"/world/ground/{tile}"] for tile in range(tiles)]
+    assert min(textures) >= 1
+    assert max(textures) >= 2, "marks change the photo"
+
+
+def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
+    rig = Rig(scenario, terrain, tmp_path / "late.rrd")
+    rig.scheduler.run_until(20 * NS_PER_S)
+    rig.play((now_ns + 20 * NS_PER_S, told) for now_ns, told in fake_run(terrain, hidden_truth(terrain), scenario))
+    rig.close()
+    assert rows_by_entity(tmp_path / "late.rrd")["/world/vehicles"] >= 12
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_sentence(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"cannot write .*run\.rrd: No such file or directory"):
+        new_recording_path(tmp_path / "nowhere")
+
+
+def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, None)
+    rig.speaker.publish(
+        FOLLOWED,
+        Followed(vehicle="v", target="t0", start=0, directions=b"\x00", cost_s=1.0, lower_bound_s=1.0),
+        vehicle="v",
+    )
+    rig.until(NS_PER_S)
+    assert rig.service.counters.counts["routes_unreadable"] == 1
+    rig.close()
+
+
+def test_where_to_watch_is_told_once(scenario: Scenario, terrain: Terrain) -> None:
+    rig = Rig(scenario, terrain, None, live_url="http://127.0.0.1:1/")
+    heard: list[Event] = []
+    rig.speaker.subscribe(NOTE, heard.append)
+    rig.until(3 * NS_PER_S)
+    rig.close()
+    notes = [event.message for event in heard]  # type: ignore[union-attr]
+    assert [(note.kind, note.text) for note in notes if isinstance(note, Note)] == [
+        ("live_view", "http://127.0.0.1:1/")
+    ]
+
+
+def test_a_monitor_speaks_of_nothing_but_itself(scenario: Scenario, terrain: Terrain) -> None:
+    rig = Rig(scenario, terrain, None)
+    for topic in TOPICS:
+        rig.speaker.subscribe(topic, lambda _: None)
+    rig.play(fake_run(terrain, hidden_truth(terrain), msgspec.structs.replace(scenario, seconds=2.0)))
+    rig.close()
+    assert rig.said == {"run", "stats"}
+
+
+# --- outlets: sockets and files ---------------------------------------------------------------------------------
+
+
+def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> bool:
+    deadline_s = time.monotonic() + within_s
+    while time.monotonic() < deadline_s:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return condition()
+
+
+def listeners(pid: int) -> set[str]:
+    """Local addresses, in the kernel's hex, on which a process listens."""
+    inodes = set()
+    for fd in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            target = os.readlink(fd)
+        except OSError:
+            continue
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    addresses = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and fields[9] in inodes:
+                addresses.add(fields[1].rpartition(":")[0])
+    return addresses
+
+
+def served(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(url, timeout=2) as reply:
+            return reply.status == 200 and b"rerun" in reply.read().lower()
+    except OSError:
+        return False
+
+
+@pytest.mark.network
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_viewer_and_stream_are_served_on_loopback_only_and_end_with_us(terrain: Terrain, tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    os.environ["HOME"], old_home = str(home), os.environ.get("HOME", "")
+    try:
+        outlets = Outlets("r", tmp_path / "run.rrd", LIVE, make_blueprint(Ground(terrain)))
+    finally:
+        os.environ["HOME"] = old_home
+    assert outlets.live_url is not None
+    assert outlets._viewer is not None
+    pid = outlets._viewer.pid
+    try:
+        assert eventually(lambda: served(outlets.live_url or ""))
+        assert listeners(pid) == {"0100007F"}
+        assert listeners(os.getpid()) == {"0100007F"}
+        assert list(home.rglob("*")) == [], "nothing is written to the home folder"
+    finally:
+        began_s = time.monotonic()
+        outlets.close()
+    assert time.monotonic() - began_s < 4
+    assert not Path(f"/proc/{pid}").exists()
+
+
+@pytest.mark.network
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot tie a child to its parent's end")
+def test_a_killed_monitor_leaves_a_readable_file_and_no_process(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    script = f"""
+import time, numpy, pathlib
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.outlets import Outlets
+from launch_scripts.monitor.scene import Ground
+from shared_map.terrain import terrain_of_pace
+from swarm.config import MonitorConfig
+import rerun as rr
+ground = Ground(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
+outlets = Outlets("r", pathlib.Path({str(path)!r}), MonitorConfig(grpc_port=0, web_port=0), make_blueprint(ground))
+for n in range(100):
+    outlets.rec.set_time("tick", sequence=n)
+    outlets.rec.log("a", rr.Scalars(n))
+outlets.rec.flush(timeout_sec=5)
+print(outlets._viewer.pid, flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as monitor:
+        assert monitor.stdout is not None
+        viewer = int(monitor.stdout.readline())
+        assert eventually(lambda: b"--serve-web" in Path(f"/proc/{viewer}/cmdline").read_bytes())
+        monitor.send_signal(signal.SIGKILL)
+    assert eventually(lambda: not Path(f"/proc/{viewer}").exists() or _zombie(viewer))
+    assert rows_by_entity(path)["/a"] == 100
+
+
+def _zombie(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+@pytest.mark.network
+def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("launch_scripts.monitor.outlets._PORT_PATIENCE_S", 0.2)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        config = MonitorConfig(grpc_port=0, web_port=port)
+        with pytest.raises(
+            BusError, match=rf"live view on port {port}: Address already in use; .*monitor\.web_port"
+        ):
+            Outlets("r", None, config, make_blueprint(Ground(terrain)))
+
+
+@pytest.mark.network
+def test_logging_does_not_wait_for_a_viewer_that_reads_nothing(terrain: Terrain) -> None:
+    import rerun as rr
+
+    outlets = Outlets("r", None, LIVE, make_blueprint(Ground(terrain)))
+    try:
+        assert outlets.live_url is not None
+        port = int(outlets.live_url.rpartition(":")[2].split("/")[0])
+        with socket.create_connection(("127.0.0.1", port)) as stalled:
+            stalled.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n")
+            worst_s = 0.0
+            for n in range(100):
+                began_s = time.perf_counter()
+                outlets.rec.set_time("tick", sequence=n)
+                outlets.rec.log("a", rr.Points3D(np.zeros((2000, 3), np.float32)))
+                worst_s = max(worst_s, time.perf_counter() - began_s)
+        assert worst_s < 2.0
+    finally:
+        outlets.close()
