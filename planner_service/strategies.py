@@ -2,7 +2,7 @@
 
     full                              the exact tree, every time
     variable_range                    the paper's: a window around the target, as wide as its movement asks for
-    rotation                          small windows every move, and a full growth every `full_every` moves on a worker
+    rotation                          small windows every move, every `full_every` moves a full growth on a worker
     multi_resolution                  the whole terrain, coarser with the distance from the target
     variable_range+multi_resolution   the paper's combination: windows near, the coarse tree far
     auto                              full while it fits `cpu_budget`, then rotation, then coarse and rotation
@@ -13,6 +13,7 @@ takes its result. Whatever happened, the tree that `routes` reads has no cycle a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -20,9 +21,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service import kernels
+from planner_service.tree import Changes, CostToGoTree, Floats, Ground, check_pace, flood
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
-from swarm.messages import Route
+from swarm.messages import Route, RouteStatus
 
 Kind = Literal["none", "full", "window", "repair", "coarse", "forced"]
 EMPTY = Window(0, 0, 0, 0)
@@ -44,18 +47,66 @@ class Update:
     wants_full: bool = False
 
 
+MODEL_NS_PER_CELL = 15
+"""What a full growth costs per cell, for choices that must come out alike on every machine."""
+REPAIR_SHARE = 16
+"""A repair that concerns more than one cell in so many gives way to a full growth."""
+ROUNDING = 2.0**-23
+"""Relative error of one float32 step, doubled for the sum over a route's steps."""
+
+
+def block_window(grid: GridSpec, old: int, new: int, k_min: int) -> Window:
+    """The paper's variable range: the largest k >= k_min whose block index of 2**k cells changed between two cells
+    gives a window 2**(k+2)+1 wide; if none did, the one of k_min. At least as far out as the move was long, and
+    shut around both cells."""
+    row, col = grid.row_col(new)
+    old_row, old_col = grid.row_col(old)
+    k = k_min
+    top = max(grid.rows, grid.cols)
+    for exponent in range(k_min, top.bit_length() + 1):
+        if row >> exponent != old_row >> exponent or col >> exponent != old_col >> exponent:
+            k = exponent
+    return grid.around(new, max(2 << k, 2 * grid.distance_cells(old, new)))
+
+
+def literal_window(grid: GridSpec, old: int, new: int) -> Window:
+    """The paper's rule as it is printed: a block must be crossed in row and column at once, so that it never widens
+    for a move along an axis. For comparison only."""
+    row, col = grid.row_col(new)
+    old_row, old_col = grid.row_col(old)
+    k = 1
+    for exponent in range(1, max(grid.rows, grid.cols).bit_length() + 1):
+        if row >> exponent != old_row >> exponent and col >> exponent != old_col >> exponent:
+            k = exponent
+    return grid.around(new, 2 << k)
+
+
 @dataclass(frozen=True, eq=False)
 class GrownTree:
     """An exact tree, grown by a worker on a snapshot.
 
-    cost_to_go  (rows, cols) float32  s; inf where there is no way
-    parent      (rows, cols) uint8    direction 0..7; NO_DIRECTION at the target and where there is no way
+    cost, parent, weight  padded, as in `kernels`
+    offered               padded parents of the tree that was served when the snapshot was taken; None before any
     """
 
     target_cell: int
     map_version: int
-    cost_to_go: NDArray[np.float32]
+    cost: Floats
     parent: NDArray[np.uint8]
+    weight: Floats
+    fine: bool
+    offered: NDArray[np.uint8] | None
+    stride: int
+
+    @property
+    def cost_to_go(self) -> Floats:
+        """(rows, cols) float32, s; inf where there is no way."""
+        return np.ascontiguousarray(self.cost.reshape(-1, self.stride)[1:-1, 1:-1])
+
+    @property
+    def parents(self) -> NDArray[np.uint8]:
+        """(rows, cols) uint8, direction 0..7; NO_DIRECTION at the target and where there is no way."""
+        return np.ascontiguousarray(self.parent.reshape(-1, self.stride)[1:-1, 1:-1])
 
 
 class TargetTree:
@@ -73,27 +124,81 @@ class TargetTree:
         self.map_version = -1
         self.ready = False
         self.last_gaps: NDArray[np.float64] = np.empty(0, np.float64)
+        self._grid = grid
+        self._config = config
+        self._ground = Ground(grid, config)
+        self._tree = CostToGoTree(self._ground)
+        self._loaded = False
+        self._stale = True
+        self._moves = 0
+        self._job_out = False
+        self._full_ns = self.measured_model_ns()
+        # Lower bounds: `_potential` is an exact tree of an earlier root; no step costs less than it falls by.
+        self._potential: Floats | None = None
 
-    def update(
-        self, pace: NDArray[np.float32], target_cell: int, dirty: Sequence[Window], map_version: int
-    ) -> Update:
+    # --- keeping up ---------------------------------------------------------------------------------------------
+
+    def update(self, pace: Floats, target_cell: int, dirty: Sequence[Window], map_version: int) -> Update:
         """The target moved, the map changed, or both: do this strategy's inline work.
 
         pace   (rows, cols) float32 C-contiguous, s/m, inf is lethal. ValueError on NaN, <= 0, wrong dtype or shape
         dirty  covers every cell that changed since the last call
         """
-        raise NotImplementedError
+        changes = self._learn(pace, dirty)
+        self.map_version = map_version
+        if not self._aim(target_cell, changes):
+            return Update("none")
+        if self._stale:
+            return self._grow_full(target_cell)
+        moved = target_cell != self._tree.root
+        self._moves += moved
+        if not self._windows and (moved or not self._tree.exact):
+            return self._grow_full(target_cell)
+        mended = self._mend(changes)
+        if mended is None:
+            return self._grow_full(target_cell)
+        if not moved:
+            return self._with_wish(mended)
+        window = self._move(target_cell)
+        if mended.kind == "none" or window.kind == "full":
+            return self._with_wish(window)
+        return self._with_wish(Update("window", window.window.union(mended.window), window.cells + mended.cells))
 
-    def full_job(
-        self, pace_snapshot: NDArray[np.float32], target_cell: int, map_version: int
-    ) -> Callable[[], GrownTree]:
+    def full_job(self, pace_snapshot: Floats, target_cell: int, map_version: int) -> Callable[[], GrownTree]:
         """A pure, GIL-free full growth. Nobody may write to `pace_snapshot` before it ends."""
-        raise NotImplementedError
+        check_pace(self._grid, pace_snapshot)
+        grid, config = self._grid, self._config
+        serves_it = self.ready and not self._stale and self._tree.root == target_cell
+        offered = self._tree.parent.copy() if serves_it else None
+        self._job_out = True
+
+        def job() -> GrownTree:
+            ground = Ground(grid, config)
+            ground.load(pace_snapshot)
+            cost = np.full(ground.size, np.inf, np.float32)
+            parent = np.full(ground.size, kernels.NONE, np.uint8)
+            fine = True
+            if grid.inside(*divmod(target_cell, grid.cols)) and ground.passable(target_cell):
+                root = ground.pad(target_cell)
+                _, fine = flood(
+                    ground.weight,
+                    ground.low,
+                    ground.high,
+                    ground.stride,
+                    root,
+                    ground.rule,
+                    ground.corners,
+                    cost,
+                    parent,
+                )
+            return GrownTree(target_cell, map_version, cost, parent, ground.weight, fine, offered, ground.stride)
+
+        return job
 
     def adopt(
         self,
         grown: GrownTree,
-        pace: NDArray[np.float32],
+        pace: Floats,
         target_cell: int,
         dirty: Sequence[Window],
         map_version: int,
@@ -103,24 +208,266 @@ class TargetTree:
 
         dirty  covers every cell that changed since the snapshot of `grown` was taken
         """
-        raise NotImplementedError
+        self._job_out = False
+        fresh = not self._loaded
+        changes = self._learn(pace, dirty)
+        self.map_version = map_version
+        if grown.offered is not None:
+            self._measure(grown, followed_cells)
+        if not self._aim(target_cell, changes):
+            return Update("none")
+        since = self._ground.difference(grown.weight, [self._grid.window] if fresh else dirty)
+        tree = self._tree
+        self._moves = 0
+        if grown.cost[self._ground.pad(grown.target_cell)] != 0.0:
+            return self._grow_full(target_cell)
+        tree.take(grown.target_cell, grown.cost, grown.parent, grown.fine)
+        self._potential = grown.cost.copy()
+        self._stale = False
+        moved = target_cell != tree.root
+        if moved and not self._windows:
+            return self._grow_full(target_cell)
+        if not tree.fine and (since.cells.size or moved):
+            return self._grow_full(target_cell)
+        mended = self._mend(since)
+        if mended is None:
+            return self._grow_full(target_cell)
+        cells = self._grid.cells + mended.cells
+        if moved:
+            cells += self._move(target_cell).cells
+        return Update("full", self._grid.window, cells)
 
-    def force(self, pace: NDArray[np.float32], cells: Any) -> Update:
+    def force(self, pace: Floats, cells: Any) -> Update:
         """The range is forced to cover these cells: what they get afterwards is the best there is."""
-        raise NotImplementedError
-
-    def routes(self, pace: NDArray[np.float32], cells: Any, max_cells: int = 0) -> list[Route]:
-        """A route from each cell, in order; statuses instead of exceptions. 0 for `max_cells` is the whole route."""
-        raise NotImplementedError
-
-    def cost_to_go_at(self, cells: Any) -> NDArray[np.float32]:
-        """float32, s, per cell; inf where there is no way or the cell is outside."""
-        raise NotImplementedError
-
-    def measured_model_ns(self) -> int:
-        """What one full growth is taken to cost in a simulation: a constant per cell, the same on every machine."""
-        raise NotImplementedError
+        target = self.target_cell
+        if not self.ready or target is None:
+            return Update("none")
+        wanted = self._inside(np.asarray(cells, np.int64))
+        if wanted.size == 0 or self._tree.exact:
+            return Update("none")
+        grown = self._grow_full(target)
+        return Update("forced", grown.window, grown.cells)
 
     def observe_full_ns(self, took_ns: int) -> None:
         """What a full growth really took, for `auto` to choose by. A simulation does not call it."""
-        raise NotImplementedError
+        self._full_ns = max(1, took_ns)
+
+    def measured_model_ns(self) -> int:
+        """What one full growth is taken to cost in a simulation: a constant per cell, the same on every machine."""
+        return self._grid.cells * MODEL_NS_PER_CELL
+
+    # --- answers ------------------------------------------------------------------------------------------------
+
+    def routes(self, pace: Floats, cells: Any, max_cells: int = 0) -> list[Route]:
+        """A route from each cell, in order; statuses, no exceptions. 0 for `max_cells` is the whole route."""
+        asked = np.asarray(cells, np.int64).reshape(-1)
+        if not self.ready:
+            return [Route(status=RouteStatus.NO_TARGET, start=int(cell)) for cell in asked]
+        ground, tree = self._ground, self._tree
+        inside = (asked >= 0) & (asked < self._grid.cells)
+        starts = ground.pad_all(np.where(inside, asked, 0))
+        lethal = inside & ~(ground.weight[starts] < np.inf)
+        ok = inside & (tree.cost[starts] < np.inf)
+        directions, ends, driven, diagonals, last = kernels.walk_routes(
+            ground.weight,
+            tree.parent,
+            ground.stride,
+            ground.rule,
+            ground.pad(tree.root),
+            starts[ok],
+            max_cells,
+            self._grid.cells,
+        )
+        if (ends < 0).any():
+            raise AssertionError("a route does not end at the target: the tree is broken")
+        begins = np.concatenate(([0], ends))[:-1]
+        steps = ends - begins
+        lengths = (steps + diagonals * (ground.diagonal - 1.0)) * self._grid.resolution_m
+        remaining = np.maximum(tree.cost[last] + tree.offset, 0.0).astype(np.float64)
+        remaining[last == ground.pad(tree.root)] = 0.0
+        costs = driven - lengths * self._config.length_weight + remaining
+        bounds = np.minimum(self._lower_bounds(starts[ok]), costs)
+        packed = directions.tobytes()
+        routes: list[Route] = []
+        n = 0
+        for i, cell in enumerate(asked.tolist()):
+            if ok[i]:
+                routes.append(
+                    Route(
+                        status=RouteStatus.OK,
+                        start=cell,
+                        directions=packed[begins[n] : ends[n]],
+                        cost_s=float(costs[n]),
+                        lower_bound_s=float(bounds[n]),
+                        length_m=float(lengths[n]),
+                        remaining_s=float(remaining[n]),
+                    )
+                )
+                n += 1
+                continue
+            status = RouteStatus.UNREACHABLE
+            if not inside[i]:
+                status = RouteStatus.OUTSIDE
+            elif lethal[i]:
+                status = RouteStatus.LETHAL_START
+            routes.append(Route(status=status, start=cell))
+        return routes
+
+    def cost_to_go_at(self, cells: Any) -> Floats:
+        """float32, s, per cell; inf where there is no way or the cell is outside."""
+        asked = np.asarray(cells, np.int64).reshape(-1)
+        costs: Floats = np.full(asked.size, np.inf, np.float32)
+        if self.ready:
+            inside = (asked >= 0) & (asked < self._grid.cells)
+            starts = self._ground.pad_all(asked[inside])
+            costs[inside] = np.maximum(self._tree.cost[starts] + np.float32(self._tree.offset), 0)
+        return costs
+
+    # --- how ----------------------------------------------------------------------------------------------------
+
+    @property
+    def _windows(self) -> bool:
+        """Whether a move is followed by a window rather than by a full growth."""
+        strategy = self._config.strategy
+        if strategy == "auto":
+            return self._full_ns > self._budget_ns
+        return strategy != "full"
+
+    @property
+    def _budget_ns(self) -> float:
+        """CPU time that a tick may take."""
+        return self._config.cpu_budget * 1e9 / self._config.tick_hz
+
+    @property
+    def _full_every(self) -> int:
+        """Moves from one full growth to the next; 0 for never."""
+        if self._config.strategy == "rotation":
+            return self._config.full_every
+        if self._config.strategy == "auto":
+            return max(2, math.ceil(self._full_ns / self._budget_ns))
+        return 0
+
+    def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
+        """Take the map's changes. None the first time: everything is new."""
+        if not self._loaded:
+            self._ground.load(pace)
+            self._loaded = True
+            return None
+        changes = self._ground.apply(pace, dirty)
+        if self._potential is not None and changes.any_lower:
+            ground = self._ground
+            limit = self._grid.cells // REPAIR_SHARE + 1024
+            done = kernels.lower(
+                ground.weight,
+                self._potential,
+                ground.stride,
+                ground.rule,
+                ground.corners,
+                changes.cells,
+                changes.before,
+                limit,
+            )
+            if done < 0:
+                self._potential = None
+        return changes
+
+    def _aim(self, target_cell: int, changes: Changes | None) -> bool:
+        """Whether the target stands where a tree can lead. If not, the tree is stale as soon as the map changes."""
+        self.ready = (
+            self._grid.inside(*divmod(target_cell, self._grid.cols))
+            and target_cell >= 0
+            and self._ground.passable(target_cell)
+        )
+        self.target_cell = target_cell if self.ready else None
+        if not self.ready and (changes is None or changes.cells.size):
+            self._stale = True
+        return self.ready
+
+    def _grow_full(self, target_cell: int) -> Update:
+        cells = self._tree.grow(target_cell)
+        self._stale = False
+        self._moves = 0
+        if self._windows:
+            self._potential = self._tree.cost.copy()
+        return Update("full", self._grid.window, cells)
+
+    def _mend(self, changes: Changes | None) -> Update | None:
+        """Repair the tree; None if it must be grown instead."""
+        if changes is None:
+            return None
+        if changes.cells.size == 0:
+            return Update("none")
+        tree = self._tree
+        if not tree.fine or not self._ground.weight[self._ground.pad(tree.root)] < np.inf:
+            return None
+        visited = tree.repair(changes, self._grid.cells // REPAIR_SHARE + 1024)
+        if visited < 0:
+            return None
+        rows = changes.cells // self._ground.stride - 1
+        cols = changes.cells % self._ground.stride - 1
+        window = Window(int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1)
+        return Update("repair", window, visited)
+
+    def _move(self, target_cell: int) -> Update:
+        tree = self._tree
+        if not tree.fine:
+            return self._grow_full(target_cell)
+        if not tree.precise:
+            tree.relabel()
+        window = block_window(self._grid, tree.root, target_cell, self._config.k_min)
+        cells = 0
+        while window.cells * 2 < self._grid.cells:
+            grown = tree.move(target_cell, window)
+            if grown:
+                return Update("window", window, cells + grown)
+            cells += window.cells
+            height, width = window.row1 - window.row0, window.col1 - window.col0
+            window = self._grid.around(target_cell, max(height, width))
+        return self._grow_full(target_cell)
+
+    def _with_wish(self, update: Update) -> Update:
+        due = self._full_every
+        wants = bool(due) and self._moves >= due and not self._job_out and update.kind != "full"
+        return Update(update.kind, update.window, update.cells, wants)
+
+    def _inside(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        asked = cells.reshape(-1)
+        return asked[(asked >= 0) & (asked < self._grid.cells)]
+
+    def _lower_bounds(self, starts: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Proven lower bounds on the time from padded cells to the target now."""
+        ground, tree = self._ground, self._tree
+        potential = tree.cost if tree.exact else self._potential
+        if potential is None:
+            return np.zeros(starts.size)
+        at_target = 0.0 if tree.exact else float(potential[ground.pad(tree.root)])
+        if not at_target < math.inf:
+            return np.zeros(starts.size)
+        own = potential[starts].astype(np.float64)
+        own[~np.isfinite(own)] = 0.0
+        bound = own * (1.0 - self._rounding(own)) - at_target * (1.0 + self._rounding(np.asarray(at_target)))
+        bound = np.maximum(bound, 0.0)
+        if self._config.length_weight:
+            # Of the key's optimum only the share that is travel time counts, at least low / (low + lambda).
+            bound = bound * (1.0 - ground.length_weight_s / ground.low)
+        return np.asarray(bound)
+
+    def _rounding(self, costs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How far float32 may have put these costs off, relatively: no optimal route has more steps than this."""
+        steps = np.minimum(costs / self._ground.low, self._grid.cells) + 4.0
+        return np.minimum(np.asarray(steps * ROUNDING), 1.0)
+
+    def _measure(self, grown: GrownTree, followed_cells: Any) -> None:
+        """Driven cost over optimum of what was offered when the snapshot was taken, on the snapshot."""
+        cells = self._inside(np.asarray(followed_cells, np.int64))
+        starts = self._ground.pad_all(cells)
+        root = self._ground.pad(grown.target_cell)
+        offered = grown.offered
+        assert offered is not None
+        starts = starts[(grown.cost[starts] < np.inf) & (offered[starts] != kernels.NONE)]
+        _, ends, driven, _, _ = kernels.walk_routes(
+            grown.weight, offered, self._ground.stride, self._ground.rule, root, starts, 0, self._grid.cells
+        )
+        whole = ends >= 0
+        optimum = grown.cost[starts[whole]].astype(np.float64)
+        self.last_gaps = np.maximum(driven[whole] / optimum, 1.0)
