@@ -14,10 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
-from swarm.messages import TILE_AREA, MarkKind, MarkSet, column, pack_column
+from swarm.messages import STAMP_LIMIT_NS, TILE_AREA, MarkKind, MarkSet, column, pack_column
 
-STAMP_LIMIT_NS = 1 << 62
-"""A stamp from here on (year 2116) is refused on every replica alike, so that there is always a newer one."""
 NO_STATEMENT = -1
 """In place of a stamp: nobody says anything about the cell."""
 
@@ -41,8 +39,8 @@ def statements(mark_set: MarkSet) -> Statements:
     """The columns of a set."""
     kinds = column(mark_set.kinds, "<u1")
     paces = column(mark_set.paces, "<f4")
-    if (kinds != MarkKind.PACE).any():
-        paces = np.where(kinds == MarkKind.PACE, paces, np.float32(0))
+    if max(mark_set.kinds, default=_PACE) != _PACE:
+        paces = np.where(kinds == _PACE, paces, _NO_PACE)
     return Statements(column(mark_set.cells, "<u2"), kinds, paces, column(mark_set.stamps_ns, "<i8"))
 
 
@@ -81,18 +79,19 @@ def fault(of: MarkSet, grid: GridSpec) -> str | None:
     """Why a set can be no part of this grid's map; None if it can."""
     if of.tile >= grid.tiles:
         return f"tile {of.tile} is not in 0..{grid.tiles - 1}"
-    if not of.kinds:
-        return None
-    window = grid.tile_window(of.tile)
-    height, width = window.row1 - window.row0, window.col1 - window.col0
-    if height < TILE_CELLS or width < TILE_CELLS:
+    if of.kinds and at_border(of.tile, grid):
+        window = grid.tile_window(of.tile)
         cells = column(of.cells, "<u2")
+        height, width = window.row1 - window.row0, window.col1 - window.col0
         if (cells // TILE_CELLS >= height).any() or (cells % TILE_CELLS >= width).any():
             return f"a cell of tile {of.tile} lies outside the grid"
-    newest_ns = int(column(of.stamps_ns, "<i8").max())
-    if newest_ns >= STAMP_LIMIT_NS:
-        return f"stamp {newest_ns} is not below {STAMP_LIMIT_NS}"
     return None
+
+
+def at_border(tile: int, grid: GridSpec) -> bool:
+    """Whether the grid ends inside or with this tile."""
+    tile_row, tile_col = divmod(tile, grid.tile_cols)
+    return (tile_row + 1) * TILE_CELLS > grid.rows or (tile_col + 1) * TILE_CELLS > grid.cols
 
 
 def resolve(sets: Iterable[MarkSet]) -> Statements:
@@ -100,21 +99,66 @@ def resolve(sets: Iterable[MarkSet]) -> Statements:
 
     sets  at most one per author, in increasing order of author
     """
-    stamps = np.full(TILE_AREA, NO_STATEMENT, np.int64)
-    kinds = np.full(TILE_AREA, MarkKind.CLEAR, np.uint8)
-    paces = np.zeros(TILE_AREA, np.float32)
+    dense = _blank()
     for each in sets:
-        if not each.kinds:
-            continue
-        said = statements(each)
-        wins = said.stamps_ns >= stamps[said.cells]  # on a tie the later, that is the larger, author
-        cells = said.cells[wins]
-        stamps[cells] = said.stamps_ns[wins]
-        kinds[cells] = said.kinds[wins]
-        paces[cells] = said.paces[wins]
-    return Statements(_TILE, kinds, paces, stamps)
+        if each.kinds:
+            said = statements(each)
+            _overlay(dense, said, said.stamps_ns >= dense.stamps_ns[said.cells])  # on a tie the larger author
+    return dense
 
 
+def difference(old: MarkSet | None, new: MarkSet, others: Iterable[MarkSet]) -> Statements:
+    """The cells whose winner changes in kind or pace when `new` replaces `old`, with their winners since.
+
+    others  the sets of the other authors, in increasing order of author
+    """
+    base = _blank()
+    larger = np.zeros(TILE_AREA, bool)  # the cell's winner so far is of an author that wins ties against us
+    for each in others:
+        if each.kinds:
+            said = statements(each)
+            wins = said.stamps_ns >= base.stamps_ns[said.cells]
+            _overlay(base, said, wins)
+            larger[said.cells[wins]] = each.author > new.author
+    before, after = base, base
+    if old is not None and old.kinds:
+        before = _standing(base, statements(old), larger)
+    if new.kinds:
+        after = _standing(base, statements(new), larger)
+    changed = np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces))
+    return taken(after, changed)
+
+
+def _standing(base: Statements, said: Statements, larger: NDArray[np.bool_]) -> Statements:
+    dense = Statements(_TILE, base.kinds.copy(), base.paces.copy(), base.stamps_ns.copy())
+    known_ns = base.stamps_ns[said.cells]
+    _overlay(dense, said, said.stamps_ns >= known_ns + larger[said.cells])
+    return dense
+
+
+def _blank() -> Statements:
+    return Statements(
+        _TILE,
+        np.full(TILE_AREA, _CLEAR, np.uint8),
+        np.zeros(TILE_AREA, np.float32),
+        np.full(TILE_AREA, NO_STATEMENT, np.int64),
+    )
+
+
+def _overlay(dense: Statements, said: Statements, wins: NDArray[np.bool_]) -> None:
+    cells = said.cells
+    if not wins.all():
+        said, cells = taken(said, np.flatnonzero(wins)), cells[wins]
+    dense.kinds[cells] = said.kinds
+    dense.paces[cells] = said.paces
+    dense.stamps_ns[cells] = said.stamps_ns
+
+
+_CLEAR = int(MarkKind.CLEAR)
+_PACE = int(MarkKind.PACE)
+_NO_PACE = np.float32(0)
+_TILE_BITS = np.uint32(TILE_CELLS.bit_length() - 1)
+_TILE_MASK = np.uint32(TILE_CELLS - 1)
 _TILE: NDArray[np.uint16] = np.arange(TILE_AREA, dtype=np.uint16)
 
 
@@ -136,9 +180,9 @@ NOTHING_SAID = Statements(
 def grid_cells(grid: GridSpec, tile: int, cells: NDArray[np.integer]) -> NDArray[np.uint32]:
     """Flat indices in the grid of cells inside a tile."""
     tile_row, tile_col = divmod(tile, grid.tile_cols)
-    inner = cells.astype(np.int64)
-    rows = inner // TILE_CELLS + tile_row * TILE_CELLS
-    return (rows * grid.cols + inner % TILE_CELLS + tile_col * TILE_CELLS).astype(np.uint32)
+    corner = np.uint32(tile_row * TILE_CELLS * grid.cols + tile_col * TILE_CELLS)
+    inner = cells.astype(np.uint32)
+    return (inner >> _TILE_BITS) * np.uint32(grid.cols) + (inner & _TILE_MASK) + corner
 
 
 def tile_cells(grid: GridSpec, cells: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDArray[np.uint16]]:

@@ -15,6 +15,7 @@ from shared_map.marks import (
     NOTHING_SAID,
     HybridClock,
     Statements,
+    difference,
     fault,
     grid_cells,
     mark_set,
@@ -109,20 +110,23 @@ class MapReplica:
     def _accept(self, received: MarkSet, measured: bool) -> NDArray[np.uint32]:
         tile = received.tile
         sets = self._tiles.setdefault(tile, {})
-        before = resolve(sets[name] for name in sorted(sets))
+        changed = difference(
+            sets.get(received.author),
+            received,
+            [sets[name] for name in sorted(sets) if name != received.author] if sets else (),
+        )
         sets[received.author] = received
-        after = resolve(sets[name] for name in sorted(sets))
         self.ledger.record(received.author, tile, received.epoch, received.seq)
         self.counts["sets_merged"] += 1
-        changed = np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces))
-        if not len(changed):
+        count = len(changed.cells)
+        if not count:
             return _NO_CELLS
-        self.counts["marks_merged"] += len(changed)
-        cells = grid_cells(self.grid, tile, changed)
+        self.counts["marks_merged"] += count
+        cells = grid_cells(self.grid, tile, changed.cells)
         if self._cost_map is not None:
-            self._cost_map.apply(cells, after.kinds[changed], after.paces[changed])
+            self._cost_map.apply(cells, changed.kinds, changed.paces)
         if measured:
-            newest_ns = int(after.stamps_ns[changed].max())
+            newest_ns = int(changed.stamps_ns.max())
             if newest_ns != NO_STATEMENT and (self._newest_ns is None or newest_ns > self._newest_ns):
                 self._newest_ns = newest_ns
         return cells

@@ -63,6 +63,10 @@ class Nothing(Message, frozen=True, kw_only=True, tag=schema_of("nothing")):
 # --- the shared map -----------------------------------------------------------------------------------------
 
 
+STAMP_LIMIT_NS = 1 << 62
+"""Marks stamped from here on (year 2116) are refused by everybody alike, so that there is always a newer stamp."""
+
+
 class MarkKind(enum.IntEnum):
     PACE = 0
     """The cell can be driven at this pace."""
@@ -98,19 +102,40 @@ class MarkSet(Message, frozen=True, kw_only=True, tag=schema_of("marks")):
         check_column("cells", self.cells, 2, count)
         check_column("paces", self.paces, 4, count)
         check_column("stamps_ns", self.stamps_ns, 8, count)
-        if count == 0:
-            return
-        cells = column(self.cells, "<u2").astype(np.int32)
-        if int(cells[-1]) >= TILE_AREA or (np.diff(cells) <= 0).any():
-            raise ValueError(f"cells must increase strictly below {TILE_AREA}")
-        kinds = column(self.kinds, "<u1")
-        if (kinds > MarkKind.CLEAR).any():
-            raise ValueError(f"kind {int(kinds.max())} is not in 0..{int(MarkKind.CLEAR)}")
-        paces = column(self.paces, "<f4")[kinds == MarkKind.PACE]
-        if not (np.isfinite(paces) & (paces > 0)).all():
-            raise ValueError("the pace of a PACE mark must be positive and finite")
-        if (column(self.stamps_ns, "<i8") < 0).any():
-            raise ValueError("stamps_ns must not be negative")
+        if count:
+            check_statements(self.cells, self.kinds, self.paces, self.stamps_ns)
+
+
+def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes) -> None:
+    """Columns of one length, one or more."""
+    if max(kinds) > MarkKind.CLEAR:
+        raise ValueError(f"kind {max(kinds)} is not in 0..{int(MarkKind.CLEAR)}")
+    if len(kinds) > _FEW:
+        array = column(cells, "<u2")
+        rising = bool((array[1:] > array[:-1]).all())
+        last = int(array[-1])
+        times = column(stamps_ns, "<i8")
+        oldest_ns, newest_ns = int(times.min()), int(times.max())
+        told = column(paces, "<f4")[column(kinds, "<u1") == MarkKind.PACE]
+        possible = bool(((told > 0) & (told < math.inf)).all())
+    else:
+        listed = memoryview(cells).cast("H").tolist()
+        rising = sorted(set(listed)) == listed
+        last = listed[-1]
+        stamps = memoryview(stamps_ns).cast("q").tolist()
+        oldest_ns, newest_ns = min(stamps), max(stamps)
+        said = zip(memoryview(paces).cast("f").tolist(), kinds, strict=True)
+        possible = all(kind != MarkKind.PACE or 0 < pace < math.inf for pace, kind in said)
+    if not rising or last >= TILE_AREA:
+        raise ValueError(f"cells must increase strictly below {TILE_AREA}")
+    if not possible:
+        raise ValueError("the pace of a PACE mark must be positive and finite")
+    if oldest_ns < 0 or newest_ns >= STAMP_LIMIT_NS:
+        raise ValueError("stamps_ns must not be negative, and below 2**62")
+
+
+_FEW = 100
+"""Up to so many statements, as most sets have, lists are checked several times faster than arrays."""
 
 
 class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):

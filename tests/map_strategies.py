@@ -6,6 +6,7 @@ import random
 from collections.abc import Sequence
 
 import numpy as np
+from hypothesis import settings
 from hypothesis import strategies as st
 
 from shared_map.feed import MapFeed
@@ -22,6 +23,9 @@ from swarm.memory_bus import MemoryNetwork, PerfectLinks
 from swarm.messages import MarkKind, MarkSet
 from swarm.role import RoleSetup
 from swarm.scheduler import Scheduler
+
+settings.register_profile("shared-cores", deadline=None)  # a busy machine is no failed law
+settings.load_profile("shared-cores")
 
 GRID = GridSpec(40, 70, 10.0)
 """2 x 3 tiles, those at the border cut off."""

@@ -8,7 +8,6 @@ from map_strategies import GRID, mark_sets, naive_winners, set_of
 
 from shared_map.marks import (
     NO_STATEMENT,
-    STAMP_LIMIT_NS,
     HybridClock,
     fault,
     grid_cells,
@@ -17,7 +16,7 @@ from shared_map.marks import (
     supersedes,
     tile_cells,
 )
-from swarm.messages import MarkKind, MarkSet
+from swarm.messages import STAMP_LIMIT_NS, MarkKind, MarkSet
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 
@@ -73,7 +72,6 @@ def test_every_tile_is_in_exactly_one_region() -> None:
         (set_of("a", 6, 0, {}), "tile 6 is not in 0..5"),
         (set_of("a", 2, 0, {6: (LETHAL, 0, 1)}), "a cell of tile 2 lies outside the grid"),
         (set_of("a", 3, 0, {8 * 32: (LETHAL, 0, 1)}), "a cell of tile 3 lies outside the grid"),
-        (set_of("a", 0, 0, {0: (LETHAL, 0, STAMP_LIMIT_NS)}), f"stamp {STAMP_LIMIT_NS} is not below"),
     ],
 )
 def test_a_set_that_is_no_part_of_the_grid_is_told_apart_by_its_values_alone(
@@ -87,3 +85,8 @@ def test_whoever_knows_a_statement_from_the_future_can_overrule_it_at_once() -> 
     assert clock.stamps_ns(100, np.array([NO_STATEMENT, 50, 5_000])).tolist() == [100, 100, 5_001]
     assert clock.stamps_ns(90, np.array([NO_STATEMENT])).tolist() == [100]  # never backwards
     assert clock.stamps_ns(101, np.array([NO_STATEMENT])).tolist() == [101]  # not dragged along
+
+
+def test_a_stamp_beyond_time_is_no_mark() -> None:
+    with pytest.raises(ValueError, match="below 2"):
+        set_of("a", 0, 0, {0: (LETHAL, 0, STAMP_LIMIT_NS)})

@@ -74,7 +74,7 @@ def mark_sets(draw: st.DrawFn) -> MarkSet:
         cells=pack_column(where, "<u2"),
         kinds=bytes(draw(st.lists(st.sampled_from([int(kind) for kind in MarkKind]), min_size=n, max_size=n))),
         paces=pack_column(draw(st.lists(st.floats(0.015625, 8192, width=32), min_size=n, max_size=n)), "<f4"),
-        stamps_ns=pack_column(draw(st.lists(st.integers(0, (1 << 63) - 1), min_size=n, max_size=n)), "<i8"),
+        stamps_ns=pack_column(draw(st.lists(st.integers(0, (1 << 62) - 1), min_size=n, max_size=n)), "<i8"),
     )
 
 
