@@ -1,6 +1,6 @@
 """The newest of everything that processes tell about a run: where all are, what they counted, what they marked.
 
-Pure: the launcher, the monitor and the simulation feed it with what they heard on `OBSERVED_TOPICS`.
+Pure: the launcher, the monitor and the simulation feed it with what they heard on `RECORDED_TOPICS`.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ class Observed:
         self.status: dict[str, PlannerStatus] = {}
         self.poses: dict[str, TargetPose] = {}
         self._stats: dict[tuple[str, str, int], Stats] = {}
+        self._messages_before: dict[tuple[str, str, int], int] = {}
         self._fleets: dict[tuple[str, int], Fleet] = {}
         self._marks: dict[tuple[str, int], MarkSet] = {}
         self._alive: dict[tuple[str, str], set[int]] = {}
@@ -68,6 +69,7 @@ class Observed:
                 stats = self._stats.get(key)
                 if stats is None or message.stamp_ns >= stats.stamp_ns:
                     self._stats[key] = message
+                self._messages_before.setdefault(key, message.counts.get("messages_out", 0))
                 self._seen(message.role, message.id, message.incarnation)
             case PlannerStatus():
                 status = self.status.get(message.target)
@@ -181,6 +183,13 @@ class Observed:
         """A count, summed over processes and incarnations; None if no process ever told of it."""
         told = [stats.counts[name] for stats in self._stats.values() if name in stats.counts]
         return sum(told) if told else None
+
+    @property
+    def messages(self) -> int:
+        """Sent by all processes since each was first heard of: grows evenly, also for who joins late."""
+        return sum(
+            stats.counts.get("messages_out", 0) - self._messages_before[key] for key, stats in self._stats.items()
+        )
 
     def gauge(self, name: str) -> float | None:
         """A gauge, summed over the newest incarnation of each process; None if nobody told of it."""

@@ -29,7 +29,7 @@ from launch_scripts.palette import (
     RULE,
     YELLOW,
 )
-from launch_scripts.plots import draw_plots, halo
+from launch_scripts.plots import draw_plots, duration, halo
 from launch_scripts.record import Recorder
 from launch_scripts.relief import hillshade
 from shared_map.terrain import Terrain
@@ -95,8 +95,8 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
         ("re-route requests", _number(report["reroute_requests"]), INK),
         ("routes served", _number(report["routes_served"]), INK),
         ("mean gap to optimum", _gap(report["gap"]["mean"]), INK),
-        ("growth of a tree, p50", _ms(report["growth_ms"]["p50"]), INK),
-        ("route query, p99", _ms(report["route_query_ms"]["p99"]), INK),
+        ("growth of a tree, p50", duration(report["growth_ms"]["p50"]), INK),
+        ("route query, p99", duration(report["route_query_ms"]["p99"]), INK),
         ("collisions", _number(report["collisions"]), RED if report["collisions"] else GREEN),
         ("lethal entries", _number(report["lethal_entries"]), RED if report["lethal_entries"] else GREEN),
         ("lost", _number(report["lost"]), RED if report["lost"] else GREEN),
@@ -139,10 +139,6 @@ def _number(value: float | None) -> str:
 
 def _gap(value: float | None) -> str:
     return "–" if value is None else f"{(value - 1) * 100:.2g} %"
-
-
-def _ms(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3g} ms"
 
 
 # --- the map ----------------------------------------------------------------------------------------------------

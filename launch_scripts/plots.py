@@ -41,7 +41,7 @@ def draw_plots(figure: Figure, recorder: Recorder) -> None:
 
 
 def _plot_states(axes: Axes, samples: list[Sample]) -> None:
-    axes.set_title("Vehicles by state")
+    axes.set_title("Vehicles")
     if not samples:
         _nothing(axes)
         return
@@ -135,12 +135,13 @@ def _plot_timings(axes: Axes, recorder: Recorder) -> None:
         axes.plot(values, row + 0.8 * heights, color=colour, linewidth=1.2)
         p50, p99 = (histogram.quantile(q) or 0.0 for q in (0.5, 0.99))
         axes.plot([p50, p50], [row, row + 0.8], color=INK, linewidth=1.4)
+        text = f"{label}  p50 {duration(p50)}, p99 {duration(p99)}"
         axes.text(
-            1.0, row + 0.62, f"{label}  p50 {p50:.3g}  p99 {p99:.3g}", transform=axes.get_yaxis_transform(),
-            ha="right", va="center", fontsize=8.5, color=INK, path_effects=halo(),
+            1.0, row + 0.62, text, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=8.5,
+            color=INK, path_effects=halo(),
         )  # fmt: skip
     low, high = axes.get_xlim()
-    axes.set_xlim(low, high * (high / low) ** 0.8)  # room for the labels
+    axes.set_xlim(low, high * (high / low) ** 1.1)  # room for the labels
     axes.set_ylim(0, len(timed))
     axes.set_yticks([])
     axes.tick_params(axis="x", which="both", length=0)
@@ -181,6 +182,13 @@ def _short(value: float, _: object = None) -> str:
 def _nothing(axes: Axes) -> None:
     axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=FAINT)
     axes.set_yticks([])
+
+
+def duration(milliseconds: float | None) -> str:
+    """As a person would say it."""
+    if milliseconds is None:
+        return "–"
+    return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1000:.3g} s"
 
 
 def halo() -> list[Any]:

@@ -202,7 +202,7 @@ class Recorder:
             marks=observed.total("marks"),
             reroute_requests=observed.total("reroute_requests"),
             routes_served=observed.total("routes_served"),
-            messages=observed.total("messages_out") or 0,
+            messages=observed.messages,
             alive=len(observed.up()),
             gaps={id: s.gap_mean for id, s in status if s.gap_mean is not None},
             growth_ms={id: s.growth_ms for id, s in status},

@@ -19,7 +19,7 @@ from swarm.messages import VehicleState
 
 _NAMES_SHOWN = 40
 _ROUTE_COLOUR = (150, 235, 255)
-_TRAIL_COLOUR = (0, 200, 110)
+_TRAIL_COLOUR = (0, 148, 88)
 _TARGET_TRAIL_COLOUR = (255, 70, 70)
 _WINDOW_COLOUR = (255, 200, 60)
 _PLOT_COLOURS = [
@@ -54,7 +54,7 @@ class Drawing:
         for tile in ground.mesh_tiles():
             self._tile(tile)
         thin, line, thick = _screen_points(0.5), _screen_points(1.3), _screen_points(2.2)
-        rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [_TRAIL_COLOUR], [thick]), static=True)
+        rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [_TRAIL_COLOUR], [line]), static=True)
         rec.log(
             "world/trails/targets",
             _style(rr.LineStrips3D, [_TARGET_TRAIL_COLOUR], [thick]),
@@ -108,7 +108,7 @@ class Drawing:
             self._rec.log("world/vehicles", rr.Points3D.from_fields(positions=points.positions))
             return
         self._vehicle_ids, self._vehicle_colours = points.ids, points.colours
-        radii = None if same else [_screen_points(4.6)]
+        radii = None if same else [_screen_points(5.0)]
         self._rec.log(
             "world/vehicles",
             rr.Points3D.from_fields(positions=points.positions, colors=points.colours, radii=radii),

@@ -32,7 +32,7 @@ _RELIEF = 0.09
 STATE_COLOURS = {
     VehicleState.IDLE: (150, 178, 158),
     VehicleState.WAITING: (0, 150, 96),
-    VehicleState.FOLLOWING: (0, 255, 136),
+    VehicleState.FOLLOWING: (70, 255, 150),
     VehicleState.ARRIVED: (205, 255, 80),
     VehicleState.STRANDED: (150, 150, 20),
     VehicleState.LOST: (40, 84, 60),
