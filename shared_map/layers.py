@@ -21,6 +21,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,9 +245,27 @@ def terrain_pace(grade_: Floats, classes: Bytes, cost: CostConfig) -> Floats:
 
 
 def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
-    """Cells whose middle lies in the polygon (even-odd). Raises TerrainError if it covers none."""
+    """Cells whose middle lies in the polygon (even-odd), or that are painted in the mask. Raises TerrainError if it
+    covers none."""
+    if zone.mask is not None:
+        from shared_map.rasters import mask_of
+
+        inside = mask_of(Path(zone.mask), grid)
+    else:
+        inside = polygon_mask(zone.polygon_m or (), grid)
+    if not inside.any():
+        width, height = grid.cols * grid.resolution_m, grid.rows * grid.resolution_m
+        raise TerrainError(
+            f"{where} {zone.name or zone.kind!r} covers no cell: its corners are metres east and south of the"
+            f" north-west corner of a terrain of {width:.0f} m x {height:.0f} m"
+        )
+    return inside
+
+
+def polygon_mask(polygon_m: Sequence[tuple[float, float]], grid: GridSpec) -> Bools:
+    """Cells whose middle lies in a polygon of [east, south] corners in metres (even-odd rule)."""
     inside = np.zeros((grid.rows, grid.cols), np.bool_)
-    corners = [(x / grid.resolution_m, y / grid.resolution_m) for x, y in zone.polygon_m]
+    corners = [(x / grid.resolution_m, y / grid.resolution_m) for x, y in polygon_m]
     lowest = max(math.floor(min(y for _, y in corners)), 0)
     highest = min(math.ceil(max(y for _, y in corners)), grid.rows)
     for row in range(lowest, highest):
@@ -259,12 +278,6 @@ def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
         for start, stop in zip(crossings[::2], crossings[1::2], strict=True):
             first, end = math.ceil(start - 0.5), math.ceil(stop - 0.5)
             inside[row, max(first, 0) : max(min(end, grid.cols), 0)] = True
-    if not inside.any():
-        width, height = grid.cols * grid.resolution_m, grid.rows * grid.resolution_m
-        raise TerrainError(
-            f"{where} {zone.name or zone.kind!r} covers no cell: its corners are metres east and south of the"
-            f" north-west corner of a terrain of {width:.0f} m x {height:.0f} m"
-        )
     return inside
 
 

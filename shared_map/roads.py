@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from shared_map.layers import Bools, Floats
-from swarm.config import CostConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -13,7 +12,7 @@ _COARSE_CELLS = 1_000_000
 """Above this many cells roads are planned on every second, fourth, ... cell and then drawn."""
 
 
-def lay_roads(pace: Floats, count: int, grid: GridSpec, cost: CostConfig, seed: int) -> Bools:
+def lay_roads(pace: Floats, count: int, grid: GridSpec, seed: int) -> Bools:
     """Cells of `count` roads. Each leads from a new place to the nearest place that has one already, every fourth
     to another place instead, so that there are ways around. A road is cheap to follow, so later ones join it."""
     from skimage.graph import MCP_Geometric

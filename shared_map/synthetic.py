@@ -79,9 +79,15 @@ def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Flo
     return height
 
 
-def cover(elevation_m: Floats, resolution_m: float, seed: int, lakes: bool = True) -> Bytes:
-    """Plausible classes where nobody has looked: lakes in the lowest hollows, rock on what is steep, forest on
-    slopes, grass between, bare soil here and there."""
+def landscape(rows: int, cols: int, resolution_m: float, relief_m: float, seed: int) -> tuple[Floats, Bytes]:
+    """Heights and classes of a synthetic terrain."""
+    elevation_m = synthetic_elevation(rows, cols, relief_m, seed)
+    return elevation_m, cover(elevation_m, resolution_m, seed)
+
+
+def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
+    """Plausible classes where nobody has looked: rock on what is steep, forest on slopes, grass between, bare soil
+    here and there."""
     rows, cols = elevation_m.shape
     rng = np.random.default_rng([seed, 2])
     east, north = gradient(elevation_m, resolution_m)
@@ -94,8 +100,6 @@ def cover(elevation_m: Floats, resolution_m: float, seed: int, lakes: bool = Tru
     classes[(grade > gentle) & (patches > -0.12)] = TerrainClass.FOREST
     classes[(grade <= gentle) & (patches < -0.35)] = TerrainClass.SOIL
     classes[grade > max(float(steep), 0.3)] = TerrainClass.ROCK
-    if lakes:
-        classes[flat_water(elevation_m)] = TerrainClass.WATER
     classes[~known] = TerrainClass.UNKNOWN
     return classes
 

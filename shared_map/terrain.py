@@ -8,19 +8,21 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.layers import (
     Bytes,
     Floats,
     TerrainClass,
     grade,
+    grade_of_padded,
     inflate,
     inflation_halves,
     paint_zones,
@@ -30,6 +32,9 @@ from swarm.config import CostConfig, Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.role import RoleSetup
+
+if TYPE_CHECKING:
+    from shared_map.sources import Source
 
 FORMAT = 1
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
@@ -64,24 +69,31 @@ class Terrain:
         return np.isinf(self.pace_s_per_m)
 
 
-def build_terrain(scenario: Scenario) -> Terrain:
+def build_terrain(scenario: Scenario, progress: Progress = no_progress) -> Terrain:
     """The terrain of a scenario. Raises TerrainError with one sentence."""
     from shared_map.sources import load_source
 
-    source = load_source(scenario.terrain, scenario.seed)
-    grid, classes = source.grid, source.classes
+    try:
+        return _built(scenario, load_source(scenario.terrain, scenario.seed, progress), progress)
+    except MemoryError as error:
+        raise TerrainError(
+            f"terrain {scenario.terrain.source} does not fit into memory; set a larger terrain.resolution_m"
+        ) from error
+
+
+def _built(scenario: Scenario, source: Source, progress: Progress) -> Terrain:
+    grid, classes, cost = source.grid, source.classes, scenario.cost
     notes = list(source.notes)
-    steepness = grade(source.elevation_m, grid.resolution_m)
-    steepness[np.isnan(source.elevation_m)] = np.nan
-    cost = scenario.cost
+    ground = _ground(source, classes, cost, progress)
     if scenario.terrain.roads:
         from shared_map.roads import lay_roads
 
-        laid = lay_roads(terrain_pace(steepness, classes, cost), scenario.terrain.roads, grid, cost, scenario.seed)
+        laid = lay_roads(ground, scenario.terrain.roads, grid, scenario.seed)
         classes = np.where(laid, np.uint8(TerrainClass.ROAD), classes)
+        ground[laid] = np.float32(1 / cost.road_speed_m_per_s)
         notes.append(f"{scenario.terrain.roads} roads laid between seeded places, {int(laid.sum())} cells")
-    ground = terrain_pace(steepness, classes, cost)
-    paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m))
+    if cost.zones:
+        paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m))
     photo = source.photo
     if photo is None:
         from shared_map.synthetic import paint_photo
@@ -89,6 +101,22 @@ def build_terrain(scenario: Scenario) -> Terrain:
         photo = paint_photo(source.elevation_m, classes, grid.resolution_m, scenario.seed)
         notes.append("photo painted from elevation and classes, as there is none")
     return _finished(grid, source.elevation_m, photo, classes, ground, cost, tuple(notes))
+
+
+def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress) -> Floats:
+    """Steps 1 and 2 of the merge rule, band by band."""
+    ground = np.empty(source.elevation_m.shape, np.float32)
+
+    def work(row0: int, row1: int) -> None:
+        steepness = grade_of_padded(padded_rows(source.elevation_m, row0, row1), source.grid.resolution_m)
+        np.copyto(steepness, np.float32(np.nan), where=np.isnan(source.elevation_m[row0:row1]))
+        pace = terrain_pace(steepness, classes[row0:row1], cost)
+        if source.factor is not None:
+            pace *= source.factor[row0:row1]
+        ground[row0:row1] = pace
+
+    in_bands(source.grid.rows, work, "slope and cost", progress)
+    return ground
 
 
 def _finished(
@@ -148,7 +176,7 @@ def terrain_of_pace(
 ) -> Terrain:
     """A level terrain of given pace, for tests, benchmarks and maps that are no landscape."""
     ground = np.array(pace_s_per_m, np.float32)
-    rows, cols = ground.shape
+    rows, cols = int(ground.shape[0]), int(ground.shape[1])
     grid = GridSpec(rows, cols, resolution_m)
     height = np.zeros((rows, cols), np.float32) if elevation_m is None else np.array(elevation_m, np.float32)
     cost = CostConfig(vehicle_radius_m=vehicle_radius_m)
@@ -295,7 +323,3 @@ def prepare(folder: Path, scenario: Scenario) -> tuple[Terrain, Floats]:
     truth = build_truth(scenario, terrain)
     save_prepared(folder, terrain, truth, scenario_key(scenario))
     return terrain, truth
-
-
-def with_notes(terrain: Terrain, *notes: str) -> Terrain:
-    return replace(terrain, notes=terrain.notes + notes)

@@ -1,0 +1,48 @@
+"""Work on a large grid in bands of rows, a few at a time, so that what is needed between stays small."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+
+import numpy as np
+
+from shared_map.layers import Floats
+
+BAND_ROWS = 128
+Progress = Callable[[str, float], None]
+"""Told what is being done and the share of it that is done, 0 to 1."""
+
+
+def no_progress(what: str, share: float) -> None:
+    """Tells nobody."""
+
+
+def bands(rows: int, band_rows: int = BAND_ROWS) -> list[tuple[int, int]]:
+    """(first, end) of each band."""
+    return [(row, min(row + band_rows, rows)) for row in range(0, rows, band_rows)]
+
+
+def in_bands(rows: int, work: Callable[[int, int], None], what: str = "", progress: Progress = no_progress) -> None:
+    """`work(row0, row1)` for all bands, on as many threads as there are cores (four at most)."""
+    todo = bands(rows)
+    workers = min(os.cpu_count() or 1, 4, len(todo))
+    if workers < 2:
+        for done, (row0, row1) in enumerate(todo):
+            work(row0, row1)
+            progress(what, (done + 1) / len(todo))
+        return
+    with ThreadPoolExecutor(workers, "band") as pool:
+        futures = [pool.submit(work, row0, row1) for row0, row1 in todo]
+        for done, future in enumerate(as_completed(futures)):
+            future.result()
+            progress(what, (done + 1) / len(todo))
+
+
+def padded_rows(elevation_m: Floats, row0: int, row1: int) -> Floats:
+    """Rows row0 - 1 .. row1 with a border of one cell; beyond the terrain the ground goes on as steep as it is."""
+    rows = elevation_m.shape[0]
+    above, below = max(row0 - 1, 0), min(row1 + 1, rows)
+    pads = ((above - (row0 - 1), row1 + 1 - below), (1, 1))
+    return np.pad(elevation_m[above:below], pads, mode="reflect", reflect_type="odd")

@@ -1,0 +1,232 @@
+"""Colour photo and slope -> what covers the ground: by rules without any labels, or learnt from a few.
+
+A shadow is as dark and blue as a lake, but lies on a slope and is not smooth; a cloud is as bright as snow and
+never water. So water must be level, smooth and bluish or nearly black, and is grown from where that is certain.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.layers import Bools, Bytes, Floats, TerrainClass, grade_of_padded
+
+HALO = 6
+"""Rows around a band that its features look at."""
+LEVEL_GRADE, SHORE_GRADE = np.float32(0.05), np.float32(0.15)
+"""About 3 and 8.5 degrees: water is level; beside it the bank already tilts the slope of a 3 x 3 window."""
+SMALLEST_LAKE = 12
+
+
+class Features:
+    """What rules and learning look at, of one band of rows. Colours are 3 x 3 means, 0..255."""
+
+    def __init__(self, rgb: Bytes, grade: Floats) -> None:
+        from scipy import ndimage
+
+        colour = rgb.astype(np.float32)
+        self.red, self.green, self.blue = (ndimage.uniform_filter(colour[..., n], 3) for n in range(3))
+        light = colour @ np.array([0.299, 0.587, 0.114], np.float32)
+        mean = ndimage.uniform_filter(light, 5)
+        square = ndimage.uniform_filter(light * light, 5)
+        self.light = ndimage.uniform_filter(light, 3)
+        self.around = mean
+        self.texture = np.sqrt(np.maximum(square - mean * mean, np.float32(0)))
+        brightest = np.maximum(np.maximum(self.red, self.green), self.blue)
+        darkest = np.minimum(np.minimum(self.red, self.green), self.blue)
+        self.saturation = (brightest - darkest) / np.maximum(brightest, np.float32(1))
+        self.grade = grade
+
+    def columns(self) -> Floats:
+        """(cells, features) for a learner."""
+        total = np.maximum(self.red + self.green + self.blue, np.float32(1))
+        parts = (
+            *(self.red, self.green, self.blue, self.light, self.around, self.texture, self.saturation),
+            *(self.red / total, self.green / total, self.blue / total, self.grade),
+        )
+        return np.stack([part.reshape(-1) for part in parts], axis=1).astype(np.float32)
+
+
+def by_rules(
+    rgb: Bytes,
+    elevation_m: Floats | None,
+    resolution_m: float,
+    seen: Bools | None = None,
+    progress: Progress = no_progress,
+) -> Bytes:
+    """Classes of a photo without labels. Where the photo shows nothing (`seen` is false) the class is UNKNOWN."""
+    rows, cols = rgb.shape[:2]
+    classes = np.empty((rows, cols), np.uint8)
+    likely = np.empty((rows, cols), np.bool_)
+    certain = np.empty((rows, cols), np.bool_)
+
+    def work(row0: int, row1: int) -> None:
+        inner, features = _features(rgb, elevation_m, resolution_m, row0, row1)
+        classes[row0:row1] = _ground(features)[inner]
+        maybe, sure = _water(features)
+        likely[row0:row1], certain[row0:row1] = maybe[inner], sure[inner]
+
+    in_bands(rows, work, "classifying the photo", progress)
+    classes[_lakes(likely, certain)] = TerrainClass.WATER
+    _roads_or_not(classes)
+    if seen is not None:
+        classes[~seen] = TerrainClass.UNKNOWN
+    return classes
+
+
+def _features(
+    rgb: Bytes, elevation_m: Floats | None, resolution_m: float, row0: int, row1: int
+) -> tuple[slice, Features]:
+    """Features of a band and its halo, and which of its rows are the band."""
+    above, below = max(row0 - HALO, 0), min(row1 + HALO, rgb.shape[0])
+    if elevation_m is None:
+        grade = np.zeros((below - above, rgb.shape[1]), np.float32)
+    else:
+        grade = np.nan_to_num(grade_of_padded(padded_rows(elevation_m, above, below), resolution_m))
+    return slice(row0 - above, row1 - above), Features(rgb[above:below], grade)
+
+
+def _ground(f: Features) -> Bytes:
+    """Everything but water, from general to particular: what is written later wins."""
+    classes = np.full(f.red.shape, TerrainClass.GRASS, np.uint8)
+    grey = f.saturation < np.float32(0.16)
+    green = (f.green >= f.red) & (f.green >= f.blue)
+    classes[(f.red > np.float32(1.04) * f.green) & (f.saturation > np.float32(0.15))] = TerrainClass.SOIL
+    bare = f.saturation < np.float32(0.095)
+    classes[bare & (f.grade > np.float32(0.2)) & (f.light > 105)] = TerrainClass.ROCK
+    classes[grey & (f.light > 100) & (f.grade > np.float32(0.7))] = TerrainClass.ROCK
+    classes[grey & (f.grade < np.float32(0.2)) & (f.texture > 22) & (f.around > 95)] = TerrainClass.BUILT
+    line = f.light > f.around + 12
+    classes[grey & line & (f.grade < np.float32(0.25)) & (f.light > 110) & (f.light < 215)] = TerrainClass.ROAD
+    woody = (f.green >= np.float32(0.93) * f.red) & (f.blue <= np.float32(1.2) * f.green)
+    classes[woody & (f.around < 78)] = TerrainClass.FOREST
+    classes[woody & (f.around < 96) & (f.texture > 17) & ~(green & (f.light > 90))] = TerrainClass.FOREST
+    classes[(f.light > 205) & (f.saturation < np.float32(0.12))] = TerrainClass.SNOW
+    shade = (f.around < 100) & (f.blue > np.float32(1.18) * f.green) & (f.grade > LEVEL_GRADE)
+    classes[shade] = TerrainClass.UNKNOWN
+    classes[shade & (f.grade > np.float32(0.5))] = TerrainClass.ROCK
+    return classes
+
+
+def _water(f: Features) -> tuple[Bools, Bools]:
+    """(perhaps water, certainly water)."""
+    bluish = (f.blue > np.float32(1.2) * f.red) & (f.green > np.float32(1.02) * f.red) & (f.around < 170)
+    black = (f.light < 40) & (f.blue >= f.red)
+    dead_level = f.grade < np.float32(0.004)
+    coloured = bluish | black | (dead_level & (f.light < 65) & (f.blue >= f.red))
+    smooth = (f.grade < LEVEL_GRADE) & (f.texture < 8)
+    return coloured & (f.grade < SHORE_GRADE), coloured & (smooth | dead_level)
+
+
+def _lakes(likely: Bools, certain: Bools) -> Bools:
+    """Patches of likely water of which a third is certain; small ones are puddles or shadows of houses."""
+    from scipy import ndimage
+
+    labels, count = ndimage.label(likely)
+    if count == 0:
+        return np.zeros(likely.shape, np.bool_)
+    sizes = np.bincount(labels.reshape(-1))
+    sure = np.bincount(labels[certain], minlength=count + 1)
+    lake = (sizes >= SMALLEST_LAKE) & (3 * sure >= sizes)
+    lake[0] = False
+    wet = np.asarray(lake[labels], np.bool_)
+    return np.asarray(ndimage.binary_fill_holes(wet), np.bool_) if wet.any() else wet
+
+
+def _roads_or_not(classes: Bytes) -> None:
+    """Bright grey lines are roads if they are long and thin; specks and patches of the same colour are not."""
+    from scipy import ndimage
+
+    labels, count = ndimage.label(classes == TerrainClass.ROAD, np.ones((3, 3), np.int8))
+    if count == 0:
+        return
+    sizes = np.bincount(labels.reshape(-1))
+    long = np.zeros(count + 1, np.bool_)
+    for number, box in enumerate(ndimage.find_objects(labels), 1):
+        if box is not None:
+            reach = max(box[0].stop - box[0].start, box[1].stop - box[1].start)
+            long[number] = reach >= 12 and sizes[number] <= 4 * reach
+    classes[(labels > 0) & ~long[labels]] = TerrainClass.BUILT
+
+
+# --- learnt -------------------------------------------------------------------------------------------------
+
+
+def learnt(
+    rgb: Bytes,
+    elevation_m: Floats | None,
+    resolution_m: float,
+    labels: Bytes,
+    seen: Bools | None = None,
+    seed: int = 1,
+    progress: Progress = no_progress,
+) -> Bytes:
+    """Classes of a photo learnt from labelled cells (`labels`, UNKNOWN where there is none)."""
+    rows, cols = rgb.shape[:2]
+    model = _model(seed)
+    model.fit(*_samples(rgb, elevation_m, resolution_m, labels))
+    classes = np.empty((rows, cols), np.uint8)
+
+    def work(row0: int, row1: int) -> None:
+        inner, features = _features(rgb, elevation_m, resolution_m, row0, row1)
+        classes[row0:row1] = model.predict(features.columns()).reshape(features.red.shape)[inner]
+
+    in_bands(rows, work, "classifying the photo", progress)
+    if seen is not None:
+        classes[~seen] = TerrainClass.UNKNOWN
+    return classes
+
+
+def _model(seed: int) -> Any:
+    from sklearn.ensemble import ExtraTreesClassifier
+
+    return ExtraTreesClassifier(
+        n_estimators=40, max_depth=14, min_samples_leaf=2, class_weight="balanced", random_state=seed
+    )
+
+
+def _samples(rgb: Bytes, elevation_m: Floats | None, resolution_m: float, labels: Bytes) -> tuple[Floats, Bytes]:
+    """Features and class of each labelled cell."""
+    columns, kinds = [], []
+    labelled_rows = np.flatnonzero((labels != TerrainClass.UNKNOWN).any(axis=1))
+    for row in labelled_rows:
+        inner, features = _features(rgb, elevation_m, resolution_m, int(row), int(row) + 1)
+        here = labels[row] != TerrainClass.UNKNOWN
+        table = features.columns().reshape(*features.red.shape, -1)[inner][0]
+        columns.append(table[here])
+        kinds.append(labels[row][here])
+    return np.concatenate(columns), np.concatenate(kinds)
+
+
+def held_out(
+    rgb: Bytes,
+    elevation_m: Floats | None,
+    resolution_m: float,
+    labels: Bytes,
+    groups: NDArray[np.int32],
+    seed: int = 1,
+) -> tuple[Bytes, Bytes]:
+    """(true, predicted) of each labelled cell, predicted by a model that saw nothing of the same polygon."""
+    from sklearn.model_selection import GroupKFold, cross_val_predict
+
+    columns, kinds = _samples(rgb, elevation_m, resolution_m, labels)
+    group = groups[labels != TerrainClass.UNKNOWN]
+    folds = min(5, len(np.unique(group)))
+    predicted = cross_val_predict(_model(seed), columns, kinds, groups=group, cv=GroupKFold(folds))
+    return kinds, np.asarray(predicted, np.uint8)
+
+
+def confusion(true: Bytes, predicted: Bytes) -> NDArray[np.int64]:
+    """counts[true class, predicted class]."""
+    size = max(TerrainClass) + 1
+    pairs = true.reshape(-1).astype(np.int64) * size + predicted.reshape(-1)
+    return np.bincount(pairs, minlength=size * size).reshape(size, size)
+
+
+def overlap(true: Bytes, predicted: Bytes, kind: TerrainClass) -> float:
+    """Intersection over union of one class; NaN where neither has it."""
+    union = np.count_nonzero((true == kind) | (predicted == kind))
+    return np.count_nonzero((true == kind) & (predicted == kind)) / union if union else float("nan")

@@ -1,0 +1,274 @@
+"""Readers of plain formats: .asc, .npz, MovingAI .map, ROS map_server yaml + pgm. Each checks what it is told."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.layers import Bytes, Floats
+from swarm.errors import TerrainError
+
+MAX_CELLS = 16384 * 16384
+SCALE_FACTOR = 9.0
+"""ROS `scale` mode: pace grows by up to this many times between free and occupied."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlainGrid:
+    """What a plain file says.
+
+    heights     float32, NaN is a void; None for a map without heights
+    factor      float32, pace relative to open ground, inf is lethal, NaN unknown; None for open ground
+    step_m      width and height of a cell, in metres, or in degrees if `degrees`
+    west, north outer corner of cell (0, 0), in the same unit
+    """
+
+    heights: Floats | None
+    factor: Floats | None
+    step: tuple[float, float]
+    west: float = 0.0
+    north: float = 0.0
+    degrees: bool = False
+    photo: Bytes | None = None
+    notes: tuple[str, ...] = ()
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii")
+    except OSError as error:
+        raise TerrainError(f"terrain {path} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise TerrainError(f"terrain {path} is no text: byte {error.start} is not ASCII") from error
+
+
+def check_cells(rows: int, cols: int, path: Path) -> None:
+    if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
+        raise TerrainError(f"terrain {path}: its header says {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed")
+
+
+def read_asc(path: Path) -> PlainGrid:
+    """ESRI ASCII grid: six header lines, then one line per row from the north."""
+    lines = _text(path).splitlines()
+    header: dict[str, float] = {}
+    first = 0
+    for first, line in enumerate(lines):
+        words = line.split()
+        if len(words) != 2 or not words[0][:1].isalpha() or words[0].lower() == "nan":
+            break
+        try:
+            header[words[0].lower()] = float(words[1])
+        except ValueError as error:
+            raise TerrainError(f"terrain {path}, line {first + 1}: {words[1]!r} is no number") from error
+    missing = [key for key in ("ncols", "nrows", "cellsize") if key not in header]
+    if missing:
+        raise TerrainError(f"terrain {path} is no ESRI ASCII grid: its header lacks {', '.join(missing)}")
+    rows, cols, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
+    check_cells(rows, cols, path)
+    if not step > 0:
+        raise TerrainError(f"terrain {path}: cellsize is {step:g}; it must be positive")
+    body = [line for line in lines[first:] if line.strip()]
+    if len(body) != rows:
+        raise TerrainError(f"terrain {path} has {len(body)} rows of heights; its header says {rows}")
+    heights = np.empty((rows, cols), np.float32)
+    for row, line in enumerate(body):
+        words = line.split()
+        if len(words) != cols:
+            raise TerrainError(
+                f"terrain {path} is ragged: line {first + row + 1} has {len(words)} heights, its header says {cols}"
+            )
+        try:
+            heights[row] = np.array(words, np.float32)
+        except ValueError as error:
+            raise TerrainError(f"terrain {path}, line {first + row + 1}: {error}") from error
+    heights[heights == np.float32(header.get("nodata_value", -9999.0))] = np.nan
+    half = step / 2
+    west = header["xllcorner"] if "xllcorner" in header else header.get("xllcenter", half) - half
+    south = header["yllcorner"] if "yllcorner" in header else header.get("yllcenter", half) - half
+    return PlainGrid(heights, None, (step, step), west, south + rows * step)
+
+
+def read_npz(path: Path) -> PlainGrid:
+    """`elevation` (rows, cols), row 0 north, with `resolution_m`, or with `dx`, `dy`, `xmin` and the north latitude
+    `ymin` in degrees as in matplotlib's samples; optional `photo` (rows, cols, 3)."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_promises(archive, path)
+        with np.load(path, allow_pickle=False) as file:
+            arrays: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}
+    except OSError as error:
+        raise TerrainError(f"terrain {path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise TerrainError(f"terrain {path} is truncated or no .npz of numbers: {error}") from error
+    heights = arrays.get("elevation")
+    if heights is None or heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
+        held = ", ".join(f"{name} {value.shape}" for name, value in sorted(arrays.items()))
+        raise TerrainError(
+            f"terrain {path} has no two-dimensional `elevation` of numbers; it has {held or 'nothing'}"
+        )
+    photo = arrays.get("photo")
+    if photo is not None and (photo.shape != (*heights.shape, 3) or photo.dtype != np.uint8):
+        raise TerrainError(f"terrain {path}: photo is {photo.shape} {photo.dtype}, not {(*heights.shape, 3)} uint8")
+    heights = heights.astype(np.float32)
+    try:
+        if "resolution_m" in arrays:
+            step = float(arrays["resolution_m"])
+            return PlainGrid(heights, None, (_positive(step, path), step), photo=photo)
+        if {"dx", "dy", "xmin", "ymin"} <= arrays.keys():
+            # matplotlib's jacksboro file calls the northern latitude ymin and the southern one ymax.
+            north = max(float(arrays[key]) for key in ("ymin", "ymax") if key in arrays)
+            steps = (_positive(float(arrays["dx"]), path), _positive(float(arrays["dy"]), path))
+            return PlainGrid(heights, None, steps, float(arrays["xmin"]), north, degrees=True, photo=photo)
+    except TypeError as error:
+        raise TerrainError(f"terrain {path}: its cell size is no single number: {error}") from error
+    return PlainGrid(heights, None, (0.0, 0.0), photo=photo)
+
+
+def _positive(step: float, path: Path) -> float:
+    if not 0 < step < 1e7:
+        raise TerrainError(f"terrain {path}: the size of a cell is {step:g}; it must be positive")
+    return step
+
+
+def _check_promises(archive: zipfile.ZipFile, path: Path) -> None:
+    """A small archive may promise 20 GB: look at the headers before anything is unpacked."""
+    for member in archive.infolist():
+        if member.file_size > 5 * MAX_CELLS:
+            raise TerrainError(f"terrain {path}: {member.filename} would unpack to {member.file_size / 1e9:.1f} GB")
+
+
+# --- maps without heights -----------------------------------------------------------------------------------
+
+
+def read_map(path: Path) -> PlainGrid:
+    """MovingAI grid map: `.` `G` `S` can be driven, `@` `O` `T` `W` cannot."""
+    lines = _text(path).splitlines()
+    words = [line.split() for line in lines[:4]]
+    try:
+        ((_, kind), (_, rows_text), (_, cols_text), (marker,)) = words
+        header = {line[0]: line[-1] for line in words}
+        rows, cols = int(header["height"]), int(header["width"])
+    except (ValueError, KeyError) as error:
+        raise TerrainError(
+            f"terrain {path} is no MovingAI map: it must begin with type, height, width, map"
+        ) from error
+    if marker != "map" or not rows_text or not cols_text:
+        raise TerrainError(f"terrain {path} is no MovingAI map: line 4 is {marker!r}, not 'map'")
+    check_cells(rows, cols, path)
+    body = lines[4:]
+    while body and not body[-1].strip():
+        body.pop()
+    if len(body) != rows:
+        raise TerrainError(f"terrain {path} has {len(body)} rows; its header says {rows}")
+    for row, line in enumerate(body):
+        if len(line) != cols:
+            raise TerrainError(f"terrain {path}, line {row + 5}: {len(line)} cells; its header says {cols}")
+    cells = np.frombuffer("".join(body).encode("ascii"), np.uint8).reshape(rows, cols)
+    factor = np.full((rows, cols), np.nan, np.float32)
+    factor[np.isin(cells, list(b".GS"))] = 1.0
+    factor[np.isin(cells, list(b"@OTW"))] = np.inf
+    strange = np.argwhere(np.isnan(factor))
+    if len(strange):
+        row, col = strange[0]
+        raise TerrainError(
+            f"terrain {path}, line {row + 5}, column {col + 1}: {chr(cells[row, col])!r} is no ground"
+        )
+    return PlainGrid(None, factor, (0.0, 0.0), notes=(f"MovingAI map of type {kind}",))
+
+
+def read_ros(path: Path) -> PlainGrid:
+    """ROS map_server: a yaml that names an image, its resolution, origin and thresholds."""
+    values = _flat_yaml(path)
+    try:
+        image = path.parent / values["image"]
+        resolution_m = _positive(float(values["resolution"]), path)
+        origin = [float(word) for word in values["origin"].strip("[] ").split(",")]
+        mode = values.get("mode", "trinary").lower()
+        negate = int(values.get("negate", "0"))
+        occupied, free = float(values["occupied_thresh"]), float(values["free_thresh"])
+    except KeyError as error:
+        raise TerrainError(f"terrain {path} is no ROS map: {error.args[0]} is missing") from error
+    except ValueError as error:
+        raise TerrainError(f"terrain {path}: {error}") from error
+    if mode not in ("trinary", "scale", "raw"):
+        raise TerrainError(f"terrain {path}: mode is {mode!r}; trinary, scale and raw are known")
+    if len(origin) > 2 and abs(origin[2]) > 1e-9:
+        raise TerrainError(
+            f"terrain {path}: the origin is turned by {origin[2]:g} rad; turn the image and set it to 0"
+        )
+    if not 0 <= free <= occupied <= 1:
+        raise TerrainError(
+            f"terrain {path}: thresholds free {free:g}, occupied {occupied:g}: 0 <= free <= occupied <= 1"
+        )
+    pixels, brightest = read_pgm(image)
+    if negate:
+        pixels = brightest - pixels
+    factor = np.full(pixels.shape, np.nan, np.float32)
+    if mode == "raw":
+        known = pixels <= 100
+        taken = np.asarray(pixels, np.float32) / np.float32(100)
+    else:
+        known = np.ones(pixels.shape, np.bool_)
+        taken = np.float32(1) - np.asarray(pixels, np.float32) / np.float32(brightest)
+    factor[known & (taken < free)] = 1.0
+    if mode != "trinary":
+        between = known & (taken >= free) & (taken <= occupied)
+        share = (taken[between] - np.float32(free)) / np.float32(max(occupied - free, 1e-6))
+        factor[between] = np.float32(1) + np.float32(SCALE_FACTOR) * share
+    factor[known & (taken > occupied)] = np.inf
+    north = origin[1] + pixels.shape[0] * resolution_m
+    notes = (f"ROS map, mode {mode}, {np.isnan(factor).mean():.1%} unknown",)
+    return PlainGrid(None, factor, (resolution_m, resolution_m), origin[0], north, notes=notes)
+
+
+def _flat_yaml(path: Path) -> dict[str, str]:
+    """`key: value` lines; map_server needs no more of YAML."""
+    values = {}
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        line = re.sub(r"(^|\s)#.*", "", line).strip()
+        if not line or line == "---":
+            continue
+        key, colon, value = line.partition(":")
+        if not colon:
+            raise TerrainError(f"terrain {path}, line {number}: {line[:60]!r} is not `key: value`")
+        values[key.strip()] = value.strip().strip("'\"")
+    return values
+
+
+def read_pgm(path: Path) -> tuple[NDArray[np.int32], int]:
+    """(pixels, brightest) of a P2 or P5 image, comments and 16 bits included. Row 0 is on top."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise TerrainError(f"image {path} cannot be read: {error.strerror or error}") from error
+    magic = data[:2]
+    if magic not in (b"P2", b"P5"):
+        raise TerrainError(f"image {path} is no PGM: it begins with {magic!r}, not P2 or P5")
+    header = re.match(rb"P[25]" + rb"(?:\s|#[^\n]*\n)+(\d{1,9})" * 3 + rb"(?:#[^\n]*\n|\s)", data)
+    if header is None:
+        raise TerrainError(f"image {path} is no PGM: width, height and brightest value are missing")
+    cols, rows, brightest = (int(group) for group in header.groups())
+    check_cells(rows, cols, path)
+    if not 0 < brightest < 65536:
+        raise TerrainError(f"image {path}: its brightest value is {brightest}; 1 to 65535 are allowed")
+    body = data[header.end() :]
+    if magic == b"P2":
+        try:
+            text = re.sub(rb"#[^\n]*", b"", body)
+            pixels = np.loadtxt(io.BytesIO(b" ".join(text.split())), np.int64, ndmin=1).reshape(-1)
+        except ValueError as error:
+            raise TerrainError(f"image {path} is no PGM: {error}") from error
+    else:
+        pixels = np.frombuffer(
+            body[: len(body) // 2 * 2] if brightest > 255 else body, ">u2" if brightest > 255 else "u1"
+        )
+    if pixels.size < rows * cols:
+        raise TerrainError(f"image {path} is truncated: {pixels.size} pixels; its header says {rows} x {cols}")
+    return np.asarray(pixels[: rows * cols].reshape(rows, cols), np.int32), brightest
