@@ -34,7 +34,7 @@ from swarm.messages import (
 from swarm.role import RoleSetup
 from swarm.scheduler import Scheduler
 from swarm.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
-from tests.naive_tree import naive_tree
+from naive_tree import naive_tree
 from vehicle_agent.service import AgentService
 
 START_NS = 1_000 * NS_PER_S

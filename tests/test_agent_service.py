@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from swarm.messages import VehicleState
-from tests.agent_world import AgentWorld, pace_of
+from agent_world import AgentWorld, pace_of
 
 SCENARIO = """
 name = "test"
