@@ -67,8 +67,12 @@ class FaultyLinks:
         self._began_ns = began_ns
         self._lease_s = lease_s
         self._last_ns: dict[tuple[str, str], int] = {}
+        faultless = not (plan.drop or plan.duplicate or plan.reorder or plan.jitter_ms or plan.partitions)
+        self._always = (int(plan.delay_ms * _NS_PER_MS),) if faultless else None
 
     def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
+        if self._always is not None:
+            return self._always
         plan, chance = self._plan, self._chance
         if OBSERVER in (source, destination):
             return (_NS_PER_MS,)

@@ -119,17 +119,28 @@ class MemoryNetwork:
 
 @dataclass(eq=False, slots=True)
 class _Interest:
-    """A subscription or a queryable. `fields` holds all the topic's, wildcards included."""
+    """A subscription or a queryable. `narrow` holds the fields that are no wildcard."""
 
     bus: MemoryBus
-    topic: Topic
-    fields: dict[str, str]
+    narrow: dict[str, str]
     post: Post
 
+    def meets(self, fields: Mapping[str, str]) -> bool:
+        """Whether this and another key of the topic, either with wildcards, can name the same value."""
+        return not self.narrow or _meet(self.narrow, fields)
 
-def _intersect(a: Mapping[str, str], b: Mapping[str, str]) -> bool:
-    """Whether two keys of one topic, either of which may have wildcards, can name the same value."""
-    return all(chunk == b[name] or chunk == "*" or b[name] == "*" for name, chunk in a.items())
+
+def _interest(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post) -> _Interest:
+    every = topic.every(fields)
+    return _Interest(bus, {name: chunk for name, chunk in every.items() if chunk != "*"}, post)
+
+
+def _meet(narrow: Mapping[str, str], fields: Mapping[str, str]) -> bool:
+    for name, chunk in narrow.items():
+        other = fields[name]
+        if other not in (chunk, "*"):
+            return False
+    return True
 
 
 class MemoryBus:
@@ -156,21 +167,21 @@ class MemoryBus:
             return
         self.counts["messages_out"] += 1
         sample = _Sample(topic, fields, payload)
-        scheduler = self.network.scheduler
-        for bus in self.network.buses:
+        network = self.network
+        for bus in network.buses:
             for interest in bus.subscriptions.get(topic.name, ()):
-                if bus.namespace == self.namespace and _intersect(fields, interest.fields):
-                    for when_ns in self.network.arrivals_ns(self, bus, topic.name):
-                        scheduler.at(when_ns, _Arrival(self, interest, sample))
+                if interest.meets(fields) and bus.namespace == self.namespace:
+                    for when_ns in network.arrivals_ns(self, bus, topic.name):
+                        network.scheduler.at(when_ns, _Arrival(self, interest, sample))
 
     def subscribe(self, topic: Topic, post: Post, **fields: str | int) -> None:
-        interest = _Interest(self, topic, topic.every(fields), post)
+        interest = _interest(self, topic, fields, post)
         self.subscriptions.setdefault(topic.name, []).append(interest)
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
-        interest = _Interest(self, topic, topic.every(fields), post)
+        interest = _interest(self, topic, fields, post)
         self.queryables.setdefault(topic.name, []).append(interest)
 
     def ask(
@@ -197,7 +208,7 @@ class MemoryBus:
             for bus in self.network.buses
             if bus.namespace == self.namespace and self.network.connected(self, bus)
             for interest in bus.queryables.get(topic.name, ())
-            if _intersect(wanted, interest.fields)
+            if interest.meets(wanted)
         ]
         asking.waiting = set(range(len(interests)))
         if not interests:
@@ -370,9 +381,8 @@ class _MemoryAnswerer:
         if self.ended:
             raise RuntimeError("answered after the end")
         asking, bus = self.asking, self.interest.bus
-        concrete = {name: chunk for name, chunk in self.interest.fields.items() if chunk != "*"}
-        named = asking.topic.one({**concrete, **fields})
-        if bus.closed or not _intersect(named, asking.wanted):
+        named = asking.topic.one({**self.interest.narrow, **fields})
+        if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
             return
         bus.counts["messages_out"] += 1
         payload = encode(message)
