@@ -23,13 +23,18 @@ CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITH
 CREATE TABLE IF NOT EXISTS sets (
     tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
     cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL,
+    untils_ns BLOB NOT NULL,
     PRIMARY KEY (tile, author)
 ) WITHOUT ROWID;
 """
+_FIELDS = ("tile", "author", "group", "epoch", "seq", "cells", "kinds", "paces", "stamps_ns", "untils_ns")
+_COLUMNS = tuple("grp" if field == "group" else field for field in _FIELDS)  # GROUP is a word of SQL
 _UPSERT = """
-INSERT INTO sets (tile, author, grp, epoch, seq, cells, kinds, paces, stamps_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)
+INSERT INTO sets (tile, author, grp, epoch, seq, cells, kinds, paces, stamps_ns, untils_ns)
+VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
 ON CONFLICT (tile, author) DO UPDATE SET grp = excluded.grp, epoch = excluded.epoch, seq = excluded.seq,
-    cells = excluded.cells, kinds = excluded.kinds, paces = excluded.paces, stamps_ns = excluded.stamps_ns
+    cells = excluded.cells, kinds = excluded.kinds, paces = excluded.paces, stamps_ns = excluded.stamps_ns,
+    untils_ns = excluded.untils_ns
 WHERE (excluded.epoch, excluded.seq) >= (sets.epoch, sets.seq)
 """
 
@@ -83,29 +88,20 @@ class KeeperStore:
     def load(self) -> Iterator[MarkSet]:
         """Everything in the store. Raises StoreError where a row is no set."""
         try:
-            for tile, author, group, epoch, seq, cells, kinds, paces, stamps_ns in self._db.execute(
-                "SELECT tile, author, grp, epoch, seq, cells, kinds, paces, stamps_ns FROM sets"
-            ):
-                yield MarkSet(
-                    author=author,
-                    group=group,
-                    tile=tile,
-                    epoch=epoch,
-                    seq=seq,
-                    cells=cells,
-                    kinds=kinds,
-                    paces=paces,
-                    stamps_ns=stamps_ns,
-                )
+            for row in self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM sets"):
+                fields = dict(zip(_FIELDS, row, strict=True))
+                yield MarkSet(**fields)
         except (sqlite3.Error, ValueError, TypeError) as error:
             raise StoreError(_damaged(self.path, str(error))) from error
 
     def save(self, sets: Iterable[MarkSet]) -> None:
         """Commit all or none; on the disk when this returns. Raises StoreError, which leaves the store usable."""
-        rows = [(s.tile, s.author, s.group, s.epoch, s.seq, s.cells, s.kinds, s.paces, s.stamps_ns) for s in sets]
+        rows = [tuple(getattr(each, field) for field in _FIELDS) for each in sets]
         try:
             with self._db:
                 self._db.executemany(_UPSERT, rows)
+        except sqlite3.ProgrammingError:
+            raise  # a bug of ours, and no disk will get better
         except sqlite3.Error as error:
             raise StoreError(f"cannot write the store {self.path}: {error}") from error
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
-from swarm.messages import STAMP_LIMIT_NS, TILE_AREA, MarkKind, MarkSet, column, pack_column
+from swarm.messages import FOREVER, STAMP_LIMIT_NS, TILE_AREA, MarkKind, MarkSet, column, pack_column
 
 NO_STATEMENT = -1
 """In place of a stamp: nobody says anything about the cell."""
@@ -27,12 +27,14 @@ class Statements(NamedTuple):
     kinds      MarkKind
     paces      s/m, 0 where the kind is not PACE
     stamps_ns  hybrid time, NO_STATEMENT where there is none
+    untils_ns  when a statement ends by itself, FOREVER if it does not; None if none of them does
     """
 
     cells: NDArray[np.uint16]
     kinds: NDArray[np.uint8]
     paces: NDArray[np.float32]
     stamps_ns: NDArray[np.int64]
+    untils_ns: NDArray[np.int64] | None = None
 
 
 def statements(mark_set: MarkSet) -> Statements:
@@ -41,7 +43,25 @@ def statements(mark_set: MarkSet) -> Statements:
     paces = column(mark_set.paces, "<f4")
     if max(mark_set.kinds, default=_PACE) != _PACE:
         paces = np.where(kinds == _PACE, paces, _NO_PACE)
-    return Statements(column(mark_set.cells, "<u2"), kinds, paces, column(mark_set.stamps_ns, "<i8"))
+    untils_ns = column(mark_set.untils_ns, "<i8") if mark_set.untils_ns else None
+    return Statements(column(mark_set.cells, "<u2"), kinds, paces, column(mark_set.stamps_ns, "<i8"), untils_ns)
+
+
+def standing(mark_set: MarkSet, now_ns: int) -> Statements:
+    """The columns of a set, without the statements that have ended."""
+    said = statements(mark_set)
+    if said.untils_ns is None or not len(said.cells):
+        return said
+    return taken(said, np.flatnonzero(said.untils_ns > now_ns))
+
+
+def first_end_ns(mark_set: MarkSet, after_ns: int) -> int | None:
+    """When the next of a set's statements ends by itself; None if none does."""
+    if not mark_set.untils_ns:
+        return None
+    untils_ns = column(mark_set.untils_ns, "<i8")
+    coming = untils_ns[(untils_ns > after_ns) & (untils_ns != FOREVER)]
+    return int(coming.min()) if len(coming) else None
 
 
 def mark_set(author: str, group: str, tile: int, epoch: int, seq: int, said: Statements) -> MarkSet:
@@ -55,7 +75,14 @@ def mark_set(author: str, group: str, tile: int, epoch: int, seq: int, said: Sta
         kinds=pack_column(said.kinds, "<u1"),
         paces=pack_column(said.paces, "<f4"),
         stamps_ns=pack_column(said.stamps_ns, "<i8"),
+        untils_ns=_packed_untils(said.untils_ns),
     )
+
+
+def _packed_untils(untils_ns: NDArray[np.int64] | None) -> bytes:
+    if untils_ns is None or (untils_ns == FOREVER).all():
+        return b""
+    return pack_column(untils_ns, "<i8")
 
 
 def supersedes(new: MarkSet, old: MarkSet) -> bool:
@@ -71,8 +98,8 @@ def supersedes(new: MarkSet, old: MarkSet) -> bool:
     return _content(new) > _content(old)
 
 
-def _content(of: MarkSet) -> tuple[bytes, bytes, bytes, bytes, str]:
-    return of.cells, of.kinds, of.paces, of.stamps_ns, of.group
+def _content(of: MarkSet) -> tuple[bytes, bytes, bytes, bytes, bytes, str]:
+    return of.cells, of.kinds, of.paces, of.stamps_ns, of.untils_ns, of.group
 
 
 def fault(of: MarkSet, grid: GridSpec) -> str | None:
@@ -94,20 +121,21 @@ def at_border(tile: int, grid: GridSpec) -> bool:
     return (tile_row + 1) * TILE_CELLS > grid.rows or (tile_col + 1) * TILE_CELLS > grid.cols
 
 
-def resolve(sets: Iterable[MarkSet]) -> Statements:
+def resolve(sets: Iterable[MarkSet], now_ns: int = 0) -> Statements:
     """The winning statement about each of a tile's 1024 cells; CLEAR where nobody says anything.
 
-    sets  at most one per author, in increasing order of author
+    sets    at most one per author, in increasing order of author
+    now_ns  statements that ended by then count as never made
     """
-    dense = _blank()
+    won = _blank()
     for each in sets:
         if each.kinds:
-            said = statements(each)
-            _overlay(dense, said, said.stamps_ns >= dense.stamps_ns[said.cells])  # on a tie the larger author
-    return dense
+            said = standing(each, now_ns)
+            _overlay(won, said, said.stamps_ns >= won.stamps_ns[said.cells])  # on a tie the larger author
+    return won
 
 
-def difference(old: MarkSet | None, new: MarkSet, others: Iterable[MarkSet]) -> Statements:
+def difference(old: MarkSet | None, new: MarkSet, others: Iterable[MarkSet], now_ns: int = 0) -> Statements:
     """The cells whose winner changes in kind or pace when `new` replaces `old`, with their winners since.
 
     others  the sets of the other authors, in increasing order of author
@@ -116,24 +144,34 @@ def difference(old: MarkSet | None, new: MarkSet, others: Iterable[MarkSet]) -> 
     larger = np.zeros(TILE_AREA, bool)  # the cell's winner so far is of an author that wins ties against us
     for each in others:
         if each.kinds:
-            said = statements(each)
+            said = standing(each, now_ns)
             wins = said.stamps_ns >= base.stamps_ns[said.cells]
             _overlay(base, said, wins)
             larger[said.cells[wins]] = each.author > new.author
     before, after = base, base
     if old is not None and old.kinds:
-        before = _standing(base, statements(old), larger)
+        before = _with(base, standing(old, now_ns), larger)
     if new.kinds:
-        after = _standing(base, statements(new), larger)
-    changed = np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces))
-    return taken(after, changed)
+        after = _with(base, standing(new, now_ns), larger)
+    return changes(before, after)
 
 
-def _standing(base: Statements, said: Statements, larger: NDArray[np.bool_]) -> Statements:
-    dense = Statements(_TILE, base.kinds.copy(), base.paces.copy(), base.stamps_ns.copy())
-    known_ns = base.stamps_ns[said.cells]
-    _overlay(dense, said, said.stamps_ns >= known_ns + larger[said.cells])
-    return dense
+def changes(before: Statements, after: Statements) -> Statements:
+    """Of a tile's winners after something happened, those that differ in kind or pace from before."""
+    return taken(after, np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces)))
+
+
+def dense(said: Statements) -> Statements:
+    """Spread over all cells of a tile, the ends included, to be changed in place."""
+    spread = _blank()._replace(untils_ns=np.full(TILE_AREA, FOREVER, np.int64))
+    _overlay(spread, said, np.ones(len(said.cells), bool))
+    return spread
+
+
+def _with(base: Statements, said: Statements, larger: NDArray[np.bool_]) -> Statements:
+    both = Statements(_TILE, base.kinds.copy(), base.paces.copy(), base.stamps_ns.copy())
+    _overlay(both, said, said.stamps_ns >= base.stamps_ns[said.cells] + larger[said.cells])
+    return both
 
 
 def _blank() -> Statements:
@@ -145,13 +183,15 @@ def _blank() -> Statements:
     )
 
 
-def _overlay(dense: Statements, said: Statements, wins: NDArray[np.bool_]) -> None:
+def _overlay(under: Statements, said: Statements, wins: NDArray[np.bool_]) -> None:
     cells = said.cells
     if not wins.all():
         said, cells = taken(said, np.flatnonzero(wins)), cells[wins]
-    dense.kinds[cells] = said.kinds
-    dense.paces[cells] = said.paces
-    dense.stamps_ns[cells] = said.stamps_ns
+    under.kinds[cells] = said.kinds
+    under.paces[cells] = said.paces
+    under.stamps_ns[cells] = said.stamps_ns
+    if under.untils_ns is not None:
+        under.untils_ns[cells] = FOREVER if said.untils_ns is None else said.untils_ns
 
 
 _CLEAR = int(MarkKind.CLEAR)
@@ -162,14 +202,19 @@ _TILE_MASK = np.uint32(TILE_CELLS - 1)
 _TILE: NDArray[np.uint16] = np.arange(TILE_AREA, dtype=np.uint16)
 
 
-def sparse(dense: Statements) -> Statements:
+def sparse(said: Statements) -> Statements:
     """Without the cells that nobody says anything about."""
-    there = np.flatnonzero(dense.stamps_ns != NO_STATEMENT)
-    return taken(dense, there)
+    return taken(said, np.flatnonzero(said.stamps_ns != NO_STATEMENT))
 
 
 def taken(said: Statements, where: NDArray[np.intp]) -> Statements:
-    return Statements(said.cells[where], said.kinds[where], said.paces[where], said.stamps_ns[where])
+    return Statements(
+        said.cells[where],
+        said.kinds[where],
+        said.paces[where],
+        said.stamps_ns[where],
+        None if said.untils_ns is None else said.untils_ns[where],
+    )
 
 
 NOTHING_SAID = Statements(

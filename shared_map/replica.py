@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -15,12 +16,16 @@ from shared_map.marks import (
     NOTHING_SAID,
     HybridClock,
     Statements,
+    changes,
+    dense,
     difference,
     fault,
+    first_end_ns,
     grid_cells,
     mark_set,
     resolve,
     sparse,
+    standing,
     statements,
     supersedes,
     tile_cells,
@@ -28,7 +33,7 @@ from shared_map.marks import (
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec
-from swarm.messages import MarkKind, MarkSet, MarksRequest
+from swarm.messages import FOREVER, MarkKind, MarkSet, MarksRequest
 
 
 class CostSink(Protocol):
@@ -75,6 +80,8 @@ class MapReplica:
         self._pending: dict[int, None] = {}  # own tiles with unpublished changes, in order
         self._published_ns: dict[int, int] = {}
         self._newest_ns: int | None = None
+        self._now_ns = 0  # up to when statements have ended by themselves
+        self._ends: list[tuple[int, int]] = []  # heap of (when, tile)
 
     # --- what others say ------------------------------------------------------------------------------------
 
@@ -114,10 +121,17 @@ class MapReplica:
             sets.get(received.author),
             received,
             [sets[name] for name in sorted(sets) if name != received.author] if sets else (),
+            self._now_ns,
         )
         sets[received.author] = received
         self.ledger.record(received.author, tile, received.epoch, received.seq)
         self.counts["sets_merged"] += 1
+        end_ns = first_end_ns(received, self._now_ns)
+        if end_ns is not None:
+            heapq.heappush(self._ends, (end_ns, tile))
+        return self._apply(tile, changed, measured)
+
+    def _apply(self, tile: int, changed: Statements, measured: bool) -> NDArray[np.uint32]:
         count = len(changed.cells)
         if not count:
             return _NO_CELLS
@@ -131,6 +145,24 @@ class MapReplica:
                 self._newest_ns = newest_ns
         return cells
 
+    def _end_statements(self, now_ns: int) -> None:
+        """Undo what ends by itself by now. Of their own statements authors drop those from their sets."""
+        ended: dict[int, None] = {}
+        while self._ends and self._ends[0][0] <= now_ns:
+            ended[heapq.heappop(self._ends)[1]] = None
+        before_ns, self._now_ns = self._now_ns, max(now_ns, self._now_ns)
+        for tile in ended:
+            sets = self.sets(tile)
+            self._apply(tile, changes(resolve(sets, before_ns), resolve(sets, self._now_ns)), False)
+            coming = [end for each in sets if (end := first_end_ns(each, self._now_ns)) is not None]
+            if coming:
+                heapq.heappush(self._ends, (min(coming), tile))
+            own = self._tiles[tile].get(self.author) if self.author is not None else None
+            if own is not None and own.untils_ns:
+                left = standing(own, self._now_ns)
+                if len(left.cells) < len(own.kinds):
+                    self._put_own(tile, left)
+
     def take_newest_stamp_ns(self) -> int | None:
         """The newest stamp among the marks that changed the map since this was last asked; None without any."""
         newest_ns, self._newest_ns = self._newest_ns, None
@@ -138,9 +170,20 @@ class MapReplica:
 
     # --- what we say ----------------------------------------------------------------------------------------
 
-    def write(self, cells: ArrayLike, kinds: ArrayLike, paces: ArrayLike, now_ns: int) -> list[PublishSet]:
+    def write(
+        self,
+        cells: ArrayLike,
+        kinds: ArrayLike,
+        paces: ArrayLike,
+        now_ns: int,
+        *,
+        lifetime_s: float | None = None,
+    ) -> list[PublishSet]:
         """State something about cells, one kind and pace each; of a cell named twice the last counts. The own
-        cost map knows at once; returned are the sets that may go out now, the others follow from `tick`."""
+        cost map knows at once; returned are the sets that may go out now, the others follow from `tick`.
+
+        lifetime_s  the statements end by themselves so long after their stamps, by the clock of whoever reads them
+        """
         flat = np.atleast_1d(np.asarray(cells, np.int64))
         if len(flat) and not (flat.min() >= 0 and flat.max() < self.grid.cells):
             raise OutsideGridError(f"a cell of {flat.min()}..{flat.max()} is not in {self.grid.cells} cells")
@@ -149,7 +192,7 @@ class MapReplica:
         tiles, inner = tile_cells(self.grid, flat)
         for tile in np.unique(tiles).tolist():
             here = tiles == tile
-            self._write_tile(tile, inner[here], new_kinds[here], new_paces[here], now_ns)
+            self._write_tile(tile, inner[here], new_kinds[here], new_paces[here], now_ns, lifetime_s)
         return self.tick(now_ns)
 
     def _write_tile(
@@ -159,22 +202,25 @@ class MapReplica:
         kinds: NDArray[np.uint8],
         paces: NDArray[np.float32],
         now_ns: int,
+        lifetime_s: float | None,
     ) -> None:
-        sets = self._tiles.get(tile, {})
-        winners = resolve(sets[name] for name in sorted(sets))
+        winners = resolve(self.sets(tile), self._now_ns)
         own = self._own(tile)
+        assert own.untils_ns is not None
         stamps = self._clock.stamps_ns(now_ns, winners.stamps_ns[cells])
         # What we say already, and what stands, need not be said again.
         paces = np.where(kinds == MarkKind.PACE, paces, np.float32(0))
         stands = (own.stamps_ns[cells] != NO_STATEMENT) & (own.stamps_ns[cells] == winners.stamps_ns[cells])
         said = stands & (winners.kinds[cells] == kinds) & (winners.paces[cells] == paces)
-        if len(np.unique(cells)) == len(cells):
+        said &= own.untils_ns[cells] == FOREVER
+        if lifetime_s is None and len(np.unique(cells)) == len(cells):
             if said.all():
                 return
             cells, kinds, paces, stamps = cells[~said], kinds[~said], paces[~said], stamps[~said]
         own.kinds[cells], own.paces[cells], own.stamps_ns[cells] = kinds, paces, stamps
+        own.untils_ns[cells] = FOREVER if lifetime_s is None else stamps + int(lifetime_s * NS_PER_S)
         self.counts["marks_written"] += len(cells)
-        self._put_own(tile, own)
+        self._put_own(tile, sparse(own))
 
     def retract(self, cells: ArrayLike, now_ns: int) -> list[PublishSet]:
         """Take back what we said about cells, as if we had never said it; what others say about them holds."""
@@ -184,11 +230,12 @@ class MapReplica:
             back = inner[tiles == tile]
             if (own.stamps_ns[back] != NO_STATEMENT).any():
                 own.stamps_ns[back] = NO_STATEMENT
-                self._put_own(tile, own)
+                self._put_own(tile, sparse(own))
         return self.tick(now_ns)
 
     def tick(self, now_ns: int) -> list[PublishSet]:
-        """The own sets that are due to go out."""
+        """The own sets that are due to go out; what ends by itself by now has ended."""
+        self._end_statements(now_ns)
         due = [
             tile
             for tile in self._pending
@@ -203,13 +250,13 @@ class MapReplica:
         if self.author is None:
             raise RuntimeError("a replica without an author cannot write")
         own = self._tiles.get(tile, {}).get(self.author)
-        return resolve(() if own is None else (own,))
+        return dense(NOTHING_SAID if own is None else statements(own))
 
     def _put_own(self, tile: int, own: Statements) -> None:
         assert self.author is not None
         held = self._tiles.get(tile, {}).get(self.author)
         epoch, seq = (1, 0) if held is None else (held.epoch, held.seq + 1)
-        self._accept(mark_set(self.author, self.group, tile, epoch, seq, sparse(own)), False)
+        self._accept(mark_set(self.author, self.group, tile, epoch, seq, own), False)
         self._pending[tile] = None
 
     # --- comparing ------------------------------------------------------------------------------------------
@@ -252,8 +299,7 @@ class MapReplica:
 
     def winners(self, tile: int) -> Statements:
         """The winning statements about a tile, without the cells that nobody speaks of."""
-        sets = self._tiles.get(tile, {})
-        return sparse(resolve(sets[name] for name in sorted(sets)))
+        return sparse(resolve(self.sets(tile), self._now_ns))
 
     @property
     def tiles(self) -> list[int]:

@@ -78,6 +78,7 @@ _COLUMN_TYPES = {
     "cost_to_go_s": "<f4",
     "paces": "<f4",
     "stamps_ns": "<i8",
+    "untils_ns": "<i8",
 }
 
 

@@ -67,6 +67,10 @@ STAMP_LIMIT_NS = 1 << 62
 """Marks stamped from here on (year 2116) are refused by everybody alike, so that there is always a newer stamp."""
 
 
+FOREVER = (1 << 63) - 1
+"""The end of a mark that does not end by itself."""
+
+
 class MarkKind(enum.IntEnum):
     PACE = 0
     """The cell can be driven at this pace."""
@@ -83,6 +87,7 @@ class MarkSet(Message, frozen=True, kw_only=True, tag=schema_of("marks")):
     kinds      uint8   MarkKind
     paces      float32 s/m for PACE, ignored otherwise
     stamps_ns  int64   hybrid logical time of each statement
+    untils_ns  int64   when each statement ends by itself, FOREVER if it does not; empty if none does
     """
 
     author: str
@@ -94,6 +99,7 @@ class MarkSet(Message, frozen=True, kw_only=True, tag=schema_of("marks")):
     kinds: bytes
     paces: bytes
     stamps_ns: bytes
+    untils_ns: bytes = b""
 
     def __post_init__(self) -> None:
         check_id("author", self.author)
@@ -102,6 +108,8 @@ class MarkSet(Message, frozen=True, kw_only=True, tag=schema_of("marks")):
         check_column("cells", self.cells, 2, count)
         check_column("paces", self.paces, 4, count)
         check_column("stamps_ns", self.stamps_ns, 8, count)
+        if self.untils_ns:
+            check_column("untils_ns", self.untils_ns, 8, count)
         if count:
             check_statements(self.cells, self.kinds, self.paces, self.stamps_ns)
 

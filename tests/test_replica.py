@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 from map_strategies import GRID, Composite, held_winners, mark_sets, naive_winners, set_of
 
 from shared_map.digest import fingerprint
+from shared_map.marks import Statements, mark_set
 from shared_map.replica import MapReplica, PublishSet
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
-from swarm.messages import MarkKind, MarkSet, MarksRequest
+from swarm.messages import FOREVER, MarkKind, MarkSet, MarksRequest
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 NOW = 1_000 * NS_PER_S
@@ -197,3 +198,75 @@ def test_a_request_is_narrowed_by_authors_tiles_and_the_asked_key() -> None:
     assert replica.answer(MarksRequest()) == sets
     assert replica.answer(MarksRequest(authors=["c", "a"], tiles=[3, 5, 3])) == [sets[3], sets[5]]
     assert replica.answer(MarksRequest(), author="b") == [sets[1], sets[4]]
+
+
+# --- marks that end by themselves ---------------------------------------------------------------------------
+
+
+def ending(author: str, cell: int, stamp_ns: int, until_ns: int, kind: MarkKind = LETHAL) -> MarkSet:
+    said = Statements(
+        np.array([cell], np.uint16),
+        np.array([kind], np.uint8),
+        np.zeros(1, np.float32),
+        np.array([stamp_ns], np.int64),
+        np.array([until_ns], np.int64),
+    )
+    return mark_set(author, "all", 0, 1, 0, said)
+
+
+def test_a_mark_ends_by_itself_and_what_it_had_overruled_stands_again() -> None:
+    replica, composite = replica_of([set_of("b", 0, 0, {5: (PACE, 2.0, 10)}), ending("a", 5, 20, 50)])
+    replica.tick(49)
+    assert composite.kinds[5] == LETHAL
+    replica.tick(50)
+    assert (composite.kinds[5], composite.paces[5]) == (PACE, 2.0)
+
+
+def test_a_mark_that_had_ended_before_it_came_changes_nothing() -> None:
+    replica, composite = replica_of([])
+    replica.tick(60)
+    assert replica.merge(ending("a", 5, 20, 50)).tolist() == []  # type: ignore[union-attr]
+    assert composite.kinds[5] == CLEAR
+
+
+@given(
+    st.lists(
+        st.builds(ending, st.sampled_from("abc"), st.integers(0, 2), st.integers(0, 9), st.integers(0, 19)),
+        max_size=6,
+    ),
+    st.data(),
+)
+def test_when_all_that_ends_has_ended_the_order_of_marks_and_ticks_does_not_show(
+    sets: list[MarkSet], data: st.DataObject
+) -> None:
+    composites = []
+    for _ in range(2):
+        replica, composite = replica_of([])
+        now_ns = 0
+        for each in data.draw(st.permutations(sets)):
+            replica.merge(each)
+            now_ns = data.draw(st.integers(now_ns, 12))
+            replica.tick(now_ns)
+        replica.tick(12)
+        composites.append(composite)
+    assert composites[0].same(composites[1])
+
+
+def test_an_author_drops_its_own_ended_statements_from_its_set() -> None:
+    replica, composite = writer()
+    replica.write([5], [LETHAL], [0], NOW, lifetime_s=2.0)
+    [action] = replica.write([6], [LETHAL], [0], NOW + NS_PER_S)
+    assert np.frombuffer(action.mark_set.untils_ns, "<i8").tolist() == [NOW + 2 * NS_PER_S, FOREVER]
+    [action] = replica.tick(NOW + 2 * NS_PER_S)
+    assert action.mark_set == set_of("a1.1", 0, 2, {6: (LETHAL, 0, NOW + NS_PER_S)})
+    assert composite.kinds[[5, 6]].tolist() == [CLEAR, LETHAL]
+
+
+def test_saying_the_same_again_prolongs_a_lifetime() -> None:
+    replica, composite = writer()
+    replica.write([5], [LETHAL], [0], NOW, lifetime_s=2.0)
+    replica.write([5], [LETHAL], [0], NOW + NS_PER_S, lifetime_s=2.0)
+    replica.tick(NOW + 2 * NS_PER_S)
+    assert composite.kinds[5] == LETHAL
+    replica.tick(NOW + 3 * NS_PER_S)
+    assert composite.kinds[5] == CLEAR
