@@ -1,6 +1,6 @@
 """How simulated targets move over the true ground. Pure: time and chance are arguments.
 
-Targets take legal steps only: to one of eight neighbours, never into a lethal cell, never between two lethal cells.
+Targets take legal steps only: to one of eight neighbours, never into a lethal cell, never past the corner of one.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Ground:
         self.passable: NDArray[np.bool_] = np.isfinite(pace_s_per_m)
         if not self.passable.any():
             raise TerrainError("every cell of the terrain is lethal: nobody could stand on it")
-        # A diagonal step that does not squeeze between two lethal cells has a passable cell beside it, so what is
-        # connected by eight-neighbour steps is exactly what is connected by four-neighbour steps.
+        # A diagonal step has passable cells beside it, so what is connected by eight-neighbour steps is exactly
+        # what is connected by four-neighbour steps.
         regions: NDArray[np.signedinteger[Any]]
         regions, _ = label(self.passable)
         sizes = np.bincount(regions.ravel())
@@ -60,7 +60,7 @@ class Ground:
         to_row, to_col = row + d_row, col + d_col
         if not self.grid.inside(to_row, to_col) or not self.passable[to_row, to_col]:
             return None
-        if d_row and d_col and not (self.passable[row, to_col] or self.passable[to_row, col]):
+        if d_row and d_col and not (self.passable[row, to_col] and self.passable[to_row, col]):
             return None
         return to_row * self.grid.cols + to_col
 
@@ -118,7 +118,7 @@ def _steps_graph(pace: NDArray[np.float32]) -> csr_array[np.float64]:
         d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
         possible = open_[1:-1, 1:-1] & shifted(open_, d_row, d_col)
         if d_row and d_col:
-            possible &= shifted(open_, d_row, 0) | shifted(open_, 0, d_col)
+            possible &= shifted(open_, d_row, 0) & shifted(open_, 0, d_col)
         start = cells[possible]
         starts.append(start)
         ends.append(start + d_row * cols + d_col)

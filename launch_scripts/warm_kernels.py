@@ -12,7 +12,6 @@ import importlib
 import logging
 import signal
 import sys
-from typing import get_args
 
 MODULES = (
     "launch_scripts.child",
@@ -37,38 +36,10 @@ def _load() -> None:
         importlib.import_module(name)
 
 
-def _compile() -> None:
-    """Run every kernel once, by walking a target over a small terrain under every strategy."""
-    import numpy as np
-    from msgspec.structs import replace
-
-    from planner_service.strategies import TargetTree
-    from swarm.config import PlannerConfig, Strategy
-    from swarm.grid import GridSpec, Window
-
-    grid = GridSpec(rows=48, cols=48, resolution_m=10.0)
-    for strategy in get_args(Strategy):
-        octile = PlannerConfig(strategy=strategy)
-        for config in (octile, replace(octile, edge="paper"), replace(octile, edge="paper", neighbours=4)):
-            pace = np.ones((grid.rows, grid.cols), np.float32)
-            tree = TargetTree(grid, config)
-            tree.update(pace, grid.cell(20, 20), [], 1)
-            snapshot = pace.copy()
-            grown = tree.full_job(snapshot, grid.cell(20, 21), 1)()
-            for version, value in ((2, np.inf), (3, 0.5)):  # dearer and cheaper are repaired in different ways
-                pace[22:24, 22:24] = value
-                tree.update(pace, grid.cell(20, 20 + version), [Window(22, 22, 24, 24)], version)
-            starts = [grid.cell(2, 2), grid.cell(40, 44)]
-            tree.adopt(grown, pace, grid.cell(20, 23), [Window(22, 22, 24, 24)], 3, starts)
-            tree.force(pace, starts)
-            tree.routes(pace, starts)
-            tree.cost_to_go_at(starts)
-
-
 _die_with_launcher()
 try:
     _load()
-    _compile()
+    importlib.import_module("planner_service.warm").warm_up()
 except Exception:  # a role that cannot be loaded says so better in its own log
     logging.getLogger(__name__).exception("cannot warm up")
 gc.freeze()

@@ -56,6 +56,9 @@ class Followers:
     def get(self, vehicle: str) -> Follower | None:
         return self._by_id.get(vehicle)
 
+    def all(self) -> Iterable[Follower]:
+        return self._by_id.values()
+
     @property
     def cells(self) -> NDArray[np.int64]:
         """Where they all are."""

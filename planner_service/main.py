@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 
 from planner_service.service import PlannerService
+from planner_service.warm import warm_up
 from shared_map.terrain import load_terrain
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
@@ -22,6 +23,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             f"scenario {scenario.name} has no target {setup.id}; it has {', '.join(scenario.target_ids)}"
         )
     terrain = load_terrain(setup)
+    warm_up()
     clock = MonotonicClock()
     inbox = Inbox()
     with open_bus(scenario.network) as bus, closing(ThreadWorker("grow-tree", inbox, clock)) as worker:

@@ -73,8 +73,8 @@ class ScriptedTree(TargetTree):
         self, pace_snapshot: NDArray[np.float32], target_cell: int, map_version: int
     ) -> Callable[[], GrownTree]:
         self.calls.append(("full_job", target_cell, map_version))
-        arrays = np.zeros((ROWS, COLS), np.float32), np.zeros((ROWS, COLS), np.uint8)
-        return lambda: GrownTree(target_cell, map_version, *arrays)
+        cost, parent = np.zeros(1, np.float32), np.zeros(1, np.uint8)
+        return lambda: GrownTree(target_cell, map_version, cost, parent, cost, True, None, COLS + 2)
 
     def adopt(
         self,
@@ -573,7 +573,7 @@ def test_growths_are_timed_by_the_stopwatch_that_is_handed_in() -> None:
 
 
 def test_without_a_stopwatch_growths_take_what_the_model_says(ready: World) -> None:
-    assert ready.planner.status(0).growth_ms == pytest.approx(GRID.cells * 20e-6)
+    assert ready.planner.status(0).growth_ms == pytest.approx(GRID.cells * 15e-6)
     assert ready.tree.named("observe") == []
 
 

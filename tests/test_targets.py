@@ -71,12 +71,13 @@ def test_the_largest_part_is_what_legal_steps_connect() -> None:
     assert ground(pace).home.tolist() == [0, 1, 6, 7, 8, 12, 13, 14, 18, 19, 20]
 
 
-def test_nobody_squeezes_between_two_lethal_cells() -> None:
+def test_nobody_squeezes_past_the_corner_of_a_lethal_cell() -> None:
     pace = flat(2, 2)
-    pace[0, 1] = pace[1, 0] = np.inf
-    where = ground(pace)
-    assert where.step(0, 3) is None
-    assert len(where.home) == 1
+    pace[0, 1] = np.inf
+    assert ground(pace).step(0, 3) is None
+    assert ground(pace).step(0, 4) == 2
+    pace[1, 0] = np.inf
+    assert len(ground(pace).home) == 1
 
 
 def test_a_terrain_without_a_passable_cell_is_refused() -> None:

@@ -1,0 +1,114 @@
+"""How far from optimal routes are: the books of one planner. Pure.
+
+certified_gap_excess  proven, of every route served: its cost over its lower bound, less 1
+gap_excess            measured at full growths: driven cost over optimum of what the tree offered each follower
+held_gap_excess       measured at full growths: driven cost over optimum of going on along the route that a
+                      follower was given last, and from its end by the cheapest way
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.followers import Follower, Followers
+from planner_service.strategies import TargetTree
+from swarm.clock import NS_PER_S
+from swarm.config import PlannerConfig
+from swarm.grid import GridSpec
+from swarm.messages import Route, RouteStatus
+from swarm.stats import Counters
+
+_EVERY_NS = NS_PER_S
+_MOST = 64
+"""Followers that are measured at a time, evenly chosen: to read a route takes as long as a small growth."""
+
+Gaps = NDArray[np.float64]
+
+
+class GapBooks:
+    """What was measured of one planner's routes. `last` is mean, p95 and highest of the last full growth."""
+
+    def __init__(self, grid: GridSpec, config: PlannerConfig, counters: Counters) -> None:
+        self.last: tuple[float, float, float] | None = None
+        self._counters = counters
+        self._cols = grid.cols
+        self._length_weight = config.length_weight
+        self._straight_m = grid.resolution_m
+        self._diagonal_m = grid.resolution_m * (math.sqrt(2) if config.edge == "octile" else 1.0)
+        self._due_ns = 0
+
+    def certify(self, routes: Sequence[Route]) -> float:
+        """Book the proven gaps of served routes; returns the widest."""
+        widest = 1.0
+        for route in routes:
+            if route.status is RouteStatus.OK:
+                gap = route.gap
+                widest = max(widest, gap)
+                if math.isfinite(gap):
+                    self._counters.observe("certified_gap", gap)
+                    self._counters.observe("certified_gap_excess", gap - 1.0)
+        return widest
+
+    def adopted(self, tree: TargetTree, followers: Followers, pace: NDArray[np.float32], now_ns: int) -> None:
+        """A worker's tree has replaced the one that was offered until now, and has been compared with it."""
+        self._offered(tree.last_gaps)
+        self._due_ns = now_ns + _EVERY_NS
+        self._held(tree, _some(followers), pace)
+
+    def grown(self, tree: TargetTree, followers: Followers, pace: NDArray[np.float32], now_ns: int) -> None:
+        """A tree was grown on this thread: what it offers is read and compared with what it promises."""
+        if now_ns < self._due_ns or not len(followers):
+            return
+        self._due_ns = now_ns + _EVERY_NS
+        some = _some(followers)
+        cells = [follower.cell for follower in some]
+        routes = tree.routes(pace, cells, 0)
+        driven = [route.cost_s + self._length_weight * route.length_m for route in routes]
+        self._offered(_ratios(np.array(driven), tree.cost_to_go_at(cells)))
+        self._held(tree, some, pace)
+
+    def _offered(self, gaps: Gaps) -> None:
+        gaps = gaps[np.isfinite(gaps)]
+        if not len(gaps):
+            return
+        self.last = (float(gaps.mean()), float(np.quantile(gaps, 0.95)), float(gaps.max()))
+        for gap in gaps.tolist():
+            self._counters.observe("gap", gap)
+            self._counters.observe("gap_excess", max(gap - 1.0, 0.0))
+
+    def _held(self, tree: TargetTree, followers: Sequence[Follower], pace: NDArray[np.float32]) -> None:
+        rests = [(follower.cell, self._rest(follower, pace)) for follower in followers]
+        known = [(cell, *rest) for cell, rest in rests if rest is not None]
+        if not known:
+            return
+        cells, driven, ends = (list(each) for each in zip(*known, strict=True))
+        whole = np.array(driven, np.float64) + tree.cost_to_go_at(ends).astype(np.float64)
+        for gap in _ratios(whole, tree.cost_to_go_at(cells)).tolist():
+            self._counters.observe("held_gap_excess", max(gap - 1.0, 0.0))
+
+    def _rest(self, follower: Follower, pace: NDArray[np.float32]) -> tuple[float, int] | None:
+        """(cost, last cell) of the rest of a follower's route; None if it has left the route or has none."""
+        row, col = divmod(follower.cell, self._cols)
+        at = np.flatnonzero((follower.rows == row) & (follower.cols == col))
+        if not len(at):
+            return None
+        rows, cols = follower.rows[int(at[0]) :], follower.cols[int(at[0]) :]
+        diagonal = (np.diff(rows) != 0) & (np.diff(cols) != 0)
+        metres = np.where(diagonal, self._diagonal_m, self._straight_m)
+        costs = (pace[rows[1:], cols[1:]].astype(np.float64) + self._length_weight) * metres
+        return float(costs.sum()), int(rows[-1]) * self._cols + int(cols[-1])
+
+
+def _some(followers: Followers) -> list[Follower]:
+    every = list(followers.all())
+    return every[:: -(-len(every) // _MOST) or 1]
+
+
+def _ratios(driven: Gaps, optimum: NDArray[np.float32]) -> Gaps:
+    """Cost over optimum where both are finite and there is any way to go."""
+    given = np.isfinite(driven) & np.isfinite(optimum) & (optimum > 0)
+    return np.asarray(driven[given] / optimum[given].astype(np.float64), np.float64)
