@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -266,6 +266,7 @@ def test_a_tick_without_news_costs_nothing(ready: World) -> None:
     assert ready.tree.calls == []
 
 
+@settings(deadline=None)
 @given(st.permutations([(1, 1), (1, 2), (1, 9), (2, 1), (2, 2)]))
 def test_the_newest_pose_wins_in_whatever_order_poses_arrive(order: list[tuple[int, int]]) -> None:
     world = World()
@@ -348,6 +349,7 @@ def test_a_growth_of_another_map_than_it_was_decided_on_is_a_bug(ready: World) -
         ready.planner.growth(GrowTree(3, 5))
 
 
+@settings(deadline=None)
 @given(st.randoms(use_true_random=False))
 def test_whatever_happens_the_tree_ends_up_with_the_newest_pose_and_map(chance: random.Random) -> None:
     world = World()

@@ -274,6 +274,7 @@ def test_who_is_seen_standing_still_stood_there_meanwhile() -> None:
     assert len(judged(a(100, 5), b(150, 4), b(250, 5), a(900, 5), b(950, 5))) == 1
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.integers(0, 3)), max_size=30), st.randoms())
 def test_repeated_and_late_reports_change_nothing(moves: list[tuple[str, int]], chance: random.Random) -> None:
     reports = [(a if id == "a" else b)(100.0 * n, cell) for n, (id, cell) in enumerate(moves)]
