@@ -213,7 +213,8 @@ class MonitorService:
 
     def _draw_windows(self) -> None:
         """Which part of its tree each planner grew last; the whole terrain is no news."""
-        windows = [Window(*status.window) for _, status in sorted(self.recorder.observed.status.items())]
+        told = [status.window for _, status in sorted(self.recorder.observed.status.items())]
+        windows = [Window(*window) for window in told if window]
         parts = [window for window in windows if not window.empty and window.cells < self._terrain.grid.cells]
         self._drawing.windows([window_outline(self._ground, window) for window in parts])
 
