@@ -252,7 +252,8 @@ class _Run:
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
             f"{len(self._swarm.running)} processes, {self._terrain.grid.rows} x {self._terrain.grid.cols} cells"
         )
-        self._screen.say(f"logs, recording and report: {self._run_dir}")
+        router = self._scenario.network.connect[0]
+        self._screen.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 
     def _report(self, recorder: Recorder, seconds: float) -> None:
         report = write_report(
