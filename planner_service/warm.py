@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal, get_args
 
 import numpy as np
@@ -17,6 +18,7 @@ RULES: tuple[tuple[Literal["octile", "paper"], Literal[4, 8]], ...] = (("octile"
 _SIDE = 40
 
 
+@functools.cache  # a process forked from a warm one has nothing to do
 def warm_up() -> None:
     """Grow, move, repair, force and read small trees: slow the first time ever, a moment once they are cached."""
     grid = GridSpec(_SIDE, _SIDE, 10.0)
