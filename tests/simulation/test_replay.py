@@ -1,0 +1,65 @@
+"""A seed replays a run: the same events, byte for byte, and the same report."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from simulated_swarm import SMALL, planned, seeded
+
+from launch_scripts.simulate import simulate
+
+RUN = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+from simulated_swarm import SMALL, planned
+from launch_scripts.simulate import simulate
+with open(sys.argv[2], "w") as trace:
+    result = simulate(SMALL, seed=int(sys.argv[3]), seconds=12, faults=planned(int(sys.argv[3]), 12), trace=trace)
+print(json.dumps(result.report))
+"""
+
+
+@pytest.mark.parametrize("seed", [4])
+def test_a_run_is_the_same_byte_for_byte_whatever_the_hash_seed_is(seed, tmp_path):
+    runs = []
+    for hash_seed in ("1", "4242"):
+        trace = tmp_path / f"{hash_seed}.log"
+        runs.append(
+            subprocess.Popen(
+                [sys.executable, "-c", RUN, str(Path(__file__).parents[1]), str(trace), str(seed)],
+                env={**os.environ, "PYTHONHASHSEED": hash_seed},
+                stdout=subprocess.PIPE,
+            )
+        )
+    reports = [run.communicate(timeout=250)[0] for run in runs]
+    assert [run.returncode for run in runs] == [0, 0]
+    one, other = ((tmp_path / f"{hash_seed}.log").read_bytes() for hash_seed in ("1", "4242"))
+    assert one.count(b"\n") > 3000
+    assert b" crash " in one
+    assert one == other
+    assert reports[0] == reports[1]
+
+
+def test_another_seed_is_another_run():
+    logs = []
+    for seed in (1, 2):
+        trace = io.StringIO()
+        simulate(SMALL, seed=seed, seconds=4, trace=trace)
+        logs.append(trace.getvalue())
+    assert logs[0] != logs[1]
+
+
+def test_watching_a_run_does_not_change_it():
+    trace = io.StringIO()
+    told: list[float] = []
+    one = simulate(seeded(3), seconds=4, faults=planned(3, 4), trace=trace, progress=told.append)
+    other = simulate(seeded(3), seconds=4, faults=planned(3, 4))
+    assert one.report == other.report
+    assert told == [1.0, 2.0, 3.0, 4.0]
+    assert trace.getvalue().splitlines()[0].startswith("0.")
+    assert one.deliveries == sum(" > " in line for line in trace.getvalue().splitlines())

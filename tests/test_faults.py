@@ -1,0 +1,87 @@
+"""Faulty links do what their plan says, no more and no less."""
+
+from __future__ import annotations
+
+import random
+
+from launch_scripts.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks, Partition, random_plan
+from swarm.clock import NS_PER_S
+
+BEGAN_NS = 1_000 * NS_PER_S
+
+
+def links(seed: int = 1, **plan: object) -> FaultyLinks:
+    return FaultyLinks(FaultPlan(**plan), random.Random(seed), BEGAN_NS, lease_s=2.0)  # type: ignore[arg-type]
+
+
+def at(seconds: float) -> int:
+    return BEGAN_NS + int(seconds * NS_PER_S)
+
+
+def sent(model: FaultyLinks, times: int, every_s: float = 0.001) -> list[tuple[float, ...]]:
+    """Arrival times in seconds of messages sent one after the other."""
+    arrivals = []
+    for n in range(times):
+        delays = model.delays_ns("a", "b", "pose", at(n * every_s))
+        arrivals.append(tuple((at(n * every_s) - BEGAN_NS + delay) / NS_PER_S for delay in delays))
+    return arrivals
+
+
+def test_without_faults_every_message_arrives_once_after_the_same_time():
+    assert sent(links(delay_ms=5.0), 3, every_s=1.0) == [(0.005,), (1.005,), (2.005,)]
+
+
+def test_the_planned_share_is_lost_repeated_and_reordered():
+    arrivals = sent(links(drop=0.2, duplicate=0.1), 5000)
+    assert 0.17 < sum(not each for each in arrivals) / 5000 < 0.23
+    assert 0.06 < sum(len(each) == 2 for each in arrivals) / 5000 < 0.1
+
+
+def test_messages_keep_their_order_but_for_those_that_are_reordered():
+    first = [each[0] for each in sent(links(jitter_ms=50.0), 2000)]
+    assert first == sorted(first)
+    assert max(each - n * 0.001 for n, each in enumerate(first)) > 0.03
+    mixed = [each[0] for each in sent(links(jitter_ms=1.0, reorder=0.1), 2000)]
+    assert mixed != sorted(mixed)
+
+
+def test_after_the_quiet_begins_nothing_is_lost_or_repeated():
+    model = links(drop=0.5, duplicate=0.5, reorder=0.5, quiet_s=10.0)
+    assert all(len(model.delays_ns("a", "b", "pose", at(10 + n))) == 1 for n in range(200))
+
+
+def test_a_long_partition_is_noticed_after_the_lease_and_heals_a_moment_after_it_ends():
+    model = links(partitions=(Partition(5, 9, ("a", "c")),))
+    assert [bool(model.delays_ns("a", "b", "x", at(t))) for t in (4.9, 5.1, 8.9, 9.1, 9 + RELINK_S)] == [
+        True, False, False, False, True,
+    ]  # fmt: skip
+    assert [model.connected("a", "b", at(t)) for t in (5.1, 6.9, 7.1, 9.2, 9 + RELINK_S)] == [
+        True, True, False, False, True,
+    ]  # fmt: skip
+    assert model.delays_ns("a", "c", "x", at(6))
+    assert model.delays_ns("b", "d", "x", at(6))
+    assert model.connected("a", "c", at(8))
+
+
+def test_a_short_partition_is_only_silence():
+    model = links(partitions=(Partition(5, 6, ("a",)),))
+    assert not model.delays_ns("a", "b", "x", at(5.5))
+    assert model.delays_ns("a", "b", "x", at(6.0))
+    assert all(model.connected("a", "b", at(t / 10)) for t in range(100))
+
+
+def test_the_observer_hears_everything():
+    model = links(drop=1.0, partitions=(Partition(0, 100, ("a",)),))
+    assert model.delays_ns("a", OBSERVER, "x", at(1)) == (1_000_000,)
+    assert model.connected("a", OBSERVER, at(50))
+
+
+def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
+    nodes = ["keeper-0", "planner-t0", "agent-a0"]
+    assert random_plan(3, nodes, 30) == random_plan(3, nodes[::-1], 30)
+    for seed in range(200):
+        plan = random_plan(seed, nodes, 30)
+        assert plan.quiet_s == 20
+        assert all(crash.at_s < 20 and crash.node in nodes for crash in plan.crashes)
+        assert all(part.until_s <= 20 and set(part.nodes) < set(nodes) for part in plan.partitions)
+    assert len({str(random_plan(seed, nodes, 30)) for seed in range(20)}) == 20
