@@ -39,6 +39,7 @@ class Features:
         darkest = np.minimum(np.minimum(self.red, self.green), self.blue)
         self.saturation = (brightest - darkest) / np.maximum(brightest, np.float32(1))
         self.grade = grade
+        self.sharp = colour
 
     def columns(self) -> Floats:
         """(cells, features) for a learner."""
@@ -117,12 +118,18 @@ def _water(f: Features) -> tuple[Bools, Bools]:
     black = (f.light < 40) & (f.blue >= f.red)
     dead_level = f.grade < np.float32(0.004)
     coloured = bluish | black | (dead_level & (f.light < 65) & (f.blue >= f.red))
-    smooth = (f.grade < LEVEL_GRADE) & (f.texture < 8)
-    return coloured & (f.grade < SHORE_GRADE), coloured & (smooth | dead_level)
+    # Sky light in a shadow is blue, not green: a lake is both.
+    teal = (f.blue > np.float32(1.45) * f.red) & (f.green > np.float32(1.4) * f.red)
+    smooth = (f.grade < LEVEL_GRADE) & ((f.texture < 8) | teal)
+    # The shore is drawn by single pixels: a mean of 3 x 3 is half land there.
+    red, green, blue = f.sharp[..., 0], f.sharp[..., 1], f.sharp[..., 2]
+    wet = (blue > np.float32(1.2) * red) & (green > np.float32(1.02) * red)
+    wet |= (green < 50) & (blue >= red) & (dead_level | black)
+    return (wet | (coloured & smooth)) & (f.grade < SHORE_GRADE), coloured & (smooth | dead_level)
 
 
 def _lakes(likely: Bools, certain: Bools) -> Bools:
-    """Patches of likely water of which a third is certain; small ones are puddles or shadows of houses."""
+    """Patches of likely water of which a fifth is certain; small ones are puddles or shadows of houses."""
     from scipy import ndimage
 
     labels, count = ndimage.label(likely)
@@ -130,7 +137,7 @@ def _lakes(likely: Bools, certain: Bools) -> Bools:
         return np.zeros(likely.shape, np.bool_)
     sizes = np.bincount(labels.reshape(-1))
     sure = np.bincount(labels[certain], minlength=count + 1)
-    lake = (sizes >= SMALLEST_LAKE) & (3 * sure >= sizes)
+    lake = (sizes >= SMALLEST_LAKE) & (5 * sure >= sizes)
     lake[0] = False
     wet = np.asarray(lake[labels], np.bool_)
     return np.asarray(ndimage.binary_fill_holes(wet), np.bool_) if wet.any() else wet
