@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
-from swarm.messages import NO_TARGET, Fleet, VehicleState, column
+from swarm.messages import Fleet, column
 
 _SKEW_NS = NS_PER_S // 200
 """Overlaps shorter than this are within what the clocks of two processes may differ."""
@@ -134,14 +134,3 @@ class Referee:
                 self._stays[cell] = kept
             else:
                 del self._stays[cell]
-
-
-def chasers(fleet: Fleet, target: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Of the vehicles in a report: the positions of those that chase a target, and which of these say ARRIVED."""
-    if target not in fleet.target_ids:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_)
-    index = fleet.target_ids.index(target)
-    assert index != NO_TARGET
-    chasing = np.flatnonzero(column(fleet.targets, "<u1") == index)
-    arrived = column(fleet.states, "<u1")[chasing] == VehicleState.ARRIVED
-    return chasing, arrived

@@ -6,13 +6,14 @@ does.
 
 from __future__ import annotations
 
+import math
 import random
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.referee import Collision, LethalEntry, Referee, chasers
+from launch_scripts.referee import Collision, LethalEntry, Referee
 from launch_scripts.walks import Budget, Ground, Walker, far_place, slowness_of
 from shared_map.layers import inflate, inflation_halves
 from shared_map.terrain import Terrain
@@ -21,7 +22,7 @@ from swarm.clock import NS_PER_S
 from swarm.config import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.membership import Member
-from swarm.messages import Fleet, PlannerStatus, TargetPose, column
+from swarm.messages import NO_TARGET, Fleet, PlannerStatus, TargetPose, VehicleState, column
 from swarm.role import RoleSetup
 from swarm.topics import FLEET, POSE, STATUS
 
@@ -118,12 +119,9 @@ class TargetWorld:
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
         actions: list[Action] = list(self._referee.hear(fleet))
-        for id in fleet.target_ids:
-            target = self._targets.get(id)
-            if target is not None and target.placed:
-                vehicle = self._catcher(fleet, id, target)
-                if vehicle is not None:
-                    actions.extend(self._reached(id, target, vehicle, now_ns))
+        for index, vehicle in self._catchers(fleet):
+            id = fleet.target_ids[index]
+            actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
         return actions
 
     def tick(self, now_ns: int) -> list[Action]:
@@ -160,21 +158,31 @@ class TargetWorld:
             jumps=target.jumps,
         )
 
-    def _catcher(self, fleet: Fleet, id: str, target: _Target) -> str | None:
-        """The first vehicle in a report that has this target, which it chases, within reach.
+    def _catchers(self, fleet: Fleet) -> list[tuple[int, str]]:
+        """(target's index, first vehicle within reach of it) of the targets that a report says are chased.
 
         A vehicle that says ARRIVED is believed at twice the range: it compares cells, and the target may have moved
         on since it looked.
         """
-        chasing, arrived = chasers(fleet, id)
+        chased = np.frombuffer(fleet.targets, np.uint8)
+        chasing = np.flatnonzero(chased != NO_TARGET)
         if not len(chasing):
-            return None
-        east_m = column(fleet.east_m, "<f4")[chasing] - (target.x_m - self._grid.west_m)
-        south_m = column(fleet.south_m, "<f4")[chasing] - (self._grid.north_m - target.y_m)
+            return []
+        chased = chased[chasing]
+        # Where nobody is: a target that is not ours, or not placed yet.
+        known = [self._targets.get(id) for id in fleet.target_ids]
+        places = [(t.x_m, t.y_m) if t is not None and t.placed else (math.inf, math.inf) for t in known]
+        x_m, y_m = np.array(places).T
+        east_m = column(fleet.east_m, "<f4")[chasing] - (x_m[chased] - self._grid.west_m)
+        south_m = column(fleet.south_m, "<f4")[chasing] - (self._grid.north_m - y_m[chased])
+        arrived = np.frombuffer(fleet.states, np.uint8)[chasing] == VehicleState.ARRIVED
         range_m = self._capture_range_m
         reach_m = np.where(arrived, range_m + max(range_m, 2 * self._grid.resolution_m), range_m)
         near = np.flatnonzero(np.hypot(east_m, south_m) <= reach_m)
-        return fleet.ids[int(chasing[near[0]])] if len(near) else None
+        caught: dict[int, str] = {}
+        for index, vehicle in zip(chased[near].tolist(), chasing[near].tolist(), strict=True):
+            caught.setdefault(index, fleet.ids[vehicle])
+        return list(caught.items())
 
     def _reached(self, id: str, target: _Target, vehicle: str, now_ns: int) -> list[Action]:
         calm = now_ns >= target.calm_until_ns
