@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import http.client
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.parse
 import urllib.request
 import warnings
 from collections.abc import Callable, Iterator
@@ -18,6 +21,7 @@ import numpy as np
 import pytest
 from fake_run import fake_run
 
+from launch_scripts.monitor import tied
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.outlets import Outlets, new_recording_path
 from launch_scripts.monitor.scene import Ground
@@ -241,42 +245,56 @@ def listeners(pid: int) -> set[str]:
     return addresses
 
 
-def served(url: str) -> bool:
-    try:
-        with urllib.request.urlopen(url, timeout=2) as reply:
-            return reply.status == 200 and b"rerun" in reply.read().lower()
-    except OSError:
-        return False
+def stream_port(live_url: str) -> int:
+    """Of the stream that the page leads to."""
+    page = http.client.HTTPConnection("127.0.0.1", urllib.parse.urlparse(live_url).port or 0)
+    page.request("GET", "/")
+    location = page.getresponse().getheader("Location") or ""
+    page.close()
+    stream = urllib.parse.parse_qs(urllib.parse.urlparse(location).query)["url"][0]
+    return urllib.parse.urlparse(stream).port or 0
+
+
+def children(pid: int) -> list[int]:
+    return [
+        int(child)
+        for thread in Path(f"/proc/{pid}/task").iterdir()
+        for child in (thread / "children").read_text().split()
+    ]
 
 
 @pytest.mark.network
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_viewer_and_stream_are_served_on_loopback_only_and_end_with_us(terrain: Terrain, tmp_path: Path) -> None:
+def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_home(
+    terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     home = tmp_path / "home"
     home.mkdir()
-    os.environ["HOME"], old_home = str(home), os.environ.get("HOME", "")
-    try:
-        outlets = Outlets("r", tmp_path / "run.rrd", LIVE, make_blueprint(Ground(terrain)))
-    finally:
-        os.environ["HOME"] = old_home
+    monkeypatch.setenv("HOME", str(home))
+    before = children(os.getpid())
+    outlets = Outlets("r", tmp_path / "run.rrd", LIVE, make_blueprint(Ground(terrain)))
     assert outlets.live_url is not None
-    assert outlets._viewer is not None
-    pid = outlets._viewer.pid
     try:
-        assert eventually(lambda: served(outlets.live_url or ""))
-        assert listeners(pid) == {"0100007F"}
-        assert listeners(os.getpid()) == {"0100007F"}
+        with urllib.request.urlopen(outlets.live_url, timeout=30) as reply:
+            assert "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A" in reply.url, "led to the stream"
+            assert b"re_viewer.js" in reply.read()
+            policy = reply.headers["Content-Security-Policy"]
+        assert policy.endswith("connect-src 'self' http://127.0.0.1:*")
+        with urllib.request.urlopen(f"{outlets.live_url}re_viewer_bg.wasm", timeout=30) as reply:
+            assert reply.headers["Content-Type"] == "application/wasm"
+            assert reply.read(4) == b"\0asm"
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"{outlets.live_url}etc/passwd", timeout=30)
+        assert eventually(lambda: listeners(os.getpid()) == {"0100007F"})
+        assert children(os.getpid()) == before, "the viewer program is gone again"
         assert list(home.rglob("*")) == [], "nothing is written to the home folder"
     finally:
         began_s = time.monotonic()
         outlets.close()
     assert time.monotonic() - began_s < 4
-    assert not Path(f"/proc/{pid}").exists()
 
 
-@pytest.mark.network
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot tie a child to its parent's end")
-def test_a_killed_monitor_leaves_a_readable_file_and_no_process(tmp_path: Path) -> None:
+def test_a_killed_monitor_leaves_a_readable_file(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     script = f"""
 import time, numpy, pathlib
@@ -287,28 +305,35 @@ from shared_map.terrain import terrain_of_pace
 from swarm.config import MonitorConfig
 import rerun as rr
 ground = Ground(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
-outlets = Outlets("r", pathlib.Path({str(path)!r}), MonitorConfig(grpc_port=0, web_port=0), make_blueprint(ground))
+outlets = Outlets("r", pathlib.Path({str(path)!r}), MonitorConfig(live=False), make_blueprint(ground))
 for n in range(100):
     outlets.rec.set_time("tick", sequence=n)
     outlets.rec.log("a", rr.Scalars(n))
 outlets.rec.flush(timeout_sec=5)
-print(outlets._viewer.pid, flush=True)
+print("written", flush=True)
 time.sleep(60)
 """
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as monitor:
         assert monitor.stdout is not None
-        viewer = int(monitor.stdout.readline())
-        assert eventually(lambda: b"--serve-web" in Path(f"/proc/{viewer}/cmdline").read_bytes())
+        assert monitor.stdout.readline() == "written\n"
         monitor.send_signal(signal.SIGKILL)
-    assert eventually(lambda: not Path(f"/proc/{viewer}").exists() or _zombie(viewer))
     assert rows_by_entity(path)["/a"] == 100
 
 
-def _zombie(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot tie a child to its parent's end")
+def test_a_tied_program_ends_with_its_parent_even_if_that_is_killed() -> None:
+    parent_script = f"""
+import os, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-I", {tied.__file__!r}, str(os.getpid()), "/bin/sleep", "60"])
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", parent_script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = Path(f"/proc/{int(parent.stdout.readline())}")
+        assert eventually(lambda: b"sleep" in (child / "cmdline").read_bytes())
+        parent.send_signal(signal.SIGKILL)
+    assert eventually(lambda: not child.exists() or "\nState:\tZ" in (child / "status").read_text())
 
 
 @pytest.mark.network
@@ -332,7 +357,7 @@ def test_logging_does_not_wait_for_a_viewer_that_reads_nothing(terrain: Terrain)
     outlets = Outlets("r", None, LIVE, make_blueprint(Ground(terrain)))
     try:
         assert outlets.live_url is not None
-        port = int(outlets.live_url.rpartition(":")[2].split("/")[0])
+        port = stream_port(outlets.live_url)
         with socket.create_connection(("127.0.0.1", port)) as stalled:
             stalled.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n")
             worst_s = 0.0

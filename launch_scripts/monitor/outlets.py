@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import logging
-import os
 import socket
-import subprocess
-import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import rerun as rr
 import rerun.blueprint as rrb
 
-from launch_scripts.monitor import tied
+from launch_scripts.monitor.web import LOOPBACK, ViewerPage
 from swarm.config import MonitorConfig
 from swarm.errors import BusError, StoreError
 
 log = logging.getLogger(__name__)
 
 APPLICATION = "terrain-swarm"
-_LOOPBACK = "127.0.0.1"
 _PORT_PATIENCE_S = 3.0
+
+T = TypeVar("T")
 
 
 def new_recording_path(folder: Path) -> Path:
@@ -50,22 +49,23 @@ class Outlets:
         self.rec = rr.RecordingStream(
             APPLICATION, recording_id=recording_id, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.1)
         )
-        self.live_url: str | None = None
-        self._viewer: subprocess.Popen[bytes] | None = None
+        self._page: ViewerPage | None = None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         if path is not None:
             sinks.append(rr.FileSink(path, write_footer=True))
         if config.live:
-            grpc_port, web_port = _port(config.grpc_port, "grpc_port"), _port(config.web_port, "web_port")
-            sinks.append(
-                rr.GrpcServerSink(bind_ip=_LOOPBACK, port=grpc_port, server_memory_limit=f"{config.memory_mib}MiB")
-            )
+            grpc_port = _patiently(_free_port, config.grpc_port, "grpc_port")
+            stream_url = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
+            page = _patiently(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
+            self._page = page
+            limit = f"{config.memory_mib}MiB"
+            sinks.append(rr.GrpcServerSink(bind_ip=LOOPBACK, port=grpc_port, server_memory_limit=limit))
         self.rec.set_sinks(*sinks, default_blueprint=blueprint)
-        if config.live:
-            grpc_url = f"rerun+http://{_LOOPBACK}:{grpc_port}/proxy"
-            self._viewer = _serve_viewer(web_port, grpc_url)
-            escaped = grpc_url.replace("+", "%2B")
-            self.live_url = f"http://{_LOOPBACK}:{web_port}/?url={escaped}"
+
+    @property
+    def live_url(self) -> str | None:
+        """Where a browser on this machine sees the run."""
+        return None if self._page is None else self._page.url
 
     def close(self, within_s: float = 3.0) -> None:
         closing = threading.Thread(target=self._flush, args=(within_s,), name="flush", daemon=True)
@@ -73,9 +73,8 @@ class Outlets:
         closing.join(within_s)
         if closing.is_alive():
             log.warning("the recording was not written to the end within %.0f s", within_s)
-        if self._viewer is not None:
-            self._viewer.kill()
-            self._viewer.wait()
+        if self._page is not None:
+            self._page.close()
 
     def _flush(self, within_s: float) -> None:
         with contextlib.suppress(Exception):  # a viewer that is gone must not keep the file from its end
@@ -83,41 +82,23 @@ class Outlets:
         self.rec.disconnect()
 
 
-def _port(wanted: int, name: str) -> int:
-    """The port if it is free, or becomes free soon as after a restart; any free one if 0 is wanted."""
+def _patiently(listen: Callable[[int], T], port: int, name: str) -> T:
+    """Listen on a port, also if it only soon becomes free, as after a restart. Raises BusError."""
     deadline_s = time.monotonic() + _PORT_PATIENCE_S
     while True:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((_LOOPBACK, wanted))
-                return int(probe.getsockname()[1])
-            except OSError as error:
-                if time.monotonic() > deadline_s:
-                    raise BusError(
-                        f"cannot show the live view on port {wanted}: {error.strerror}; choose another "
-                        f"monitor.{name}, 0 for any, or monitor.live = false"
-                    ) from error
+        try:
+            return listen(port)
+        except OSError as error:
+            if time.monotonic() > deadline_s:
+                raise BusError(
+                    f"cannot show the live view on port {port}: {error.strerror}; choose another "
+                    f"monitor.{name}, 0 for any, or monitor.live = false"
+                ) from error
         time.sleep(0.1)
 
 
-def viewer_program() -> Path:
-    """The viewer itself. The script of that name on the path would be a second process between us and it."""
-    spec = importlib.util.find_spec("rerun_cli")
-    if spec is None or spec.origin is None:
-        raise StoreError("rerun's viewer is not installed: install rerun-sdk, or set monitor.live = false")
-    return Path(spec.origin).parent / ("rerun.exe" if sys.platform == "win32" else "rerun")
-
-
-def _serve_viewer(port: int, grpc_url: str) -> subprocess.Popen[bytes]:
-    """The web viewer, on loopback only: rerun's own function would serve it to the whole network.
-
-    Given a url, the program serves nothing but the viewer itself. On "CI" it collects no usage data and writes
-    nothing to the home folder.
-    """
-    serve = [str(viewer_program()), "--serve-web", "--bind", _LOOPBACK, "--web-viewer-port", str(port), grpc_url]
-    return subprocess.Popen(
-        [sys.executable, "-I", str(Path(tied.__file__)), str(os.getpid()), *serve],
-        stdin=subprocess.DEVNULL,
-        env={**os.environ, "CI": "1", "RUST_LOG": "warn"},
-    )
+def _free_port(wanted: int) -> int:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((LOOPBACK, wanted))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,187 @@
+"""The viewer's page, on loopback only, and with no way out to the internet.
+
+rerun's own function serves to the whole network, and its page calls home, for usage data among other things. The
+page's files are found only inside the viewer program, so it is started for a moment when the first visitor comes.
+"""
+
+from __future__ import annotations
+
+import http.client
+import importlib.util
+import logging
+import os
+import socket
+import socketserver
+import subprocess
+import sys
+import threading
+import time
+import urllib.parse
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from launch_scripts.monitor import tied
+from swarm.errors import StoreError
+
+log = logging.getLogger(__name__)
+
+LOOPBACK = "127.0.0.1"
+_FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/sw.js")
+_READY_WITHIN_S = 20.0
+_HEADERS = {
+    # Whatever the page wants of other hosts (usage data, fonts, news of releases) it does not get.
+    "Content-Security-Policy": (
+        "default-src 'self' blob: data:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
+        f"style-src 'self' 'unsafe-inline'; worker-src 'self' blob:; connect-src 'self' http://{LOOPBACK}:*"
+    ),
+    "Cache-Control": "no-cache",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class _File(NamedTuple):
+    content_type: str
+    content: bytes
+
+
+class ViewerPage:
+    """Serves the page of the web viewer; a visit to `/` leads to the recording stream. Raises OSError if it cannot
+    listen on the port; 0 is any."""
+
+    def __init__(self, port: int, stream_url: str) -> None:
+        self._files: dict[str, _File] = {}
+        self._fetching = threading.Lock()
+        query = {"url": stream_url, "theme": "dark", "hide_welcome_screen": "1"}
+        self._entrance = "/?" + urllib.parse.urlencode(query)
+        self._server = _Server((LOOPBACK, port), _Handler)
+        self._server.page = self
+        threading.Thread(target=self._server.serve_forever, name="viewer-page", daemon=True).start()
+
+    @property
+    def url(self) -> str:
+        return f"http://{LOOPBACK}:{self._server.server_address[1]}/"
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+    def entrance(self, path: str) -> str | None:
+        """Where a visitor without a query is to be sent."""
+        return self._entrance if path == "/" else None
+
+    def file(self, path: str) -> _File | None:
+        """Raises OSError if the viewer cannot be started."""
+        if path not in _FILES:
+            return None
+        with self._fetching:
+            if not self._files:
+                self._files = _take_files()
+        return self._files.get(path)
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    page: ViewerPage
+
+    def server_bind(self) -> None:
+        socketserver.TCPServer.server_bind(self)  # HTTPServer's asks the name service who 127.0.0.1 is
+        self.server_name, self.server_port = LOOPBACK, int(self.server_address[1])
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = 60.0
+
+    def do_GET(self) -> None:
+        path, _, query = self.path.partition("?")
+        entrance = None if query else self.server.page.entrance(path)
+        if entrance is not None:
+            self.send_response(302)
+            self.send_header("Location", entrance)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
+        try:
+            file = self.server.page.file(path)
+        except (OSError, StoreError) as error:
+            log.warning("no viewer to serve: %s", error)
+            self.send_error(503, "the viewer program cannot be started; see the monitor's log")
+            return
+        if file is None:
+            self.send_error(404)
+            return
+        self.send_response(200)
+        for name, value in {**_HEADERS, "Content-Type": file.content_type}.items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(file.content)))
+        self.send_header("rerun-final-length", str(len(file.content)))
+        self.end_headers()
+        self.wfile.write(file.content)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        log.debug(format, *args)
+
+
+def viewer_program() -> Path:
+    """The viewer itself. The script of that name on the path would be a second process between us and it."""
+    spec = importlib.util.find_spec("rerun_cli")
+    if spec is None or spec.origin is None:
+        raise StoreError("rerun's viewer is not installed: install rerun-sdk, or set monitor.live = false")
+    return Path(spec.origin).parent / ("rerun.exe" if sys.platform == "win32" else "rerun")
+
+
+def _take_files() -> dict[str, _File]:
+    """The page's files, from a viewer program that lives only as long as that takes."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        port = probe.getsockname()[1]
+    # Given a stream to show, the program serves nothing but the page. On "CI" it collects no usage data and writes
+    # nothing to the home folder.
+    serve = [str(viewer_program()), "--serve-web", "--bind", LOOPBACK, "--web-viewer-port", str(port)]
+    viewer = subprocess.Popen(
+        [
+            sys.executable,
+            "-I",
+            str(Path(tied.__file__)),
+            str(os.getpid()),
+            *serve,
+            "rerun+http://127.0.0.1:1/proxy",
+        ],
+        stdin=subprocess.DEVNULL,
+        env={**os.environ, "CI": "1", "RUST_LOG": "warn"},
+    )
+    try:
+        _wait_for(port, viewer)
+        return {path: _fetch(port, path) for path in _FILES}
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+def _wait_for(port: int, viewer: subprocess.Popen[bytes]) -> None:
+    deadline_s = time.monotonic() + _READY_WITHIN_S
+    while True:
+        try:
+            socket.create_connection((LOOPBACK, port), timeout=1.0).close()
+            return
+        except OSError:
+            if viewer.poll() is not None or time.monotonic() > deadline_s:
+                raise
+        time.sleep(0.02)
+
+
+def _fetch(port: int, path: str) -> _File:
+    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=_READY_WITHIN_S)
+    try:
+        connection.request("GET", path)
+        reply = connection.getresponse()
+        content = reply.read()
+        if reply.status != 200:
+            raise OSError(f"the viewer answers {reply.status} for {path}")
+        return _File(reply.headers.get("Content-Type") or "text/html", content)
+    except http.client.HTTPException as error:
+        raise OSError(f"the viewer does not serve {path}: {error!r}") from error
+    finally:
+        connection.close()
