@@ -7,7 +7,7 @@ merging depends on neither order, grouping nor repetition.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -135,11 +135,13 @@ def resolve(sets: Iterable[MarkSet], now_ns: int = 0) -> Statements:
     return won
 
 
-def difference(old: MarkSet | None, new: MarkSet, others: Iterable[MarkSet], now_ns: int = 0) -> Statements:
+def difference(old: MarkSet | None, new: MarkSet, others: Sequence[MarkSet], now_ns: int = 0) -> Statements:
     """The cells whose winner changes in kind or pace when `new` replaces `old`, with their winners since.
 
     others  the sets of the other authors, in increasing order of author
     """
+    if not others and _small(new) and (old is None or _small(old)):
+        return _small_difference(old, new)
     base = _blank()
     larger = np.zeros(TILE_AREA, bool)  # the cell's winner so far is of an author that wins ties against us
     for each in others:
@@ -154,6 +156,44 @@ def difference(old: MarkSet | None, new: MarkSet, others: Iterable[MarkSet], now
     if new.kinds:
         after = _with(base, standing(new, now_ns), larger)
     return changes(before, after)
+
+
+def _small(of: MarkSet) -> bool:
+    return len(of.kinds) <= 64 and not of.untils_ns
+
+
+def _small_difference(old: MarkSet | None, new: MarkSet) -> Statements:
+    """As `difference`, of two short sets that nobody disputes and nothing of which ends: the everyday case.
+
+    Lists take a fifth of the time of arrays of 1024 here.
+    """
+    gone = {} if old is None else _listed(old)
+    changed: list[tuple[int, int, float, int]] = []
+    for cell, (kind, pace, stamp_ns) in _listed(new).items():
+        before = gone.pop(cell, _NOBODY)
+        if kind != before[0] or pace != before[1]:
+            changed.append((cell, kind, pace, stamp_ns))
+    if gone:
+        changed.extend((cell, *_NOBODY) for cell, said in gone.items() if said[0] != _CLEAR)
+        changed.sort()
+    if not changed:
+        return NOTHING_SAID
+    cells, kinds, paces, stamps_ns = zip(*changed, strict=True)
+    return Statements(
+        np.array(cells, np.uint16),
+        np.array(kinds, np.uint8),
+        np.array(paces, np.float32),
+        np.array(stamps_ns, np.int64),
+    )
+
+
+def _listed(of: MarkSet) -> dict[int, tuple[int, float, int]]:
+    """Cell -> (kind, pace, stamp)"""
+    paces: list[float] = column(of.paces, "<f4").tolist()
+    if max(of.kinds, default=_PACE) != _PACE:
+        paces = [0.0 if kind else pace for kind, pace in zip(of.kinds, paces, strict=True)]
+    said = zip(of.kinds, paces, memoryview(of.stamps_ns).cast("q").tolist(), strict=True)
+    return dict(zip(memoryview(of.cells).cast("H").tolist(), said, strict=True))
 
 
 def changes(before: Statements, after: Statements) -> Statements:
@@ -196,6 +236,7 @@ def _overlay(under: Statements, said: Statements, wins: NDArray[np.bool_]) -> No
 
 _CLEAR = int(MarkKind.CLEAR)
 _PACE = int(MarkKind.PACE)
+_NOBODY = (_CLEAR, 0.0, NO_STATEMENT)
 _NO_PACE = np.float32(0)
 _TILE_BITS = np.uint32(TILE_CELLS.bit_length() - 1)
 _TILE_MASK = np.uint32(TILE_CELLS - 1)

@@ -120,7 +120,7 @@ class MapReplica:
         changed = difference(
             sets.get(received.author),
             received,
-            [sets[name] for name in sorted(sets) if name != received.author] if sets else (),
+            [sets[name] for name in sorted(sets) if name != received.author and sets[name].kinds],
             self._now_ns,
         )
         sets[received.author] = received

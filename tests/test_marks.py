@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +10,8 @@ from map_strategies import GRID, mark_sets, naive_winners, set_of
 from shared_map.marks import (
     NO_STATEMENT,
     HybridClock,
+    changes,
+    difference,
     fault,
     grid_cells,
     region_tiles,
@@ -90,3 +93,26 @@ def test_whoever_knows_a_statement_from_the_future_can_overrule_it_at_once() -> 
 def test_a_stamp_beyond_time_is_no_mark() -> None:
     with pytest.raises(ValueError, match="below 2"):
         set_of("a", 0, 0, {0: (LETHAL, 0, STAMP_LIMIT_NS)})
+
+
+@given(mark_sets(), st.none() | mark_sets(), st.lists(mark_sets(), max_size=3))
+def test_the_difference_that_a_set_makes_is_that_between_before_and_after(
+    new: MarkSet, old: MarkSet | None, more: list[MarkSet]
+) -> None:
+    """Whether few or many say something, and by the short way as by the long."""
+    others = sorted({each.author: each for each in more if each.author != new.author}.values(), key=_author)
+    before = resolve(sorted([*others] + ([] if old is None else [_by(new.author, old)]), key=_author))
+    after = resolve(sorted([*others, new], key=_author))
+    changed = difference(None if old is None else _by(new.author, old), new, others)
+    assert changed.cells.tolist() == changes(before, after).cells.tolist()
+    assert changed.kinds.tolist() == after.kinds[changed.cells].tolist()
+    assert changed.paces.tolist() == after.paces[changed.cells].tolist()
+    assert changed.stamps_ns.tolist() == after.stamps_ns[changed.cells].tolist()
+
+
+def _author(of: MarkSet) -> str:
+    return of.author
+
+
+def _by(author: str, of: MarkSet) -> MarkSet:
+    return msgspec.structs.replace(of, author=author)

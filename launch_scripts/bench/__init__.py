@@ -1,0 +1,1 @@
+"""Measurements, run by hand and recorded with machine, size and command."""
