@@ -117,7 +117,7 @@ def flood_single(weight, cost, stride, root, diagonals, corners, width, ring, sh
     width  of a bucket, s: below the smallest weight, so that nothing in a bucket leads back into it
     ring   buckets in the circular queue, a power of two; ring * width exceeds the largest weight by two widths
     shift  a chunk of the queue holds 2**shift cells
-    Returns cells settled, or TOO_FINE.
+    Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
     """
     s = np.uint64(stride)
     mask = np.uint64(ring - 1)
@@ -148,11 +148,9 @@ def flood_single(weight, cost, stride, root, diagonals, corners, width, ring, sh
     count = _ONE
     current = 0
     waiting = 0
-    settled = 0
     while True:
         # Cells touched from the last bucket join the queue: their cost is final.
         n = np.int64(count)
-        settled += n
         waiting += n
         if spares < (n >> shift) + min(n, ring) + 2:
             more = chunks + (n >> shift) + min(n, ring) + 2
@@ -184,7 +182,7 @@ def flood_single(weight, cost, stride, root, diagonals, corners, width, ring, sh
             tail[b] = t
         if waiting == 0:
             close_costs(cost)
-            return settled
+            return current
         if current > 1 << 20:
             return TOO_FINE
         current += 1
@@ -301,10 +299,8 @@ def flood_octile(weight, cost, stride, root, corners, width, ring, shift):
     count = _ONE
     current = 0
     waiting = 0
-    settled = 0
     while True:
         n = np.int64(count)
-        settled += n
         waiting += 2 * n
         need_chunks = 2 * ((n >> shift) + min(n, ring) + 2)
         if spares < need_chunks:
@@ -350,7 +346,7 @@ def flood_octile(weight, cost, stride, root, corners, width, ring, shift):
             tail[b] = t
         if waiting == 0:
             close_costs(cost)
-            return settled
+            return current
         if current > 1 << 20:
             return TOO_FINE
         current += 1
@@ -557,23 +553,23 @@ def step_offsets(stride):
 
 @njit(cache=True, nogil=True)
 def flood_wide(weight, cost, stride, root, rule, corners, parent):
-    """First-touch flood with a heap and float64 keys, for weights of any ratio. Sets parents too: where one weight
-    drowns in the rounding of another, costs cannot tell them. Whole arrays `cost` and `parent` are written."""
+    """First-touch flood with a heap, for weights of any ratio. Sets parents too: where one weight drowns in the
+    rounding of another, costs cannot tell them. Whole arrays `cost` and `parent` are written. Returns the largest
+    exit key, which no cost exceeds."""
     offsets = step_offsets(stride)
-    exact = np.full(weight.size, np.inf)
     for i in range(weight.size):
         parent[i] = NONE
+        cost[i] = INF
     capacity = 1024
-    keys = np.empty(capacity, np.float64)
+    keys = np.empty(capacity, np.float32)
     items = np.empty(capacity, np.int64)
-    exact[root] = 0.0
+    cost[root] = np.float32(0.0)
     keys[0] = weight[root]
     items[0] = root * 2
     size = 1
     if rule == RULE_OCTILE:
-        _rise(keys, items, 1, weight[root] * SQRT2_EXACT, root * 2 + 1)
+        _rise(keys, items, 1, weight[root] * SQRT2, root * 2 + 1)
         size = 2
-    settled = 1
     while size > 0:
         key = keys[0]
         u = items[0] >> 1
@@ -581,7 +577,7 @@ def flood_wide(weight, cost, stride, root, rule, corners, parent):
         size -= 1
         _sink(keys, items, size)
         if size + 16 > capacity:
-            new_keys = np.empty(2 * capacity, np.float64)
+            new_keys = np.empty(2 * capacity, np.float32)
             new_items = np.empty(2 * capacity, np.int64)
             new_keys[:size] = keys[:size]
             new_items[:size] = items[:size]
@@ -592,25 +588,22 @@ def flood_wide(weight, cost, stride, root, rule, corners, parent):
         every = 1 if rule == RULE_PAPER else 2
         for k in range(first, 8, every):
             v = u + offsets[k]
-            if exact[v] < np.inf or not weight[v] < INF:
+            if cost[v] < INF or not weight[v] < INF:
                 continue
             if k & 1 and not corners:
                 a = weight[u + offsets[k - 1]]
                 b = weight[u + offsets[(k + 1) & 7]]
                 if not max(a, b) < INF:
                     continue
-            exact[v] = key
+            cost[v] = key
             parent[v] = (k + 4) & 7
-            settled += 1
-            w = np.float64(weight[v])
+            w = weight[v]
             _rise(keys, items, size, key + w, v * 2)
             size += 1
             if rule == RULE_OCTILE:
-                _rise(keys, items, size, key + w * SQRT2_EXACT, v * 2 + 1)
+                _rise(keys, items, size, key + w * SQRT2, v * 2 + 1)
                 size += 1
-    for i in range(weight.size):
-        cost[i] = exact[i]
-    return settled
+    return key
 
 
 @njit(cache=True, nogil=True)
@@ -640,7 +633,8 @@ def _offer(weight, cost, offsets, rule, corners, v):
 def _wave(weight, cost, offsets, rule, corners, root, candidates, count, limit):
     """Let better offers spread from `candidates` until no cell is offered less than it costs.
 
-    Returns (cells popped, or -1 beyond `limit`; the cells whose cost fell, with repetitions; how many).
+    Returns (cells popped, or -1 beyond `limit`; the largest cost popped; the cells whose cost fell, with
+    repetitions; how many).
     """
     capacity = 64 + 2 * count
     keys = np.empty(capacity, np.float32)
@@ -660,6 +654,7 @@ def _wave(weight, cost, offsets, rule, corners, root, candidates, count, limit):
             fallen[falls] = v
             falls += 1
     popped = 0
+    key = np.float32(0.0)
     while size > 0:
         key = keys[0]
         u = items[0]
@@ -669,7 +664,7 @@ def _wave(weight, cost, offsets, rule, corners, root, candidates, count, limit):
             continue
         popped += 1
         if popped > limit:
-            return -1, fallen, falls
+            return -1, key, fallen, falls
         if max(size, falls) + 16 > capacity:
             new_keys = np.empty(2 * capacity, np.float32)
             new_items = np.empty(2 * capacity, np.int64)
@@ -696,7 +691,7 @@ def _wave(weight, cost, offsets, rule, corners, root, candidates, count, limit):
             size += 1
             fallen[falls] = v
             falls += 1
-    return popped, fallen, falls
+    return popped, key, fallen, falls
 
 
 @njit(cache=True, nogil=True)
@@ -723,7 +718,7 @@ def lower(weight, cost, stride, rule, corners, changed, before, limit):
     offsets = step_offsets(stride)
     candidates = np.empty(9 * changed.size, np.int64)
     count = _eased(weight, offsets, changed, before, candidates, 0)
-    popped, _, _ = _wave(weight, cost, offsets, rule, corners, -1, candidates, count, limit)
+    popped, _, _, _ = _wave(weight, cost, offsets, rule, corners, -1, candidates, count, limit)
     return popped
 
 
@@ -734,8 +729,8 @@ def repair(weight, cost, parent, stride, rule, corners, root, changed, before, l
     changed  int64    padded cells, without repetition; before: float32, their weights when the tree was right
     state    uint8    scratch, zero; zero again afterwards
     Cells whose way led through a dearer cell lose their cost and find a new one; the rest only improves. An exact
-    tree is exact afterwards, equal to one grown from scratch. Returns cells visited, or -1 if more than `limit`
-    are concerned: then the tree is of no use any more and must be grown.
+    tree is exact afterwards, equal to one grown from scratch. Returns (cells visited, the largest new cost); -1
+    cells if more than `limit` are concerned: then the tree is of no use any more and must be grown.
     """
     offsets = step_offsets(stride)
     capacity = 64 + 12 * changed.size
@@ -780,15 +775,15 @@ def repair(weight, cost, parent, stride, rule, corners, root, changed, before, l
     for i in range(count):
         state[affected[i]] = 0
     if count > limit:
-        return -1
+        return -1, INF
     for i in range(count):
         cost[affected[i]] = INF
     candidates = np.empty(count + 9 * changed.size, np.int64)
     candidates[:count] = affected[:count]
     total = _eased(weight, offsets, changed, before, candidates, count)
-    popped, fallen, falls = _wave(weight, cost, offsets, rule, corners, root, candidates, total, limit)
+    popped, highest, fallen, falls = _wave(weight, cost, offsets, rule, corners, root, candidates, total, limit)
     if popped < 0:
-        return -1
+        return -1, INF
     # Whoever stands beside a cell that changed may have a better neighbour now.
     for part in range(3):
         many = (changed.size, count, falls)[part]
@@ -810,7 +805,7 @@ def repair(weight, cost, parent, stride, rule, corners, root, changed, before, l
         state[affected[i]] = 0
     for i in range(falls):
         state[fallen[i]] = 0
-    return popped + count
+    return popped + count, highest
 
 
 @njit(cache=True, nogil=True)

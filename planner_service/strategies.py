@@ -94,7 +94,7 @@ class GrownTree:
     cost: Floats
     parent: NDArray[np.uint8]
     weight: Floats
-    fine: bool
+    reach: float
     offered: NDArray[np.uint8] | None
     stride: int
 
@@ -177,10 +177,10 @@ class TargetTree:
             ground.load(pace_snapshot)
             cost = np.full(ground.size, np.inf, np.float32)
             parent = np.full(ground.size, kernels.NONE, np.uint8)
-            fine = True
+            reach = 0.0
             if grid.inside(*divmod(target_cell, grid.cols)) and ground.passable(target_cell):
                 root = ground.pad(target_cell)
-                _, fine = flood(
+                reach = flood(
                     ground.weight,
                     ground.low,
                     ground.high,
@@ -191,7 +191,7 @@ class TargetTree:
                     cost,
                     parent,
                 )
-            return GrownTree(target_cell, map_version, cost, parent, ground.weight, fine, offered, ground.stride)
+            return GrownTree(target_cell, map_version, cost, parent, ground.weight, reach, offered, ground.stride)
 
         return job
 
@@ -221,7 +221,7 @@ class TargetTree:
         self._moves = 0
         if grown.cost[self._ground.pad(grown.target_cell)] != 0.0:
             return self._grow_full(target_cell)
-        tree.take(grown.target_cell, grown.cost, grown.parent, grown.fine)
+        tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
         self._potential = grown.cost.copy()
         self._stale = False
         moved = target_cell != tree.root
@@ -384,12 +384,12 @@ class TargetTree:
         return self.ready
 
     def _grow_full(self, target_cell: int) -> Update:
-        cells = self._tree.grow(target_cell)
+        self._tree.grow(target_cell)
         self._stale = False
         self._moves = 0
         if self._windows:
             self._potential = self._tree.cost.copy()
-        return Update("full", self._grid.window, cells)
+        return Update("full", self._grid.window, self._grid.cells)
 
     def _mend(self, changes: Changes | None) -> Update | None:
         """Repair the tree; None if it must be grown instead."""
@@ -401,7 +401,7 @@ class TargetTree:
         if not tree.fine or not self._ground.weight[self._ground.pad(tree.root)] < np.inf:
             return None
         visited = tree.repair(changes, self._grid.cells // REPAIR_SHARE + 1024)
-        if visited < 0:
+        if visited < 0 or not tree.fine:
             return None
         rows = changes.cells // self._ground.stride - 1
         cols = changes.cells % self._ground.stride - 1

@@ -197,31 +197,31 @@ def flood(
     corners: bool,
     cost: Floats,
     parent: NDArray[np.uint8] | None,
-) -> tuple[int, bool]:
-    """Grow the exact tree of a padded root. Returns (cells settled, whether costs tell every cell from its
-    parent)."""
+) -> float:
+    """Grow the exact tree of a padded root. Returns a bound that no cost exceeds."""
     longest = high * (kernels.SQRT2_EXACT if rule == kernels.RULE_OCTILE else 1.0)
     if longest <= MAX_RATIO * low:
         width = np.float32(low * 0.98)
         ring = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
         shift = 6 if ring <= 64 else 4
         if rule == kernels.RULE_OCTILE:
-            settled = kernels.flood_octile(weight, cost, stride, root, corners, width, ring, shift)
+            last = kernels.flood_octile(weight, cost, stride, root, corners, width, ring, shift)
         else:
             diagonals = rule == kernels.RULE_PAPER
-            settled = kernels.flood_single(weight, cost, stride, root, diagonals, corners, width, ring, shift)
-        if settled != kernels.TOO_FINE:
+            last = kernels.flood_single(weight, cost, stride, root, diagonals, corners, width, ring, shift)
+        if last != kernels.TOO_FINE:
             if parent is not None:
                 rows = weight.size // stride - 2
                 kernels.point_to_parents(
                     weight, cost, stride, rule, corners, root, (0, 0, rows, stride - 2), parent
                 )
-            return int(settled), True
-    if parent is None:
-        parent = np.empty(weight.size, np.uint8)
-    settled = kernels.flood_wide(weight, cost, stride, root, rule, corners, parent)
-    finite = cost[np.isfinite(cost)]
-    return int(settled), float(finite.max()) <= FINE * low
+            return float((last + 1) * width)
+    touched = np.empty(weight.size, np.uint8) if parent is None else parent
+    reach = float(kernels.flood_wide(weight, cost, stride, root, rule, corners, touched))
+    if parent is not None and reach <= FINE * low:
+        box = (0, 0, weight.size // stride - 2, stride - 2)
+        kernels.point_to_parents(weight, cost, stride, rule, corners, root, box, parent)
+    return reach
 
 
 class CostToGoTree:
@@ -230,7 +230,7 @@ class CostToGoTree:
     root    the target's cell
     offset  s; a cell's cost-to-go is at most its stored cost plus this
     exact   whether cost-to-go is exact on the ground as it is now (then offset is 0)
-    fine    whether float32 tells every cost from its parent's: if not, only whole growths keep the tree right
+    reach   s; no stored cost exceeds it
     """
 
     def __init__(self, ground: Ground) -> None:
@@ -240,13 +240,13 @@ class CostToGoTree:
         self.root = -1
         self.offset = 0.0
         self.exact = False
-        self.fine = True
+        self.reach = 0.0
         self._scratch: NDArray[np.uint8] | None = None
 
-    def grow(self, root: int) -> int:
-        """Grow the whole tree of a passable cell, exactly. Returns cells settled."""
+    def grow(self, root: int) -> None:
+        """Grow the whole tree of a passable cell, exactly."""
         ground = self.ground
-        settled, self.fine = flood(
+        self.reach = flood(
             ground.weight,
             ground.low,
             ground.high,
@@ -260,16 +260,15 @@ class CostToGoTree:
         self.root = root
         self.offset = 0.0
         self.exact = True
-        return settled
 
-    def take(self, root: int, cost: Floats, parent: NDArray[np.uint8], fine: bool) -> None:
+    def take(self, root: int, cost: Floats, parent: NDArray[np.uint8], reach: float) -> None:
         """Become a tree that somebody else grew, exactly, on the ground as it is now."""
         self.cost = cost
         self.parent = parent
         self.root = root
         self.offset = 0.0
         self.exact = True
-        self.fine = fine
+        self.reach = reach
 
     def move(self, root: int, window: Window) -> int:
         """Lead to a new root, by growing only a window that holds it and the old root.
@@ -329,7 +328,7 @@ class CostToGoTree:
         if self._scratch is None:
             self._scratch = np.zeros(self.ground.size, np.uint8)
         ground = self.ground
-        visited = kernels.repair(
+        visited, highest = kernels.repair(
             ground.weight,
             self.cost,
             self.parent,
@@ -342,6 +341,7 @@ class CostToGoTree:
             limit,
             self._scratch,
         )
+        self.reach = max(self.reach, float(highest))
         return int(visited)
 
     def relabel(self) -> None:
@@ -349,6 +349,11 @@ class CostToGoTree:
         ground = self.ground
         kernels.relabel(ground.weight, self.parent, ground.stride, ground.rule, ground.pad(self.root), self.cost)
         self.offset = 0.0
+
+    @property
+    def fine(self) -> bool:
+        """Whether float32 tells every cost from its parent's. If not, only whole growths keep the tree right."""
+        return self.reach <= FINE * self.ground.low
 
     @property
     def precise(self) -> bool:

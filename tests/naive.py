@@ -40,6 +40,29 @@ def steps(
     return found
 
 
+def graph_into(
+    pace: NDArray[np.float32], neighbours: int = 8, edge: str = "octile", corner_cutting: bool = False
+) -> csr_matrix:
+    """The graph of all steps with every edge turned round, so that a search from the target finds the ways to
+    it."""
+    rows, cols = pace.shape
+    cells = np.arange(pace.size).reshape(rows, cols)
+    free = np.isfinite(pace)
+    into, out, costs = [], [], []
+    for direction in range(0, 8, 2 if neighbours == 4 else 1):
+        dr, dc = STEP_ROW[direction], STEP_COL[direction]
+        here = np.s_[max(0, -dr) : rows - max(0, dr), max(0, -dc) : cols - max(0, dc)]
+        there = np.s_[max(0, dr) : rows + min(0, dr), max(0, dc) : cols + min(0, dc)]
+        legal = free[here] & free[there]
+        if direction % 2 and not corner_cutting:
+            legal &= free[here[0], there[1]] & free[there[0], here[1]]
+        out.append(cells[here][legal])
+        into.append(cells[there][legal])
+        costs.append(pace[there][legal].astype(np.float64) * step_length(direction, edge))
+    shape = (pace.size, pace.size)
+    return csr_matrix((np.concatenate(costs), (np.concatenate(into), np.concatenate(out))), shape=shape)
+
+
 def cost_to_go(
     pace: NDArray[np.float32],
     target: int,
@@ -48,14 +71,7 @@ def cost_to_go(
     corner_cutting: bool = False,
 ) -> NDArray[np.float64]:
     """Cheapest cost from every cell to the target on cells of one metre, by scipy on the reversed graph."""
-    edges = steps(pace, neighbours, edge, corner_cutting)
-    if not edges:
-        alone = np.full(pace.size, np.inf)
-        alone[target] = 0.0
-        return alone.reshape(pace.shape)
-    u, v, cost = (np.array(column) for column in zip(*edges, strict=True))
-    graph = csr_matrix((cost, (v.astype(int), u.astype(int))), shape=(pace.size, pace.size))
-    found: NDArray[np.float64] = dijkstra(graph, indices=target)
+    found: NDArray[np.float64] = dijkstra(graph_into(pace, neighbours, edge, corner_cutting), indices=target)
     return found.reshape(pace.shape)
 
 
@@ -77,34 +93,27 @@ def cost_to_go_by_hand(pace: NDArray[np.float32], target: int, **rules: object) 
     return best.reshape(pace.shape)
 
 
-def driven(pace: NDArray[np.float32], start: int, directions: bytes, edge: str = "octile") -> float:
-    """What a route costs, on cells of one metre."""
-    row, col = divmod(start, pace.shape[1])
-    total = 0.0
-    for direction in directions:
-        row, col = row + STEP_ROW[direction], col + STEP_COL[direction]
-        total += float(pace[row, col]) * step_length(direction, edge)
-    return total
-
-
-def is_legal(
+def follow(
     pace: NDArray[np.float32],
     start: int,
     directions: bytes,
     neighbours: int = 8,
+    edge: str = "octile",
     corner_cutting: bool = False,
-) -> bool:
-    """Whether a route enters passable cells only and squeezes past none."""
+) -> tuple[int, float] | None:
+    """(last cell, cost) of a route on cells of one metre; None if it breaks a rule on the way."""
     rows, cols = pace.shape
     row, col = divmod(start, cols)
+    total = 0.0
     for direction in directions:
         r, c = row + STEP_ROW[direction], col + STEP_COL[direction]
-        if not (0 <= r < rows and 0 <= c < cols) or not np.isfinite(pace[r, c]):
-            return False
+        if not (0 <= r < rows and 0 <= c < cols) or pace[r, c] == math.inf:
+            return None
         if direction % 2:
             if neighbours == 4:
-                return False
-            if not corner_cutting and not (np.isfinite(pace[row, c]) and np.isfinite(pace[r, col])):
-                return False
+                return None
+            if not corner_cutting and (pace[row, c] == math.inf or pace[r, col] == math.inf):
+                return None
+        total += float(pace[r, c]) * step_length(direction, edge)
         row, col = r, c
-    return True
+    return row * cols + col, total
