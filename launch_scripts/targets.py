@@ -17,17 +17,22 @@ from launch_scripts.referee import Collision, LethalEntry, Referee
 from launch_scripts.walks import Budget, Ground, Walker, far_place, slowness_of
 from shared_map.layers import inflate, inflation_halves
 from shared_map.terrain import Terrain
-from swarm.bus import Bus, Event, Heard, Post
+from swarm.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.membership import Member
-from swarm.messages import NO_TARGET, Fleet, PlannerStatus, TargetPose, VehicleState, column
+from swarm.messages import NO_TARGET, CostReply, CostRequest, Fleet, PlannerStatus, TargetPose, VehicleState, column
 from swarm.role import RoleSetup
-from swarm.topics import FLEET, POSE, STATUS
+from swarm.topics import COST, FLEET, POSE, STATUS
 
-LISTEN_NS = NS_PER_S * 3 // 4
-"""Planners tell twice a second where their targets are: a restarted driver listens before it makes places up."""
+LISTEN_NS = NS_PER_S
+"""A starting driver asks the planners where their targets are before it makes places up. So long it waits for a
+planner to turn up."""
+PATIENCE_NS = 5 * NS_PER_S
+"""So long it waits for one that is alive to answer."""
+_ASK_NS = NS_PER_S // 2
+_ASK = "where"
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
@@ -55,6 +60,8 @@ class _Target:
     x_m: float
     y_m: float
     placed: bool = False
+    unheard_of: bool = False
+    planner_up: bool = False
     seq: int = 0
     captures: int = 0
     jumps: int = 0
@@ -64,7 +71,7 @@ class _Target:
 class TargetWorld:
     """Targets and referee. Poses, reports and ticks in; poses, captures and broken laws out.
 
-    An incarnation that starts while others run goes on where planners last saw the targets. A capture counts once:
+    An incarnation that starts while planners run goes on where they last saw the targets. A capture counts once:
     a target that jumps is out of reach for a cool-down, one that stays must first have been alone for another.
     """
 
@@ -100,14 +107,28 @@ class TargetWorld:
         walker = Walker(id, config.walk, slowness_of(config, scenario.cost), chance, cell)
         return _Target(config, walker, *self._grid.centre_m(cell))
 
-    def hear_status(self, status: PlannerStatus) -> None:
-        """Where a planner last saw a target that we have not yet placed ourselves."""
-        target, cell = self._targets.get(status.target), status.target_cell
-        if target is None or target.placed or cell is None or target.config.walk == "external":
+    def hear_planner(self, id: str, cell: int | None) -> None:
+        """Where a planner last saw a target that we have not placed ourselves; None if it knows no more than we."""
+        target = self._targets.get(id)
+        if target is None or target.placed or target.config.walk == "external":
             return
-        if 0 <= cell < self._grid.cells and not self._ground.lethal(cell):
+        if cell is not None and 0 <= cell < self._grid.cells and not self._ground.lethal(cell):
             target.walker.put(cell)
             target.placed = True
+        target.unheard_of = not target.placed
+
+    def planner_up(self, id: str, up: bool) -> None:
+        """The planner of a target has appeared or gone."""
+        target = self._targets.get(id)
+        if target is not None:
+            target.planner_up = up
+
+    @property
+    def listening(self) -> bool:
+        """Whether any planner may still know something that we want to know."""
+        return any(
+            not t.placed and not t.unheard_of and t.config.walk != "external" for t in self._targets.values()
+        )
 
     def hear_pose(self, pose: TargetPose) -> None:
         """Where somebody else says that an external target is."""
@@ -130,12 +151,13 @@ class TargetWorld:
             self._started_ns = self._ticked_ns = now_ns
         elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * self._time_scale
         self._ticked_ns = now_ns
-        listening = now_ns - self._started_ns < LISTEN_NS
+        waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells
         budget = Budget()
         actions: list[Action] = []
         for id, target in self._targets.items():
-            if target.config.walk == "external" or (listening and not target.placed):
+            patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
+            if target.config.walk == "external" or (waited_ns < patience_ns and not target.placed):
                 continue
             if target.placed:
                 target.walker.advance(self._ground, elapsed_s, vehicles, budget)
@@ -212,6 +234,7 @@ class TargetsService:
         self._scenario = setup.scenario
         self._bus = bus
         self._post = post
+        self._ask_due_ns = 0
         self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation)
         self.counters = self._member.counters
         for name in ("captures", "collisions", "lethal_entries", "poses"):
@@ -221,6 +244,7 @@ class TargetsService:
         self._member.join()
         self._bus.subscribe(FLEET, self._post)
         self._bus.subscribe(STATUS, self._post)
+        self._bus.watch_alive(self._post, role="planner")
         for target in self._scenario.targets:
             if target.walk == "external":
                 for id in ids_of(target):
@@ -233,13 +257,22 @@ class TargetsService:
             case Heard(message=Fleet() as fleet):
                 self._perform(self._world.hear_fleet(fleet, now_ns), now_ns)
             case Heard(message=PlannerStatus() as status):
-                self._world.hear_status(status)
+                self._world.hear_planner(status.target, status.target_cell)
+            case Replied(message=CostReply() as reply):
+                self._world.hear_planner(reply.target, reply.target_cell)
+            case Appeared(peer):
+                self._world.planner_up(peer.id, True)
+            case Disappeared(peer):
+                self._world.planner_up(peer.id, False)
             case Heard(message=TargetPose() as pose):
                 self._world.hear_pose(pose)
             case _:
                 pass
 
     def tick(self, now_ns: int) -> None:
+        if self._world.listening and now_ns >= self._ask_due_ns:
+            self._ask_due_ns = now_ns + _ASK_NS
+            self._bus.ask(COST, CostRequest(), self._post, tag=_ASK)
         self._perform(self._world.tick(now_ns), now_ns)
         self._member.tick(now_ns)
 

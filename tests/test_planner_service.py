@@ -12,6 +12,7 @@ from memory_world import MemoryWorld
 from naive import cost_to_go
 from numpy.typing import NDArray
 
+from launch_scripts.targets import TargetsService
 from planner_service.service import PlannerService
 from planner_service.warm import warm_up
 from shared_map.feed import MapFeed
@@ -371,6 +372,28 @@ def test_a_planner_killed_under_way_serves_again_within_three_seconds_with_all_m
     reply = swarm.ear.routes(GRID.cell(20, 10))
     assert reply.incarnation == 2
     assert GRID.cell(ROWS - 1, 25) in walk(GRID, reply.routes[0].start, reply.routes[0].directions)
+
+
+def test_a_driver_killed_under_way_goes_on_where_the_planners_saw_its_targets() -> None:
+    swarm = Swarm(targets=3)
+
+    def drive(incarnation: int) -> Node:
+        node = Node(swarm.world, f"targets{incarnation}")
+        setup = RoleSetup(swarm.scenario, "r1", "targets", "0", incarnation, 0)
+        return node.run(TargetsService(setup, swarm.terrain, swarm.pace, node.bus, node.post))
+
+    first = drive(1)
+    swarm.world.run_ms(4000)
+    first.kill()
+    swarm.world.run_ms(200)
+    poses: list[TargetPose] = []
+    swarm.ear.bus.subscribe(POSE, lambda event: poses.append(event.message))  # type: ignore[union-attr,arg-type]
+    before = {reply.target: reply.target_cell for reply in swarm.ear.ask(COST, CostRequest())}
+    drive(2)
+    swarm.world.run_ms(300)
+    after = {pose.target: pose.cell for pose in reversed(poses)}
+    assert len(before) == len(after) == 3
+    assert all(GRID.distance_cells(before[id], after[id]) <= 1 for id in before)
 
 
 def test_after_a_restart_followers_are_found_by_their_reports() -> None:

@@ -12,7 +12,7 @@ from memory_world import MemoryWorld
 from numpy.typing import NDArray
 
 from launch_scripts.referee import Collision, LethalEntry, Referee
-from launch_scripts.targets import LISTEN_NS, Action, Captured, Publish, TargetsService, TargetWorld
+from launch_scripts.targets import LISTEN_NS, PATIENCE_NS, Action, Captured, Publish, TargetsService, TargetWorld
 from launch_scripts.walks import Budget, Ground, Walk, Walker, far_place, slowness_of
 from shared_map.terrain import terrain_of_pace
 from swarm.bus import Event, Heard
@@ -24,7 +24,6 @@ from swarm.messages import (
     NO_TARGET,
     Fleet,
     Note,
-    PlannerStatus,
     Stats,
     TargetPose,
     VehicleState,
@@ -364,7 +363,8 @@ def test_a_target_moves_smoothly_at_its_speed_times_the_time_scale(walk: Walk) -
 def test_the_same_seed_gives_the_same_walk_and_another_another() -> None:
     def walk(seed: int) -> list[int]:
         world = World(TargetConfig(), time_scale=20.0, seed=seed)
-        return [world.poses(world.tick(10))["t"].cell for _ in range(30)][1:]
+        world.settle()
+        return [world.poses(world.tick(10))["t"].cell for _ in range(30)]
 
     assert walk(1) == walk(1) != walk(2)
 
@@ -432,33 +432,41 @@ def test_a_target_that_stays_is_caught_once_per_approach() -> None:
     assert (pose.captures, pose.jumps, pose.cell) == (2, 0, world.grid.cell(20, 25))
 
 
-def status(target: str, cell: int | None) -> PlannerStatus:
-    return PlannerStatus(
-        target=target, incarnation=1, stamp_ns=0, strategy="auto", target_cell=cell, map_version=0, tree_age_ms=0,
-        window=[], growths=0, window_growths=0, growth_ms=0, routes_served=0, following=0,
-    )  # fmt: skip
-
-
 def test_a_restarted_driver_goes_on_where_planners_last_saw_the_targets() -> None:
     world = World(TargetConfig(count=2), still(name="s"), incarnation=2)
     assert world.poses() == {}
     seen = world.grid.cell(3, 4)
-    world.world.hear_status(status("t0", seen))
+    world.world.hear_planner("t0", seen)
     assert world.poses()["t0"].cell == seen
     assert sorted(world.poses()) == ["t0"]
-    world.world.hear_status(status("t0", world.grid.cell(30, 30)))
+    world.world.hear_planner("t0", world.grid.cell(30, 30))
     assert world.grid.distance_cells(world.poses()["t0"].cell, seen) <= 1
     world.settle()
     assert sorted(world.poses()) == ["s", "t0", "t1"]
 
 
+def test_a_driver_waits_longer_for_a_planner_that_is_alive_but_silent() -> None:
+    world = World(TargetConfig(count=3))
+    world.world.planner_up("t0", True)
+    world.world.planner_up("t1", True)
+    world.world.hear_planner("t1", None)
+    assert list(world.poses()) == ["t1"]
+    world.settle()
+    assert list(world.poses()) == ["t1", "t2"]
+    world.tick((PATIENCE_NS - LISTEN_NS) // TICK)
+    assert list(world.poses()) == ["t0", "t1", "t2"]
+
+
 def test_nonsense_from_a_planner_places_nobody() -> None:
     pace = flat()
     pace[0, 0] = np.inf
-    world = World(TargetConfig(), pace=pace)
-    for each in (status("t", None), status("t", 0), status("t", 2**31), status("x", 5)):
-        world.world.hear_status(each)
-    assert world.poses() == {}
+    home = World(TargetConfig(), pace=pace).poses
+    for cell in (0, -1, 2**31):
+        world = World(TargetConfig(), pace=pace)
+        world.world.hear_planner("t", cell)
+        world.world.hear_planner("x", 5)
+        assert world.poses()["t"].cell not in (0, 5)
+    assert home() == {}
 
 
 def test_an_external_target_is_not_driven_but_can_be_caught() -> None:
@@ -534,7 +542,7 @@ def test_the_service_tells_poses_captures_and_broken_laws() -> None:
     ear = Ear(world)
     Driven(world, pace, scenario(still()))
     world.run_ms(2000)
-    assert len(ear.of(TargetPose)) == pytest.approx(13, abs=1)
+    assert len(ear.of(TargetPose)) == pytest.approx(10, abs=1)
     cell = 20 * 50 + 25
     for n in range(4):
         for author, ids in (("a0.1", ["v", "x"]), ("a1.1", ["w"])):
