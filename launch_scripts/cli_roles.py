@@ -5,9 +5,13 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from swarm.config import NetworkConfig
+    from swarm.messages import RunInfo
 
 app = typer.Typer()
 
@@ -139,6 +143,7 @@ def _run(
     from launch_scripts import options
     from launch_scripts.child import load_entry, log_to
     from launch_scripts.processes import ENTRIES, processes_of
+    from launch_scripts.watcher import check_vacant
     from swarm.errors import ConfigError, StoreError
     from swarm.role import RoleSetup
 
@@ -156,8 +161,11 @@ def _run(
     if id not in ids:
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
     log_to(None)
-    if run_id is None:
-        run_id = options.new_run_id() if role == "router" else _found_run_id(scenario)
+    if role != "router":
+        found = _found(scenario.network)
+        check_vacant(found, role, id)
+        run_id = run_id or (found[0].run_id if found else None)
+    run_id = run_id or options.new_run_id()
     run_dir = runs / run_id
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
@@ -169,14 +177,10 @@ def _run(
     load_entry(ENTRIES[role])(setup, None)
 
 
-def _found_run_id(scenario: object) -> str:
-    """The run that the namespace belongs to; a new one if nobody is there yet."""
-    from launch_scripts.options import new_run_id
+def _found(network: NetworkConfig) -> list[RunInfo]:
+    """Who is in the namespace."""
     from launch_scripts.watcher import ask_run
-    from swarm.config import Scenario
     from swarm.zenoh_bus import open_bus
 
-    assert isinstance(scenario, Scenario)
-    with open_bus(scenario.network) as bus:
-        found = ask_run(bus)
-    return found[0].run_id if found else new_run_id()
+    with open_bus(network) as bus:
+        return ask_run(bus)

@@ -18,7 +18,7 @@ from launch_scripts.processes import ROLES, ProcessSpec, processes_of
 from launch_scripts.record import Recorder
 from launch_scripts.report import write_report
 from launch_scripts.screen import Screen
-from launch_scripts.watcher import Watcher, ask_run
+from launch_scripts.watcher import Watcher, ask_run, check_vacant
 from shared_map.terrain import prepare
 from swarm.bus import Bus
 from swarm.clock import MonotonicClock
@@ -128,7 +128,9 @@ class _Run:
             if not self._options.joins and "router" in self._options.roles:
                 self._swarm.start("router")
                 self._wait("waiting for the router to listen", self._router_listens, _LISTEN_WITHIN_S)
-            log.info("the router listens")
+                log.info("the router listens")
+            if self._stop_asked:
+                return 0 if not self._swarm.stop() else 1
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
                 self._say_begin()
@@ -182,12 +184,16 @@ class _Run:
 
     def _join(self, bus: Bus) -> None:
         """Refuse to share a namespace with another run; a part of a swarm belongs to the run that it finds."""
-        found = [info for info in ask_run(bus) if info.run_id != self._run_id] if self._options.joins else []
+        if not self._options.joins:
+            return
+        found = ask_run(bus)
         if found and self._options.run_id is None and not set(ROLES[1:]) <= set(self._options.roles):
             self._run_id = found[0].run_id
         mine = self._setup_of(ProcessSpec("launcher", "0", "")).info(self._terrain.grid, self._terrain.digest)
         for other in found:
             check_same_run(mine, other)
+        for running in self._swarm.running:
+            check_vacant(found, running.spec.role, running.spec.id)
 
     def _watch(self, watcher: Watcher) -> float:
         """Until the time is over or somebody asks for the end. Returns how long the run lasted."""

@@ -7,6 +7,7 @@ import time
 from launch_scripts.record import RECORDED_TOPICS, Recorder
 from swarm.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
+from swarm.errors import RunMismatchError
 from swarm.messages import Followed, Note, Nothing, PlannerStatus, RunInfo
 from swarm.process import Inbox
 from swarm.topics import RUN
@@ -90,3 +91,10 @@ def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S) -> list[RunInfo]:
             case AskEnded():
                 break
     return found
+
+
+def check_vacant(found: list[RunInfo], role: str, id: str) -> None:
+    """Raises RunMismatchError if that process is in the namespace already: two would move the same vehicles."""
+    for info in found:
+        if (info.role, info.id) == (role, id):
+            raise RunMismatchError(f"{role} {id} takes part in run {info.run_id} already; stop it first")
