@@ -915,3 +915,27 @@ def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
         diagonals[r] = slants
         last[r] = v
     return directions[:n], ends, driven, diagonals, last
+
+
+@njit(cache=True, nogil=True)
+def breadth_first(weight, cost, stride, root):
+    """Steps from every cell to the root, whatever they cost: the floor under every growth of a tree."""
+    offsets = step_offsets(stride)
+    for i in range(weight.size):
+        cost[i] = INF if weight[i] < INF else LETHAL
+    queue = np.empty(weight.size, np.uint32)
+    cost[root] = np.float32(0.0)
+    queue[0] = root
+    first = 0
+    last = 1
+    while first < last:
+        u = np.int64(queue[first])
+        first += 1
+        key = cost[u] + _ONE32
+        for k in range(8):
+            v = u + offsets[k]
+            if cost[v] == INF:
+                cost[v] = key
+                queue[last] = v
+                last += 1
+    return last
