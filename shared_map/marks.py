@@ -140,8 +140,12 @@ def difference(old: MarkSet | None, new: MarkSet, others: Sequence[MarkSet], now
 
     others  the sets of the other authors, in increasing order of author
     """
-    if not others and _small(new) and (old is None or _small(old)):
-        return _small_difference(old, new)
+    if not others and not new.untils_ns:
+        if old is None:
+            said = statements(new)
+            return taken(said, np.flatnonzero(said.kinds != _CLEAR)) if _CLEAR in new.kinds else said
+        if _small(new) and _small(old):
+            return _small_difference(old, new)
     base = _blank()
     larger = np.zeros(TILE_AREA, bool)  # the cell's winner so far is of an author that wins ties against us
     for each in others:
@@ -159,15 +163,15 @@ def difference(old: MarkSet | None, new: MarkSet, others: Sequence[MarkSet], now
 
 
 def _small(of: MarkSet) -> bool:
-    return len(of.kinds) <= 64 and not of.untils_ns
+    return len(of.kinds) <= 32 and not of.untils_ns
 
 
-def _small_difference(old: MarkSet | None, new: MarkSet) -> Statements:
+def _small_difference(old: MarkSet, new: MarkSet) -> Statements:
     """As `difference`, of two short sets that nobody disputes and nothing of which ends: the everyday case.
 
     Lists take a fifth of the time of arrays of 1024 here.
     """
-    gone = {} if old is None else _listed(old)
+    gone = _listed(old)
     changed: list[tuple[int, int, float, int]] = []
     for cell, (kind, pace, stamp_ns) in _listed(new).items():
         before = gone.pop(cell, _NOBODY)
