@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.layers import Bools, Bytes, Floats, TerrainClass, gradient
+from shared_map.bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.layers import Bools, Bytes, Floats, TerrainClass, gradient, gradient_of_padded
 
 TINT = np.array(
     [
@@ -121,30 +122,46 @@ def flat_water(elevation_m: Floats, at_least: int = 4) -> Bools:
     return np.asarray(ndimage.binary_dilation(lakes, np.ones((3, 3), np.bool_)), np.bool_)
 
 
-def hillshade(elevation_m: Floats, resolution_m: float, exaggeration: float = 1.0) -> Floats:
-    """Light from the north-west, 45 degrees high: 0 dark to 1 bright; level ground is 0.707."""
-    east, north = gradient(np.nan_to_num(elevation_m), resolution_m)
-    east *= np.float32(exaggeration)
-    north *= np.float32(exaggeration)
-    light = (east - north) * np.float32(0.5) + np.float32(0.70710678)
+LEVEL_LIGHT = 0.70710678
+"""How bright level ground is."""
+
+
+def shade(east: Floats, north: Floats, exaggeration: float = 1.0) -> Floats:
+    """Light from the north-west, 45 degrees high, on a gradient: 0 dark to 1 bright."""
+    east = east * np.float32(exaggeration)
+    north = north * np.float32(exaggeration)
+    light = (east - north) * np.float32(0.5) + np.float32(LEVEL_LIGHT)
     light /= np.sqrt(east * east + north * north + np.float32(1))
     return np.clip(light, 0, 1, out=light)
 
 
-def paint_photo(elevation_m: Floats, classes: Bytes, resolution_m: float, seed: int) -> Bytes:
+def hillshade(elevation_m: Floats, resolution_m: float, exaggeration: float = 1.0) -> Floats:
+    """`shade` of heights; a void is level."""
+    return shade(*gradient(elevation_m, resolution_m), exaggeration)
+
+
+def paint_photo(
+    elevation_m: Floats, classes: Bytes, resolution_m: float, seed: int, progress: Progress = no_progress
+) -> Bytes:
     """A photograph of what covers the ground, lit from the north-west, paler in the heights."""
     rows, cols = elevation_m.shape
-    rng = np.random.default_rng([seed, 3])
-    colour = TINT[np.minimum(classes, len(TINT) - 1)].astype(np.float32)
-    texture = fractal(rng, rows, cols, 16.0)
-    water = classes == TerrainClass.WATER
+    texture = fractal(np.random.default_rng([seed, 3]), rows, cols, 16.0)
     low, high = float(np.nanmin(elevation_m)), float(np.nanmax(elevation_m))
-    height = np.nan_to_num((elevation_m - np.float32(low)) / np.float32(max(high - low, 1e-3)))
-    pale = np.where(water, np.float32(0), height * np.float32(0.25))[..., None]
-    colour += (np.float32(190) - colour) * pale
-    light = hillshade(elevation_m, resolution_m, 1.5) / np.float32(0.70710678)
-    light = np.float32(0.35) + np.float32(0.65) * light + texture * np.float32(0.18)
-    light = np.where(water, np.float32(1) + texture * np.float32(0.04), light)
-    colour *= light[..., None]
-    colour[np.isnan(elevation_m)] = 0
-    return np.clip(colour, 0, 255).astype(np.uint8)
+    photo = np.empty((rows, cols, 3), np.uint8)
+
+    def work(row0: int, row1: int) -> None:
+        here, grain = elevation_m[row0:row1], texture[row0:row1]
+        colour = TINT[np.minimum(classes[row0:row1], len(TINT) - 1)].astype(np.float32)
+        water = classes[row0:row1] == TerrainClass.WATER
+        height = np.nan_to_num((here - np.float32(low)) / np.float32(max(high - low, 1e-3)))
+        pale = np.where(water, np.float32(0), height * np.float32(0.25))[..., None]
+        colour += (np.float32(190) - colour) * pale
+        light = shade(*gradient_of_padded(padded_rows(elevation_m, row0, row1), resolution_m), 1.5)
+        light = np.float32(0.35) + np.float32(0.65 / LEVEL_LIGHT) * light + grain * np.float32(0.18)
+        light = np.where(water, np.float32(1) + grain * np.float32(0.04), light)
+        colour *= light[..., None]
+        colour[np.isnan(here)] = 0
+        photo[row0:row1] = np.clip(colour, 0, 255)
+
+    in_bands(rows, work, "painting the photo", progress)
+    return photo

@@ -98,7 +98,7 @@ def _built(scenario: Scenario, source: Source, progress: Progress) -> Terrain:
     if photo is None:
         from shared_map.synthetic import paint_photo
 
-        photo = paint_photo(source.elevation_m, classes, grid.resolution_m, scenario.seed)
+        photo = paint_photo(source.elevation_m, classes, grid.resolution_m, scenario.seed, progress)
         notes.append("photo painted from elevation and classes, as there is none")
     return _finished(grid, source.elevation_m, photo, classes, ground, cost, tuple(notes))
 
