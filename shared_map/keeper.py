@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import logging
 import os
 import sqlite3
 from collections.abc import Iterable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import IO
+from urllib.parse import quote
 
 from shared_map.digest import Ledger
 from swarm.errors import StoreError
+from swarm.grid import GridSpec
 from swarm.messages import MarkSet
 
 log = logging.getLogger(__name__)
@@ -45,13 +49,17 @@ class KeeperStore:
     A commit is on the disk when it returns (WAL with synchronous=FULL): it survives kill -9 of this process at any
     instant, and a power cut as far as the disk keeps what it was told to flush.
 
-    rebuild  move a damaged file aside and begin an empty one, to be filled from the swarm
+    rebuild    move a damaged file aside and begin an empty one, to be filled from the swarm
+    read_only  look at a store, also while a keeper writes it
     """
 
-    def __init__(self, path: Path | str, *, rebuild: bool = False) -> None:
+    def __init__(self, path: Path | str, *, rebuild: bool = False, read_only: bool = False) -> None:
         self.path = Path(path)
         self._lock: IO[bytes] | None = None
         in_memory = str(path) == _MEMORY
+        if read_only:
+            self._db = _open_to_read(self.path)
+            return
         if not in_memory:
             self._lock = _lock(self.path)
         try:
@@ -63,26 +71,41 @@ class KeeperStore:
             log.warning("moved the damaged store to %s", _move_aside(self.path))
             self._db = _open(str(path))
 
-    def bind(self, terrain: str) -> None:
+    def bind(self, terrain: str, grid: GridSpec) -> None:
         """Belong to this terrain from now on. Raises StoreError if the store holds the marks of another."""
-        try:
-            row = self._db.execute("SELECT value FROM meta WHERE key = 'terrain'").fetchone()
-            if row is None:
+        bound = self.terrain
+        if bound is None:
+            try:
                 with self._db:
                     self._db.execute("INSERT INTO meta VALUES ('terrain', ?)", (terrain,))
-                return
-        except sqlite3.Error as error:
-            raise StoreError(f"cannot write the store {self.path}: {error}") from error
-        if row[0] != terrain:
+                    self._db.execute("INSERT INTO meta VALUES ('grid', ?)", (json.dumps(asdict(grid)),))
+            except sqlite3.Error as error:
+                raise StoreError(f"cannot write the store {self.path}: {error}") from error
+        elif bound != terrain:
             raise StoreError(
-                f"the store {self.path} holds marks on terrain {row[0]}, but this run has terrain {terrain}: "
+                f"the store {self.path} holds marks on terrain {bound}, but this run has terrain {terrain}: "
                 "give another --store, or the terrain and cost rules that it was made with"
             )
 
     @property
     def terrain(self) -> str | None:
         """Digest of the terrain that the store belongs to; None before the first `bind`."""
-        row = self._db.execute("SELECT value FROM meta WHERE key = 'terrain'").fetchone()
+        return self._meta("terrain")
+
+    @property
+    def grid(self) -> GridSpec | None:
+        """The grid of that terrain."""
+        text = self._meta("grid")
+        try:
+            return None if text is None else GridSpec(**json.loads(text))
+        except (ValueError, TypeError) as error:
+            raise StoreError(_damaged(self.path, f"grid: {error}")) from error
+
+    def _meta(self, key: str) -> str | None:
+        try:
+            row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        except sqlite3.Error as error:
+            raise StoreError(_damaged(self.path, str(error))) from error
         return None if row is None else str(row[0])
 
     def load(self) -> Iterator[MarkSet]:
@@ -146,6 +169,17 @@ def _open(path: str) -> sqlite3.Connection:
     except StoreError:
         db.close()
         raise
+    return db
+
+
+def _open_to_read(path: Path) -> sqlite3.Connection:
+    if not path.is_file():
+        raise StoreError(f"there is no store {path}")
+    try:
+        db = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True, timeout=2.0)
+        db.execute("SELECT count(*) FROM meta").fetchone()
+    except sqlite3.Error as error:
+        raise StoreError(f"cannot read the store {path}: {error}") from error
     return db
 
 

@@ -45,7 +45,7 @@ class KeeperService:
             self.counters.count(name, 0)
         self._save_due_ns = 0
         self._noted_ns: int | None = None
-        store.bind(terrain.digest)
+        store.bind(terrain.digest, terrain.grid)
         for mark_set in store.load():
             if self.replica.merge(mark_set, measured=False) is not None:
                 self._keeper.restored(mark_set)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from map_strategies import MapSwarm, set_of
+from map_strategies import GRID, MapSwarm, set_of
 
 from shared_map.keeper import Keeper, KeeperStore
 from shared_map.terrain import terrain_of_pace
@@ -32,10 +32,10 @@ def make_room(store: KeeperStore) -> None:
 def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "map.sqlite"
     with KeeperStore(path) as store:
-        store.bind("t")
+        store.bind("t", GRID)
         store.save(some_sets())
     with KeeperStore(path) as store:
-        assert store.terrain == "t"
+        assert (store.terrain, store.grid) == ("t", GRID)
         assert list(store.load()) == some_sets()
 
 
@@ -48,16 +48,28 @@ def test_an_older_set_never_replaces_a_newer_one_in_the_store() -> None:
 
 def test_the_store_of_another_terrain_is_refused(tmp_path: Path) -> None:
     store = KeeperStore(tmp_path / "map.sqlite")
-    store.bind("0123456789abcdef")
-    store.bind("0123456789abcdef")
+    store.bind("0123456789abcdef", GRID)
+    store.bind("0123456789abcdef", GRID)
     with pytest.raises(StoreError, match="holds marks on terrain 0123456789abcdef, but this run has terrain fed"):
-        store.bind("fed")
+        store.bind("fed", GRID)
 
 
 def test_a_store_in_use_is_refused(tmp_path: Path) -> None:
     with KeeperStore(tmp_path / "map.sqlite"), pytest.raises(StoreError, match="in use by another keeper"):
         KeeperStore(tmp_path / "map.sqlite")
     KeeperStore(tmp_path / "map.sqlite").close()
+
+
+def test_a_store_can_be_read_while_a_keeper_writes_it(tmp_path: Path) -> None:
+    with KeeperStore(tmp_path / "a map.sqlite") as store:
+        store.save(some_sets(2))
+        with KeeperStore(tmp_path / "a map.sqlite", read_only=True) as reader:
+            store.save(some_sets(3))
+            assert list(reader.load()) == some_sets(3)
+            with pytest.raises(StoreError, match="readonly"):
+                reader.save(some_sets())
+    with pytest.raises(StoreError, match="there is no store"):
+        KeeperStore(tmp_path / "none.sqlite", read_only=True)
 
 
 def test_a_file_that_is_no_store_is_refused_with_the_reason_and_set_aside_when_asked(tmp_path: Path) -> None:
@@ -184,6 +196,6 @@ def test_two_keepers_agree_though_each_missed_what_the_other_heard() -> None:
 
 def test_a_keeper_refuses_the_store_of_another_terrain() -> None:
     store = KeeperStore(":memory:")
-    store.bind("another")
+    store.bind("another", GRID)
     with pytest.raises(StoreError, match="another"):
         MapSwarm(terrain=terrain_of_pace(np.ones((9, 9), np.float32))).keeper("keeper", store)

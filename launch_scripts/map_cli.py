@@ -1,0 +1,132 @@
+"""`swarm map`: look into the keeper's store, take marks out of it and put them into another."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from shared_map import exchange
+from shared_map.keeper import KeeperStore
+from swarm.errors import StoreError
+from swarm.grid import GridSpec
+from swarm.messages import MarkSet
+
+app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is_help=True)
+
+Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST/map.sqlite; it may be in use.")]
+_TEXT = (".json",)
+_PIXELS = (".tif", ".tiff")
+
+
+def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
+    with KeeperStore(path, read_only=True) as store:
+        terrain, grid = store.terrain, store.grid
+        if terrain is None or grid is None:
+            raise StoreError(f"the store {path} has not been used by a keeper yet: it knows no terrain")
+        return terrain, grid, list(store.load())
+
+
+@app.command()
+def inspect(store: Store, as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
+    """Say what a store holds, by author."""
+    terrain, grid, sets = _read(store)
+    _, kind = exchange.to_bands(grid, sets, time.time_ns())
+    authors: dict[str, list[MarkSet]] = {}
+    for each in sets:
+        authors.setdefault(each.author, []).append(each)
+    found = {
+        "store": str(store),
+        "terrain": terrain,
+        "rows": grid.rows,
+        "cols": grid.cols,
+        "sets": len(sets),
+        "marks": sum(len(each.kinds) for each in sets),
+        "cells_with_marks": int((kind != exchange.NOTHING_SAID_BAND).sum()),
+        "cells_lethal": int((kind == 1).sum()),
+        "authors": {
+            author: {
+                "sets": len(of),
+                "marks": sum(len(each.kinds) for each in of),
+                "tombstones": sum(not each.kinds for each in of),
+            }
+            for author, of in sorted(authors.items())
+        },
+    }
+    if as_json:
+        print(json.dumps(found, indent=2))
+        return
+    print(f"{store}: terrain {terrain}, {grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m")
+    print(f"{found['marks']} marks in {len(sets)} sets; {found['cells_with_marks']} cells marked, "
+          f"{found['cells_lethal']} of them lethal")  # fmt: skip
+    for author, of in sorted(authors.items()):
+        print(f"  {author:40} {sum(len(each.kinds) for each in of):7} marks in {len(of):5} tiles")
+
+
+@app.command()
+def export(store: Store, out: Annotated[Path, typer.Argument(help=".json: every set; .tif: the winners.")]) -> None:
+    """Write the marks of a store as JSON, which can be imported again, or as a GeoTIFF of pace and kind."""
+    terrain, grid, sets = _read(store)
+    kind_of_file = out.suffix.lower()
+    try:
+        if kind_of_file in _TEXT:
+            out.write_text(exchange.to_json(terrain, grid, sets), encoding="utf-8")
+        elif kind_of_file in _PIXELS:
+            _write_tiff(out, terrain, grid, sets)
+        else:
+            raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS)}")
+    except OSError as error:
+        raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
+    print(f"{out}: {sum(len(each.kinds) for each in sets)} marks in {len(sets)} sets")
+
+
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(help="What `swarm map export` wrote as .json.")],
+    store: Annotated[Path, typer.Argument(help="The store to put it into; made if it is not there.")],
+) -> None:
+    """Put exported marks into a store, where they merge with those that are there. No keeper may be using it."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise StoreError(f"cannot read {file}: {error}") from error
+    terrain, grid, sets = exchange.from_json(text)
+    with KeeperStore(store) as into:
+        into.bind(terrain, grid)
+        into.save(sets)
+    print(f"{store}: merged {sum(len(each.kinds) for each in sets)} marks in {len(sets)} sets")
+
+
+def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
+    import numpy as np
+    import rasterio
+    from rasterio.errors import CRSError
+    from rasterio.transform import from_origin
+
+    pace, kind = exchange.to_bands(grid, sets, time.time_ns())
+    try:
+        crs = rasterio.crs.CRS.from_user_input(grid.crs)
+    except CRSError:
+        crs = None  # a grid of its own, as synthetic terrain has
+    with rasterio.open(
+        out,
+        "w",
+        driver="GTiff",
+        height=grid.rows,
+        width=grid.cols,
+        count=2,
+        dtype="float32",
+        nodata=np.nan,
+        compress="deflate",
+        crs=crs,
+        transform=from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m),
+    ) as tiff:
+        tiff.write(pace, 1)
+        said = np.where(kind == exchange.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
+        tiff.write(said, 2)
+        tiff.set_band_description(1, "pace of marks, s/m; inf lethal; nan as the prior map says")
+        tiff.set_band_description(2, "kind: 0 pace, 1 lethal, 2 clear; nan nothing said")
+        tiff.update_tags(terrain=terrain)
