@@ -332,11 +332,11 @@ def quantiles(histogram: Histogram) -> dict[str, float | None]:
 
 
 def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
-    """(time, rate) between successive samples."""
+    """(time, rate) between successive samples, from when processes began to tell."""
     return [
         (late.time_s, max(late.messages - early.messages, 0) / (late.time_s - early.time_s))
         for early, late in itertools.pairwise(samples)
-        if late.time_s > early.time_s
+        if late.time_s > early.time_s and early.messages > 0
     ]
 
 

@@ -49,13 +49,15 @@ class Outlets:
         self.rec = rr.RecordingStream(
             APPLICATION, recording_id=recording_id, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.1)
         )
+        self.stream_url: str | None = None
+        """What a native viewer connects to."""
         self._page: ViewerPage | None = None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         if path is not None:
             sinks.append(rr.FileSink(path, write_footer=True))
         if config.live:
             grpc_port = _patiently(_free_port, config.grpc_port, "grpc_port")
-            stream_url = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
+            self.stream_url = stream_url = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
             page = _patiently(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
             self._page = page
             limit = f"{config.memory_mib}MiB"
