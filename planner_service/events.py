@@ -78,6 +78,12 @@ class AnswerCosts:
 
 
 @dataclass(frozen=True, slots=True)
+class Refuse:
+    ask: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class Push:
     pushed: PushedRoute
 
@@ -87,4 +93,4 @@ class Tell:
     status: PlannerStatus
 
 
-Action = GrowTree | AnswerRoutes | AnswerCosts | Push | Tell
+Action = GrowTree | AnswerRoutes | AnswerCosts | Refuse | Push | Tell

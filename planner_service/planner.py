@@ -16,6 +16,7 @@ from planner_service.events import (
     GrowTree,
     PoseHeard,
     Push,
+    Refuse,
     RoutesAsked,
     Tell,
     TreeGrown,
@@ -43,10 +44,13 @@ from swarm.stats import Counters
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2
+MOST_ROUTES = 20_000
+MOST_STEPS = 4 << 20
+"""In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
 _MEDIAN_OF = 5
 """Growths whose median time `auto` goes by: on a busy machine single ones take many times as long."""
 
-COUNTS = ("routes_served", "growths", "window_growths", "routes_pushed", "costs_served", "growths_late")
+COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
 
 
 class Planner:
@@ -107,6 +111,8 @@ class Planner:
                 self._hear_pose(pose)
             case FleetHeard(fleet):
                 self.followers.hear(fleet, now_ns)
+            case RoutesAsked(ask, request) if len(request.cells) > MOST_ROUTES:
+                return [Refuse(ask, f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")]
             case RoutesAsked(ask, request):
                 return [AnswerRoutes(ask, self._routes(request, now_ns))]
             case CostsAsked(ask, request):
@@ -245,7 +251,9 @@ class Planner:
         cells = self._cells(request)
         if request.force and self.tree.ready:
             self._force(cells, now_ns)
-        routes = self.tree.routes(self._cost_map.pace_s_per_m, cells, request.max_cells)
+        most = MOST_STEPS // max(len(cells), 1)
+        max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
+        routes = self.tree.routes(self._cost_map.pace_s_per_m, cells, max_cells)
         self.counters.count("routes_served", len(routes))
         self._certify(routes, now_ns)
         for vehicle, route in zip(request.vehicles, routes, strict=False):
@@ -324,7 +332,7 @@ class Planner:
                     continue
                 self.followers.sent(follower, route, now_ns + self._push_ns)
                 pushes.append(Push(self._pushed(id, route, target_cell)))
-        self.counters.count("routes_pushed", len(pushes))
+        self.counters.count("pushes", len(pushes))
         return pushes
 
     def _pushed(self, vehicle: str, route: Route, target_cell: int) -> PushedRoute:

@@ -14,6 +14,7 @@ from planner_service.events import (
     GrowTree,
     PoseHeard,
     Push,
+    Refuse,
     RoutesAsked,
     Tell,
     TreeGrown,
@@ -125,6 +126,10 @@ class PlannerService:
                 case AnswerRoutes(ask, reply) | AnswerCosts(ask, reply):
                     asked = self._asked.pop(ask)
                     asked.answer(reply, target=self._target)
+                    asked.end()
+                case Refuse(ask, reason):
+                    asked = self._asked.pop(ask)
+                    asked.refuse(reason)
                     asked.end()
                 case GrowTree():
                     model_ns = self._planner.tree.measured_model_ns()

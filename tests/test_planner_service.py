@@ -13,8 +13,12 @@ from naive import cost_to_go
 from numpy.typing import NDArray
 
 from launch_scripts.targets import TargetsService
+from planner_service.events import AnswerRoutes, PoseHeard, RoutesAsked
+from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.service import PlannerService
+from planner_service.strategies import TargetTree
 from planner_service.warm import warm_up
+from shared_map.cost_map import CostMap
 from shared_map.feed import MapFeed
 from shared_map.keeper import KeeperStore
 from shared_map.replica import MapReplica
@@ -22,6 +26,7 @@ from shared_map.service import KeeperService
 from shared_map.terrain import terrain_of_pace
 from swarm.bus import AskEnded, Event, Heard, Replied
 from swarm.clock import NS_PER_S
+from swarm.codec import MAX_PAYLOAD_BYTES, encode
 from swarm.config import MapConfig, PlannerConfig, Scenario, Strategy, TargetConfig
 from swarm.grid import GridSpec, walk
 from swarm.messages import (
@@ -44,6 +49,7 @@ from swarm.messages import (
 )
 from swarm.role import RoleSetup
 from swarm.scheduler import InlineWorker
+from swarm.stats import Counters
 from swarm.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS, Topic
 
 ROWS, COLS, RES = 40, 50, 10.0
@@ -440,11 +446,61 @@ def test_with_rotation_full_growths_come_from_the_worker_and_measure_the_windows
     assert swarm.ear.of(PlannerStatus)[-1].gap_max >= 1.0
 
 
+def test_a_request_for_more_routes_than_a_message_holds_is_refused_in_words() -> None:
+    swarm = Swarm()
+    swarm.cells["t"] = GRID.cell(20, 40)
+    swarm.world.run_ms(300)
+    assert swarm.ear.ask(ROUTE, RouteRequest(cells=[0] * (MOST_ROUTES + 1)), target="t") == []
+    assert swarm.ear.ended[-1].failure == "20001 routes at once, at most 20000: ask in parts"
+
+
+def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
+    pace = np.full((200, 200), np.inf, np.float32)
+    for row in range(0, 200, 2):  # one way in serpentines, ten thousand steps long
+        pace[row] = 0.1
+        pace[row + 1, 199 if row % 4 == 0 else 0] = 0.1
+    tree = TargetTree(GridSpec(200, 200, RES), PlannerConfig())
+    planner = Planner("t", 1, PlannerConfig(), tree, CostMap(terrain_of_pace(pace, RES)), Counters())
+    planner.handle(PoseHeard(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0)), 0)
+    planner.tick(0)
+    (whole,) = planner.handle(RoutesAsked(1, RouteRequest(cells=[198 * 200])), 0)
+    assert isinstance(whole, AnswerRoutes)
+    assert len(whole.reply.routes[0].directions) > 20_000
+    assert whole.reply.routes[0].remaining_s == 0
+    (answer,) = planner.handle(RoutesAsked(2, RouteRequest(cells=[198 * 200] * MOST_ROUTES)), 0)
+    assert isinstance(answer, AnswerRoutes)
+    assert all(route.remaining_s > 0 for route in answer.reply.routes)
+    assert len(encode(answer.reply)) < MAX_PAYLOAD_BYTES
+
+
+def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
+    """The held route ends 10 cells short of where the target is now, and going on costs nothing extra: gap 1. Where
+    the target has come towards the vehicle and beside it, the way to and fro counts."""
+    pace = flat()
+    tree = TargetTree(GRID, PlannerConfig())
+    counters = Counters()
+    planner = Planner("t", 1, PlannerConfig(push_s=100.0), tree, CostMap(terrain_of_pace(pace, RES)), counters)
+
+    def stand(col: int, seq: int, now_ns: int) -> None:
+        cell = GRID.cell(20, col)
+        pose = TargetPose(target="t", incarnation=1, seq=seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
+        planner.handle(PoseHeard(pose), now_ns)
+        planner.tick(now_ns)
+
+    stand(20, 1, 0)
+    planner.handle(RoutesAsked(1, RouteRequest(cells=[GRID.cell(20, 0)], vehicles=["v"])), 0)
+    stand(30, 2, NS_PER_S)
+    assert counters.histograms["held_gap_excess"].quantile(1.0) == pytest.approx(0.0, abs=1e-6)
+    stand(10, 3, 2 * NS_PER_S)
+    assert counters.histograms["held_gap_excess"].quantile(1.0) == pytest.approx(2.0, rel=0.03)
+    assert counters.histograms["gap_excess"].quantile(1.0) == pytest.approx(0.0, abs=1e-6)
+
+
 def test_declared_counts_are_told_before_anything_happens() -> None:
     swarm = Swarm()
     swarm.world.run_ms(100)
     counts = swarm.ear.last_stats().counts
-    for name in ("routes_served", "growths", "window_growths", "routes_pushed", "marks_merged"):
+    for name in ("routes_served", "growths", "window_growths", "pushes", "marks_merged"):
         assert counts[name] == 0
 
 
