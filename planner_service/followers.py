@@ -13,6 +13,7 @@ from swarm.messages import Fleet, Route, RouteStatus, column
 
 _STEP_ROW = np.array(STEP_ROW, np.int64)
 _STEP_COL = np.array(STEP_COL, np.int64)
+_EMPTY = Window(0, 0, 0, 0)
 _NOWHERE = np.empty(0, np.int64)
 
 
@@ -23,6 +24,7 @@ class Follower:
     cell       where it is, by its last report or request
     route      what it was given last; None if nothing was, by this incarnation of the planner
     rows, cols of the cells of that route
+    bounds     of that route and the cells next to it
     stale      there may be a better route than the one it has
     push_ns    it is not pushed another one before
     stamp_ns   of its newest report, by its own clock
@@ -34,6 +36,7 @@ class Follower:
     route: Route | None = None
     rows: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
     cols: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
+    bounds: Window = _EMPTY
     stale: bool = False
     push_ns: int = 0
     stamp_ns: int = -1
@@ -94,7 +97,11 @@ class Followers:
 
     def sent(self, follower: Follower, route: Route, push_ns: int) -> None:
         follower.route, follower.stale, follower.push_ns = route, False, push_ns
-        follower.rows, follower.cols = route_cells(self._grid, route)
+        rows, cols = follower.rows, follower.cols = route_cells(self._grid, route)
+        follower.bounds = _EMPTY
+        if len(rows):
+            row0, col0, row1, col1 = int(rows.min()), int(cols.min()), int(rows.max()), int(cols.max())
+            follower.bounds = Window(row0 - 1, col0 - 1, row1 + 2, col1 + 2)
 
     def drop_silent(self, now_ns: int) -> None:
         late = [id for id, follower in self._by_id.items() if now_ns - follower.heard_ns > self._lease_ns]
@@ -103,9 +110,10 @@ class Followers:
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
         """The tree is new inside a window, and the map changed in others: whose route does that concern?"""
+        whole = window == self._grid.window
         for follower in self._by_id.values():
             if not follower.stale:
-                inside = not window.empty and window.contains(*self._grid.row_col(follower.cell))
+                inside = whole or window.contains(*self._grid.row_col(follower.cell))
                 follower.stale = inside or any(_crosses(follower, each) for each in changed)
 
     def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
@@ -145,6 +153,8 @@ def route_cells(grid: GridSpec, route: Route) -> tuple[NDArray[np.int64], NDArra
 
 def _crosses(follower: Follower, window: Window) -> bool:
     """Whether the route passes through a window or next to it: a diagonal step depends on the cells beside it."""
+    if follower.bounds.empty or not follower.bounds.touches(window):
+        return False
     rows, cols = follower.rows, follower.cols
     return bool(
         (
