@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from naive_tree import naive_tree
 from numpy.typing import NDArray
 
 from shared_map.terrain import Terrain, terrain_of_pace
@@ -34,7 +35,6 @@ from swarm.messages import (
 from swarm.role import RoleSetup
 from swarm.scheduler import Scheduler
 from swarm.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
-from naive_tree import naive_tree
 from vehicle_agent.service import AgentService
 
 START_NS = 1_000 * NS_PER_S
@@ -221,7 +221,6 @@ class AgentWorld:
         incarnation = self.now_ns
         setup = RoleSetup(self.scenario, "run", "agent", id, incarnation, START_NS)
         bus = self.network.bus(f"agent-{id}")
-        queue: list[Event] = []
         service: AgentService
 
         def post(event: Event) -> None:
@@ -231,14 +230,11 @@ class AgentWorld:
         service = AgentService(setup, self.terrain, self.truth, bus, post)
         self.agents[id], self.buses[id] = service, bus
         service.start(self.now_ns)
-        queue.clear()
         period_ns = int(NS_PER_S / self.scenario.vehicles.tick_hz)
 
         def tick() -> None:
             if not bus.closed:
                 service.tick(self.now_ns)
-                if service.agent.vehicles:
-                    self.ghosts.pop(id, None)
                 self._look_around()
                 self.scheduler.after(period_ns, tick)
 
@@ -256,8 +252,11 @@ class AgentWorld:
     def _look_around(self) -> None:
         where: dict[int, str] = {}
         standing = [(v.id, v.cell) for service in self.agents.values() for v in service.agent.vehicles.values()]
-        for vehicles in self.ghosts.values():
-            standing += vehicles.items()
+        for agent, vehicles in list(self.ghosts.items()):
+            if agent in self.agents and self.agents[agent].agent.vehicles:
+                del self.ghosts[agent]  # they are vehicles again
+            else:
+                standing += vehicles.items()
         for id, cell in standing:
             if cell in where:
                 self.meetings.append(f"{where[cell]} and {id} on {cell} at {self.now_ns}")
@@ -336,5 +335,5 @@ class AgentWorld:
         return ", ".join(f"{id} {states[id].name} at {place}" for id, place in self.where().items())
 
     def assert_lawful(self) -> None:
-        assert not self.meetings
-        assert not self.lethal
+        assert self.meetings == []
+        assert self.lethal == []

@@ -146,13 +146,14 @@ class Agent:
         if last is not None:
             self.rights.heard(last)
         for id in self.plan.vehicle_ids:
-            cell = self._spawns[id]
+            cell, known_there = self._spawns[id], last is None
             if last is not None and last.holds.get(id):
-                cell = last.holds[id][0]
-            if not 0 <= cell < self._map.grid.cells or self.rights.holder(cell) is not None:
-                self._homeless[id] = min(max(cell, 0), self._map.grid.cells - 1)
-            else:
+                cell, known_there = last.holds[id][0], True
+            # Whoever spoke of itself without this vehicle had not found a place for it: others may be there.
+            if known_there and 0 <= cell < self._map.grid.cells and self.rights.holder(cell) is None:
                 self._place(id, cell)
+            else:
+                self._homeless[id] = min(cell, self._map.grid.cells - 1)
 
     def _place(self, id: str, cell: int) -> None:
         if not self.rights.holds(id):

@@ -5,9 +5,10 @@ repetition and reordering do no harm. A vehicle may enter a cell when every othe
 in which the want first stood, and in nobody's newest claims the cell is held, or wanted with a lower
 (ticket, agent, vehicle).
 
-Why no two get the same cell: of two wants, say A's has the lower ticket. B needs a message of A that echoes B's
-want. A sent it after it had heard B's clock, so a want that A made later has a higher ticket than B's; and one that
-A had made earlier stands in that very message, as a want with the lower ticket or as a hold. Either way B waits.
+Why no two get the same cell: A goes by a message of B that echoes A's want, B by one of A that echoes B's. Had B
+got the cell before it sent that message, the message would say so. So B got it later, when it knew A's want, and
+found its own the lower; and A got it when it knew B's, and found its own the lower. Both cannot be. Tickets only
+decide who goes first: they are Lamport's clock, so that a want made after hearing of another queues behind it.
 
 What a dead agent held or wanted stays forbidden until a newer incarnation of it speaks: each cell that it may
 stand on was wanted in a message that all who lived then had echoed.
@@ -204,12 +205,13 @@ class RightOfWay:
         return mine.holds if mine else []
 
     def wants(self, vehicle: str) -> list[int]:
-        return [want.cell for want in self._mine[vehicle].wants]
+        mine = self._mine.get(vehicle)
+        return [want.cell for want in mine.wants] if mine else []
 
     def rank(self, vehicle: str) -> Rank | None:
         """The rank of what the vehicle wants next, None if it wants nothing."""
-        mine = self._mine[vehicle]
-        return (mine.wants[0].ticket, self.agent, vehicle) if mine.wants else None
+        mine = self._mine.get(vehicle)
+        return (mine.wants[0].ticket, self.agent, vehicle) if mine and mine.wants else None
 
     def holder(self, cell: int) -> str | None:
         """Who holds a cell, as far as we know; of a dead agent also who wanted it."""
