@@ -179,12 +179,22 @@ def learnt(
 
     def work(row0: int, row1: int) -> None:
         inner, features = _features(rgb, elevation_m, resolution_m, row0, row1)
-        classes[row0:row1] = model.predict(features.columns()).reshape(features.red.shape)[inner]
+        shares = model.predict_proba(features.columns())
+        decided = _decided(model.classes_, shares, features.grade.reshape(-1))
+        classes[row0:row1] = decided.reshape(features.red.shape)[inner]
 
     in_bands(rows, work, "classifying the photo", progress)
     if seen is not None:
         classes[~seen] = TerrainClass.UNKNOWN
     return classes
+
+
+def _decided(kinds: Bytes, shares: NDArray[np.float64], grade: Floats) -> Bytes:
+    """The likeliest class; water only where the ground is level: no label teaches what a shadow is."""
+    water = kinds == TerrainClass.WATER
+    if len(kinds) > 1 and water.any():
+        shares[np.ix_(grade >= SHORE_GRADE, water)] = -1.0
+    return np.asarray(kinds[np.argmax(shares, axis=1)], np.uint8)
 
 
 def _model(seed: int) -> Any:
@@ -222,8 +232,10 @@ def held_out(
     columns, kinds = _samples(rgb, elevation_m, resolution_m, labels)
     group = groups[labels != TerrainClass.UNKNOWN]
     folds = min(5, len(np.unique(group)))
-    predicted = cross_val_predict(_model(seed), columns, kinds, groups=group, cv=GroupKFold(folds))
-    return kinds, np.asarray(predicted, np.uint8)
+    shares = cross_val_predict(
+        _model(seed), columns, kinds, groups=group, cv=GroupKFold(folds), method="predict_proba"
+    )
+    return kinds, _decided(np.unique(kinds), shares, columns[:, -1])
 
 
 def confusion(true: Bytes, predicted: Bytes) -> NDArray[np.int64]:

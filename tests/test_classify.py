@@ -62,6 +62,7 @@ def test_learning_from_labels_holds_on_polygons_it_has_not_seen(davos: tuple[Sou
     assert np.trace(table) / table.sum() > 0.7
     classes = learnt(source.photo, source.elevation_m, 10.0, labels.classes)
     assert overlap(labels.classes, np.where(labels.groups >= 0, classes, 0), TerrainClass.WATER) > 0.95
+    assert (classes[95:150, 130:330] == TerrainClass.WATER).mean() < 0.01
 
 
 @needs_data

@@ -1,0 +1,320 @@
+"""`swarm terrain`: look at elevation and photo, see what they cost, make synthetic ones, classify a photo."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from shared_map.layers import Bytes, TerrainClass, slope_deg
+from swarm.config import Scenario, TerrainConfig
+from swarm.errors import ConfigError, SwarmError, TerrainError
+
+if TYPE_CHECKING:
+    from shared_map.bands import Progress as Tell
+    from shared_map.terrain import Terrain
+    from swarm.grid import GridSpec
+
+app = typer.Typer(
+    help="""Look at terrains: what a file holds, what it costs, what a photo shows.
+
+    swarm terrain info dem.tif
+    swarm terrain cost jacksboro --out cost.tif --picture cost.png
+    swarm terrain synth --rows 512 --cols 512 --out dem.tif --photo photo.tif
+    swarm terrain classify dem.tif photo.tif --picture classes.png
+    """,
+    no_args_is_help=True,
+)
+console = Console()
+
+Crs = Annotated[str | None, typer.Option(help="Coordinate system, where the file names none: EPSG:32632.")]
+Resolution = Annotated[float | None, typer.Option(help="Cell size in metres to bring everything to.", min=1e-6)]
+Scale = Annotated[float | None, typer.Option(help="Metres per unit of height, for images.", min=1e-9)]
+Fill = Annotated[
+    bool, typer.Option("--fill", help="Fill voids from their surroundings instead of forbidding them.")
+]
+PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
+
+
+@contextlib.contextmanager
+def _bars() -> Iterator[Tell]:
+    """A progress bar for whatever takes longer than a second, on a terminal only."""
+    started = time.monotonic()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(what: str, share: float) -> None:
+            if time.monotonic() - started < 1.0 and what not in tasks:
+                return
+            if what not in tasks:
+                tasks[what] = progress.add_task(what, total=1.0)
+            progress.update(tasks[what], completed=share)
+
+        yield tell
+
+
+def _scenario(name: str) -> Scenario:
+    from launch_scripts.options import find_scenario
+
+    return find_scenario(name)
+
+
+@app.command()
+def info(
+    file: Annotated[str, typer.Argument(help="A terrain file, a scenario, or jacksboro.")],
+    crs: Crs = None,
+    resolution_m: Resolution = None,
+    height_scale: Scale = None,
+    fill: Fill = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> None:
+    """Say what a terrain file holds, and what was done to bring it onto a metric grid."""
+    from shared_map.sources import load_source
+
+    if file.endswith(".toml"):
+        config = _scenario(file).terrain
+    else:
+        nodata = "fill" if fill else "lethal"
+        raw = {
+            "source": file,
+            "crs": crs,
+            "resolution_m": resolution_m,
+            "height_scale": height_scale,
+            "nodata": nodata,
+        }
+        config = msgspec.convert(raw, TerrainConfig)
+    with _bars() as tell:
+        source = load_source(config, 1, tell)
+    facts = _facts(source.grid, source.elevation_m)
+    if source.factor is not None:
+        facts["lethal_share"] = round(float(np.isinf(source.factor).mean()), 4)
+    if as_json:
+        console.print_json(json.dumps({**facts, "notes": source.notes}))
+        return
+    table = Table(show_header=False, box=None)
+    for key, value in facts.items():
+        table.add_row(key, str(value))
+    console.print(table)
+    for note in source.notes:
+        console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _facts(grid: GridSpec, elevation_m: Any) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "rows": grid.rows,
+        "cols": grid.cols,
+        "resolution_m": grid.resolution_m,
+        "width_m": round(grid.cols * grid.resolution_m, 1),
+        "height_m": round(grid.rows * grid.resolution_m, 1),
+        "crs": grid.crs if len(grid.crs) < 80 else grid.crs[:77] + "...",
+        "voids": int(np.isnan(elevation_m).sum()),
+    }
+    known = elevation_m[~np.isnan(elevation_m)]
+    if known.size:
+        facts["lowest_m"], facts["highest_m"] = round(float(known.min()), 1), round(float(known.max()), 1)
+        stride = -(-max(grid.rows, grid.cols) // 2048)
+        slopes = slope_deg(np.ascontiguousarray(elevation_m[::stride, ::stride]), grid.resolution_m * stride)
+        for name, share in (("slope_median_deg", 50), ("slope_95_deg", 95), ("slope_max_deg", 100)):
+            facts[name] = round(float(np.nanpercentile(slopes, share)), 1)
+    return facts
+
+
+@app.command()
+def cost(
+    scenario: Annotated[str, typer.Argument(help="A scenario file or the name of a built-in one.")],
+    out: Annotated[Path | None, typer.Option(help="Write seconds per metre as GeoTIFF; lethal is -1.")] = None,
+    picture: PictureOption = None,
+) -> None:
+    """Build the prior cost map of a scenario; write it and a picture of it."""
+    from shared_map.terrain import build_terrain
+
+    loaded = _scenario(scenario)
+    with _bars() as tell:
+        started = time.perf_counter()
+        terrain = build_terrain(loaded, tell)
+        seconds = time.perf_counter() - started
+        if out is not None:
+            _write_cost(terrain, out, tell)
+    if picture is not None:
+        _draw(terrain, picture, f"{loaded.name}: {loaded.terrain.source}")
+    finite = terrain.pace_s_per_m[np.isfinite(terrain.pace_s_per_m)]
+    console.print(
+        f"{terrain.grid.rows} x {terrain.grid.cols} cells of {terrain.grid.resolution_m:g} m in {seconds:.1f} s,"
+        f" {1 - finite.size / terrain.grid.cells:.1%} lethal, pace {finite.min():.3g} to {finite.max():.3g} s/m"
+        f" (median {np.median(finite):.3g}), digest {terrain.digest}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    _print_shares(terrain.classes)
+    for note in terrain.notes:
+        console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _write_cost(terrain: Terrain, path: Path, tell: Tell) -> None:
+    pace = terrain.pace_s_per_m
+    _write(path, [np.where(np.isfinite(pace), pace, np.float32(-1))], terrain.grid, nodata=-1.0)
+    tell("writing", 1.0)
+
+
+def _write(path: Path, bands: list[Any], grid: GridSpec, **profile: Any) -> None:
+    """A tiled, compressed GeoTIFF with overviews (its tile pyramid). A terrain without a place gets none."""
+    import rasterio
+    from rasterio.enums import Resampling
+    from rasterio.errors import RasterioError
+    from rasterio.transform import from_origin
+
+    side = {"tiled": True, "blockxsize": 256, "blockysize": 256} if min(grid.rows, grid.cols) >= 256 else {}
+    size = {"height": grid.rows, "width": grid.cols, "count": len(bands), "dtype": bands[0].dtype}
+    crs = None if grid.crs == "local" else grid.crs
+    where = from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
+    try:
+        with rasterio.open(
+            path, "w", driver="GTiff", crs=crs, transform=where, compress="deflate", **side, **size, **profile
+        ) as file:
+            for number, band in enumerate(bands, 1):
+                file.write(band, number)
+            factors = [2**n for n in range(1, 8) if max(grid.rows, grid.cols) // 2**n >= 128]
+            if factors:
+                file.build_overviews(factors, Resampling.nearest)
+    except (RasterioError, OSError) as error:
+        raise TerrainError(f"cannot write {path}: {error}") from error
+
+
+def _draw(terrain: Terrain, path: Path, title: str) -> None:
+    from launch_scripts.terrain_picture import draw
+
+    draw(terrain, path, title)
+
+
+def _print_shares(classes: Bytes) -> None:
+    counts = np.bincount(classes.reshape(-1), minlength=max(TerrainClass) + 1)
+    shares = [f"{kind.name.lower()} {counts[kind] / classes.size:.1%}" for kind in TerrainClass if counts[kind]]
+    console.print("classes: " + ", ".join(shares), highlight=False)
+
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Option(help="Write the heights: .tif (in UTM 32) or .npz.")],
+    rows: Annotated[int, typer.Option(min=8, max=16384)] = 512,
+    cols: Annotated[int, typer.Option(min=8, max=16384)] = 512,
+    resolution_m: Annotated[float, typer.Option(min=0.01)] = 30.0,
+    relief_m: Annotated[float, typer.Option(min=0, help="Metres from lowest to highest.")] = 400.0,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    photo: Annotated[Path | None, typer.Option(help="Write a photo of it (.tif) too.")] = None,
+    picture: PictureOption = None,
+) -> None:
+    """Make a synthetic landscape: mountains, valleys, rivers, forest. A seed makes the same one again."""
+    from shared_map.terrain import build_terrain
+    from swarm.grid import GridSpec
+
+    config = TerrainConfig(source="synthetic", rows=rows, cols=cols, relief_m=relief_m, resolution_m=resolution_m)
+    with _bars() as tell:
+        terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
+    grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
+    if out.suffix == ".npz":
+        try:
+            np.savez_compressed(out, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
+        except OSError as error:
+            raise TerrainError(f"cannot write {out}: {error.strerror or error}") from error
+    elif out.suffix in (".tif", ".tiff"):
+        _write(out, [terrain.elevation_m], grid)
+    else:
+        raise ConfigError(f"--out {out}: write .tif or .npz")
+    if photo is not None:
+        _write(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
+    if picture is not None:
+        _draw(terrain, picture, f"synthetic, seed {seed}")
+    console.print(f"{rows} x {cols} cells of {resolution_m:g} m, relief {relief_m:g} m, seed {seed}: {out}")
+
+
+@app.command()
+def classify(
+    elevation: Annotated[Path, typer.Argument(help="The elevation file.")],
+    photo: Annotated[Path, typer.Argument(help="The colour photo.")],
+    labels: Annotated[
+        Path | None, typer.Option(help="Learn from these labels (TOML), and compare with them.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the classes as GeoTIFF.")] = None,
+    picture: PictureOption = None,
+    crs: Crs = None,
+    resolution_m: Resolution = None,
+) -> None:
+    """Say what a photo shows: water, forest, rock, grass, soil, road, built, snow.
+
+    Without labels by rules. With labels learnt from them; printed is what a model that has not seen a polygon says
+    about it, beside what the rules say.
+    """
+    from shared_map.terrain import build_terrain
+
+    terrain_config = TerrainConfig(
+        source=str(elevation),
+        photo=str(photo),
+        labels=None if labels is None else str(labels),
+        crs=crs,
+        resolution_m=resolution_m,
+    )
+    with _bars() as tell:
+        terrain = build_terrain(Scenario(terrain=terrain_config), tell)
+    _print_shares(terrain.classes)
+    if labels is not None:
+        _compare(terrain, labels)
+    if out is not None:
+        _write(out, [terrain.classes], terrain.grid)
+    if picture is not None:
+        _draw(terrain, picture, f"{photo.name} on {elevation.name}")
+    for note in terrain.notes:
+        console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _compare(terrain: Terrain, path: Path) -> None:
+    from shared_map.classify import by_rules, confusion, held_out
+    from shared_map.labels import read_labels
+
+    labels = read_labels(path, terrain.grid)
+    ground = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)
+    labelled = labels.classes != TerrainClass.UNKNOWN
+    ruled = by_rules(*ground)
+    _print_confusion("by rules", confusion(labels.classes[labelled], ruled[labelled]))
+    _print_confusion("learnt, on polygons not seen", confusion(*held_out(*ground, labels.classes, labels.groups)))
+
+
+def _print_confusion(title: str, counts: Any) -> None:
+    present = [kind for kind in TerrainClass if counts[kind].any() or counts[:, kind].any()]
+    table = Table(
+        title=f"{title}: {np.trace(counts) / counts.sum():.1%} of the labelled cells", title_justify="left"
+    )
+    table.add_column("labelled")
+    for kind in present:
+        table.add_column(kind.name.lower(), justify="right")
+    table.add_column("IoU", justify="right")
+    for kind in present:
+        union = counts[kind].sum() + counts[:, kind].sum() - counts[kind, kind]
+        cells = [str(counts[kind, other]) for other in present]
+        table.add_row(kind.name.lower(), *cells, f"{counts[kind, kind] / union:.2f}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    import sys
+
+    try:
+        app()
+    except SwarmError as error:
+        print(f"swarm terrain: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
