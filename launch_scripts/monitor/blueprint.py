@@ -27,7 +27,7 @@ def make_blueprint(ground: Ground) -> rrb.Blueprint:
                     _plot("states", "Vehicles by state"),
                 ),
                 _log(),
-                row_shares=[3.1, 1.15, 1.15, 1.25, 1.5],
+                row_shares=[3.5, 1.1, 1.1, 1.2, 1.35],
             ),
             column_shares=[2.6, 1],
         ),

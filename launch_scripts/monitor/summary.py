@@ -20,7 +20,7 @@ def summary_markdown(setup: RoleSetup, summary: LiveSummary) -> str:
     found = f"**{_count(summary.captures)}** captures, **{_count(summary.marks)}** marks"
     traffic = f"{summary.restarts} restarts, {_count(summary.messages_per_s)} messages/s"
     lines = [
-        f"### {scenario.name}: {scenario.vehicle_count} vehicles, {len(scenario.target_ids)} targets",
+        f"**{scenario.name}**: {scenario.vehicle_count} vehicles, {len(scenario.target_ids)} targets  ",
         f"{found}, **{_count(summary.reroute_requests)}** re-route requests  ",
         f"{states or 'no vehicles yet'}  ",
         f"{summary.alive} of {summary.expected} processes alive, {traffic}",
@@ -31,7 +31,7 @@ def summary_markdown(setup: RoleSetup, summary: LiveSummary) -> str:
     for line in summary.targets[:_SHOWN_TARGETS]:
         nearest = "–" if line.nearest_m is None else f"{line.nearest_m / 1000:.1f} km"
         growth = "–" if line.growth_ms is None else f"{line.growth_ms:.1f} ms"
-        gap = "–" if line.gap is None else f"{(line.gap - 1) * 100:.2f} %"
+        gap = "–" if line.gap is None else f"{max(line.gap - 1, 0) * 100:.2f} %"
         id = line.id if line.planner_up else f"{line.id} (planner gone)"
         lines.append(f"| {id} | {line.following} | {nearest} | {growth} | {gap} | {line.captures} |")
     if len(summary.targets) > _SHOWN_TARGETS:
