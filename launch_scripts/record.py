@@ -30,6 +30,8 @@ _TRACK_NS = NS_PER_S // 2
 _SAMPLE_NS = NS_PER_S
 _SAMPLES_KEPT = 4096
 _NOTES_KEPT = 1000
+_CAPTURES_AT_ONCE = 100
+"""More between two poses is nobody's count: a message must not fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +161,7 @@ class Recorder:
             return
         # Where it stood before: by now it may already have turned up elsewhere.
         capture = Capture(self.seconds(now_ns), pose.target, *self.observed.place_m(known))
-        self.captures += [capture] * (pose.captures - known.captures)
+        self.captures += [capture] * min(pose.captures - known.captures, _CAPTURES_AT_ONCE)
 
     def _certify(self, route: Followed) -> None:
         if 0 < route.lower_bound_s < math.inf and math.isfinite(route.cost_s):

@@ -130,7 +130,7 @@ def _type(hint: Any) -> str:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         meta = next(note for note in args[1:] if isinstance(note, msgspec.Meta))
-        return f"{_type(args[0])} {meta.ge} ... {_power(meta.lt)}"
+        return f"{_type(args[0])} {_number(meta.ge)} ... {_number(meta.le if meta.lt is None else meta.lt - 1)}"
     if origin in (types.UnionType, typing.Union):
         return " or ".join("nil" if arg is type(None) else _type(arg) for arg in args)
     if origin is list:
@@ -142,8 +142,13 @@ def _type(hint: Any) -> str:
     return str(hint.__name__)
 
 
-def _power(limit: Any) -> str:
-    return f"2^{int(limit).bit_length() - 1} - 1"
+def _number(limit: Any) -> str:
+    """A limit as one would write it: 2^62 - 1, -2^31, 1e+09, 0."""
+    if isinstance(limit, float) or abs(limit) < 1 << 16:
+        return f"{limit:g}"
+    sign, rest = ("-", -limit) if limit < 0 else ("", limit)
+    exponent = int(rest).bit_length()
+    return f"{sign}2^{exponent - 1}" if rest == 1 << (exponent - 1) else f"{sign}2^{exponent} - 1"
 
 
 def _enums() -> Iterator[str]:

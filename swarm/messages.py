@@ -14,6 +14,7 @@ import numpy as np
 
 from swarm.fields import (
     Cell,
+    Metres,
     Natural,
     check_column,
     check_directions,
@@ -301,14 +302,13 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
     seq: Natural
     stamp_ns: Natural
     cell: Cell
-    x_m: float
-    y_m: float
+    x_m: Metres
+    y_m: Metres
     captures: Natural = 0
     jumps: Natural = 0
 
     def __post_init__(self) -> None:
         check_id("target", self.target)
-        check_finite("position", self.x_m, self.y_m)
 
 
 class RouteStatus(enum.StrEnum):

@@ -43,6 +43,7 @@ cells = st.integers(-(1 << 31), (1 << 32) - 1)
 ids = st.text("abcXYZ019_.-", min_size=1, max_size=64)
 texts = st.text(max_size=40)
 finite = st.floats(allow_nan=False, allow_infinity=False)
+metres = st.floats(-1e9, 1e9)
 costs = st.floats(min_value=0, allow_nan=False)
 floats32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
 directions = st.lists(st.integers(0, 7), max_size=50).map(bytes)
@@ -147,8 +148,8 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite, lower_bound_s=finite
     ),
     TargetPose: st.builds(
-        TargetPose, target=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, cell=cells, x_m=finite,
-        y_m=finite, captures=naturals, jumps=naturals,
+        TargetPose, target=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, cell=cells, x_m=metres,
+        y_m=metres, captures=naturals, jumps=naturals,
     ),
     RouteRequest: route_requests(),
     RouteReply: st.builds(
