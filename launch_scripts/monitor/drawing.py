@@ -1,7 +1,7 @@
 """The only place that speaks rerun's language: arrays of the scene in, log calls out.
 
 Few entities with many instances each, arrays instead of lists, style logged once: see what was measured in
-docs/architecture.md.
+docs/decisions/0008-the-live-view.md.
 """
 
 from __future__ import annotations
