@@ -1,0 +1,101 @@
+"""One node that sends anything at all, on every key, harms nobody: no service raises, the swarm does its work."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from simulated_swarm import Laws, seeded
+from wire_strategies import EXAMPLES, MESSAGES
+
+from launch_scripts.simulate import Simulation
+from swarm.bus import Event
+from swarm.codec import encode
+from swarm.messages import Message, RunInfo
+from swarm.topics import TOPICS, Topic
+
+KNOWN = ("t0", "t1", "a0", "a1", "a2", "a0-00", "a1-01", "0", "3", "keeper", "planner", "agent", "targets")
+BY_TYPE = {type(example): example for example in EXAMPLES}
+FORGEABLE = [topic for topic in TOPICS if topic.published]
+
+
+def ignore(event: Event) -> None:
+    pass
+
+
+def key_fields(topic: Topic, message: Message, chance: random.Random) -> dict[str, str]:
+    """The fields that the message itself names, else those of somebody who exists."""
+    named = {name: getattr(message, name, None) for name in topic.fields}
+    return {name: str(chance.choice(KNOWN) if value is None else value) for name, value in named.items()}
+
+
+def test_garbage_on_every_key_is_counted_and_dropped_and_the_swarm_does_its_work():
+    simulation = Simulation(seeded(1))
+    laws = Laws(simulation)
+    chance = random.Random(1)
+    stranger = simulation.network.bus("stranger")
+    for step in range(120):
+        simulation.run_until(step * 0.1)
+        for topic in FORGEABLE:
+            payload = bytearray(encode(BY_TYPE[topic.message]))
+            payload[chance.randrange(len(payload))] ^= 1 << chance.randrange(8)
+            garbage = chance.choice([bytes(payload[: chance.randrange(len(payload))]), chance.randbytes(40), b""])
+            stranger.publish_bytes(topic, garbage, key_fields(topic, BY_TYPE[topic.message], chance))
+    simulation.finish()
+    report = simulation.report(12)
+    assert report["payloads_dropped"] > 1000
+    assert report["vehicles_routed"] == 10
+    assert report["captures"] > 0
+    assert laws.collisions == laws.lethal == []
+
+
+@pytest.mark.parametrize("topic", FORGEABLE, ids=lambda topic: topic.name)
+def test_any_valid_message_on_its_key_raises_nowhere(topic):
+    """Such as cells outside the grid, tickets near 2**62, and authors that do not exist."""
+    simulation = Simulation(seeded(2))
+    simulation.run_until(2.0)
+    stranger = simulation.network.bus("stranger")
+    chance = random.Random(2)
+
+    @settings(
+        max_examples=60, deadline=None, derandomize=True, phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(MESSAGES[topic.message], st.booleans())
+    def forge(message, as_somebody):
+        fields = key_fields(topic, message, chance)
+        if as_somebody:
+            fields = {name: chance.choice(KNOWN) for name in topic.fields}
+        stranger.publish_bytes(topic, encode(message), fields)
+        simulation.run_until(simulation.now_s + 0.05)
+
+    forge()
+    simulation.run_until(simulation.now_s + 1)
+
+
+@pytest.mark.parametrize("topic", [topic for topic in TOPICS if topic.request], ids=lambda topic: topic.name)
+def test_any_valid_question_is_answered_or_refused(topic):
+    simulation = Simulation(seeded(2))
+    simulation.run_until(2.0)
+    stranger = simulation.network.bus("stranger")
+    chance = random.Random(3)
+    assert topic.request is not None
+
+    @settings(
+        max_examples=60, deadline=None, derandomize=True, phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(MESSAGES[topic.request], st.booleans())
+    def ask(request, narrow):
+        fields = {name: chance.choice(KNOWN) for name in topic.fields} if narrow else {}
+        stranger.ask(topic, request, ignore, tag="q", **fields)
+        simulation.run_until(simulation.now_s + 0.05)
+
+    ask()
+    simulation.run_until(simulation.now_s + 1)
+
+
+def test_only_a_run_that_differs_ends_a_process():
+    assert RunInfo not in {topic.message for topic in FORGEABLE}
