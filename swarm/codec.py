@@ -5,6 +5,7 @@ Nothing but ProtocolError comes out of it, whatever goes in.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from typing import Any, TypeVar
 
@@ -49,6 +50,16 @@ def decode(payload: bytes, message_type: type[M]) -> M:
         raise ProtocolError("nested too deeply") from error
     except Exception as error:  # msgpack raises a dozen kinds; none may pass the door
         raise ProtocolError(f"{type(error).__name__}: {error}"[:300]) from error
+
+
+def prime(message_type: type[Message]) -> None:
+    """Have msgspec look at a type once, on one thread.
+
+    It describes a struct at its first use and shows the unfinished description to other threads, which then crash
+    the process (msgspec 0.20; an agent died so at its start, when the first replies came on several threads).
+    """
+    with contextlib.suppress(msgspec.ValidationError):
+        msgspec.convert({}, message_type)
 
 
 def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+from swarm.codec import prime
 from swarm.messages import (
     Claims,
     CostReply,
@@ -65,6 +66,9 @@ class Topic:
     def __post_init__(self) -> None:
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.key))
         object.__setattr__(self, "_pattern", re.compile(pattern))
+        for message_type in (self.message, self.request):
+            if message_type is not None:
+                prime(message_type)  # before there are threads to meet it half described
         object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
 
     def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
