@@ -14,18 +14,17 @@ from typing import Protocol
 from swarm.bus import (
     Appeared,
     Asked,
-    AskEnded,
     Disappeared,
     Event,
     Heard,
     LinkChanged,
     Post,
-    Replied,
 )
 from swarm.clock import NS_PER_S
 from swarm.codec import decode, encode
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
+from swarm.memory_query import Asking, MemoryAnswerer
 from swarm.messages import Message
 from swarm.scheduler import InlineWorker as InlineWorker
 from swarm.scheduler import Scheduler as Scheduler
@@ -118,7 +117,7 @@ class MemoryNetwork:
 
 
 @dataclass(eq=False, slots=True)
-class _Interest:
+class Interest:
     """A subscription or a queryable. `narrow` holds the fields that are no wildcard."""
 
     bus: MemoryBus
@@ -130,9 +129,9 @@ class _Interest:
         return not self.narrow or _meet(self.narrow, fields)
 
 
-def _interest(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post) -> _Interest:
+def _interest(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post) -> Interest:
     every = topic.every(fields)
-    return _Interest(bus, {name: chunk for name, chunk in every.items() if chunk != "*"}, post)
+    return Interest(bus, {name: chunk for name, chunk in every.items() if chunk != "*"}, post)
 
 
 def _meet(narrow: Mapping[str, str], fields: Mapping[str, str]) -> bool:
@@ -152,8 +151,8 @@ class MemoryBus:
         self.namespace = namespace
         self.closed = False
         self.counts: dict[str, int] = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
-        self.subscriptions: dict[str, list[_Interest]] = {}
-        self.queryables: dict[str, list[_Interest]] = {}
+        self.subscriptions: dict[str, list[Interest]] = {}
+        self.queryables: dict[str, list[Interest]] = {}
         self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
         self.tokens: list[Peer] = []
@@ -198,7 +197,7 @@ class MemoryBus:
             raise TypeError(f"topic {topic.name} is not a queryable")
         wanted = topic.every(fields)
         scheduler = self.network.scheduler
-        asking = _Asking(self, topic, wanted, tag, post)
+        asking = Asking(self, topic, wanted, tag, post)
         if self.closed:
             scheduler.after(0, asking.finish)
             return
@@ -218,7 +217,7 @@ class MemoryBus:
         parsed = decode(payload, topic.request)
         for index, interest in enumerate(interests):
             for when_ns in self.network.arrivals_ns(self, interest.bus, topic.name):
-                answerer = _MemoryAnswerer(asking, interest, index)
+                answerer = MemoryAnswerer(asking, interest, index)
                 event = Asked(topic, wanted, parsed, answerer)
                 scheduler.at(when_ns, _Delivery(self, interest.bus, topic.name, payload, interest.post, event))
         scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)
@@ -312,7 +311,7 @@ class _Arrival:
     """A sample reaching a subscription: parsed at the door, as on the real bus."""
 
     source: MemoryBus
-    interest: _Interest
+    interest: Interest
     sample: _Sample
 
     def __call__(self) -> None:
@@ -342,89 +341,3 @@ class _Delivery:
         if self.to.traced(self.source, self.what, self.payload):
             self.to.counts["messages_in"] += 1
             self.post(self.event)
-
-
-@dataclass(eq=False)
-class _Asking:
-    """One query under way. `waiting` are the queryables that have not ended yet."""
-
-    bus: MemoryBus
-    topic: Topic
-    wanted: dict[str, str]
-    tag: str
-    post: Post
-    waiting: set[int] = field(default_factory=set)
-    replies: int = 0
-    failure: str | None = None
-    over: bool = False
-
-    def finish(self) -> None:
-        if not self.over:
-            self.over = True
-            self.post(AskEnded(self.tag, self.topic, self.replies, self.failure))
-
-    def time_out(self) -> None:
-        if not self.over:
-            self.failure = "timeout"
-            self.finish()
-
-
-@dataclass(eq=False)
-class _MemoryAnswerer:
-    asking: _Asking
-    interest: _Interest
-    index: int
-    ended: bool = False
-    last_arrival_ns: int = 0
-
-    def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
-        if self.ended:
-            raise RuntimeError("answered after the end")
-        asking, bus = self.asking, self.interest.bus
-        named = asking.topic.one({**self.interest.narrow, **fields})
-        if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
-            return
-        bus.counts["messages_out"] += 1
-        payload = encode(message)
-        reply = Replied(asking.tag, asking.topic, named, decode(payload, asking.topic.message))
-
-        def arrive() -> None:
-            if not asking.over:
-                asking.bus.counts["messages_in"] += 1
-                asking.replies += 1
-                asking.post(reply)
-
-        self._send(payload, arrive)
-
-    def refuse(self, reason: str) -> None:
-        def arrive() -> None:
-            self.asking.failure = reason
-
-        if not self.ended:
-            self._send(reason.encode(), arrive)
-
-    def end(self) -> None:
-        if self.ended:
-            return
-        self.ended = True
-
-        def arrive() -> None:
-            self.asking.waiting.discard(self.index)
-            if not self.asking.waiting:
-                self.asking.finish()
-
-        self._send(b"", arrive)
-
-    def _send(self, payload: bytes, arrive: Callable[[], None]) -> None:
-        """What answers one query stays in order; it may be lost or repeated."""
-        source, to, what = self.interest.bus, self.asking.bus, self.asking.topic.name
-        if source.closed:
-            return
-
-        def deliver() -> None:
-            if to.traced(source, what, payload):
-                arrive()
-
-        for arrival_ns in source.network.arrivals_ns(source, to, what):
-            self.last_arrival_ns = max(self.last_arrival_ns, arrival_ns)
-            source.network.scheduler.at(self.last_arrival_ns, deliver)
