@@ -31,6 +31,7 @@ NONE = np.uint8(255)
 SQRT2 = np.float32(1.4142135623730951)
 SQRT2_EXACT = 1.4142135623730951
 INF = np.float32(np.inf)
+HUGE = np.float32(3.4028235e38)
 LETHAL = np.float32(-1.0)
 """While growing, the cost of a lethal cell: below every key, so that a minimum leaves it alone."""
 
@@ -206,53 +207,52 @@ def flood_single(weight, cost, stride, root, diagonals, corners, width, ring, sh
             for p in range(position, stop):
                 u = np.uint64(pool[p])
                 key = cost[u] + weight[u]
-                i = u - s
-                north = cost[i]
-                cost[i] = min(north, key)
-                touched[count] = i
+                above = u - s
+                below = u + s
+                north = cost[above]
+                east = cost[u + _ONE]
+                south = cost[below]
+                west = cost[u - _ONE]
+                cost[above] = min(north, key)
+                touched[count] = above
                 count += np.uint64(north == INF)
-                i = u + _ONE
-                east = cost[i]
-                cost[i] = min(east, key)
-                touched[count] = i
+                cost[u + _ONE] = min(east, key)
+                touched[count] = u + _ONE
                 count += np.uint64(east == INF)
-                i = u + s
-                south = cost[i]
-                cost[i] = min(south, key)
-                touched[count] = i
+                cost[below] = min(south, key)
+                touched[count] = below
                 count += np.uint64(south == INF)
-                i = u - _ONE
-                west = cost[i]
-                cost[i] = min(west, key)
-                touched[count] = i
+                cost[u - _ONE] = min(west, key)
+                touched[count] = u - _ONE
                 count += np.uint64(west == INF)
-                if diagonals:
-                    ne = se = sw = nw = key
-                    if not corners:
-                        ne = key if min(north, east) >= np.float32(0.0) else INF
-                        se = key if min(south, east) >= np.float32(0.0) else INF
-                        sw = key if min(south, west) >= np.float32(0.0) else INF
-                        nw = key if min(north, west) >= np.float32(0.0) else INF
-                    i = u - s + _ONE
-                    old = cost[i]
-                    cost[i] = min(old, ne)
-                    touched[count] = i
-                    count += np.uint64((old == INF) & (ne < INF))
-                    i = u + s + _ONE
-                    old = cost[i]
-                    cost[i] = min(old, se)
-                    touched[count] = i
-                    count += np.uint64((old == INF) & (se < INF))
-                    i = u + s - _ONE
-                    old = cost[i]
-                    cost[i] = min(old, sw)
-                    touched[count] = i
-                    count += np.uint64((old == INF) & (sw < INF))
-                    i = u - s - _ONE
-                    old = cost[i]
-                    cost[i] = min(old, nw)
-                    touched[count] = i
-                    count += np.uint64((old == INF) & (nw < INF))
+                if not diagonals:
+                    continue
+                ne = above + _ONE
+                se = below + _ONE
+                sw = below - _ONE
+                nw = above - _ONE
+                if not corners and min(min(north, east), min(south, west)) < np.float32(0.0):
+                    # A step past a wall goes to cell 0 instead, which is lethal and takes no offer.
+                    ne = ne if min(north, east) >= np.float32(0.0) else _ZERO
+                    se = se if min(south, east) >= np.float32(0.0) else _ZERO
+                    sw = sw if min(south, west) >= np.float32(0.0) else _ZERO
+                    nw = nw if min(north, west) >= np.float32(0.0) else _ZERO
+                old = cost[ne]
+                cost[ne] = min(old, key)
+                touched[count] = ne
+                count += np.uint64(old == INF)
+                old = cost[se]
+                cost[se] = min(old, key)
+                touched[count] = se
+                count += np.uint64(old == INF)
+                old = cost[sw]
+                cost[sw] = min(old, key)
+                touched[count] = sw
+                count += np.uint64(old == INF)
+                old = cost[nw]
+                cost[nw] = min(old, key)
+                touched[count] = nw
+                count += np.uint64(old == INF)
             if end >> sh == position >> sh:
                 position = end
             else:
@@ -414,36 +414,38 @@ def flood_octile(weight, cost, stride, root, corners, width, ring, shift):
             for p in range(position, stop):
                 u = np.uint64(pool[p])
                 key = cost[u] + weight[u] * SQRT2
-                ne = se = sw = nw = key
+                above = u - s
+                below = u + s
+                ne = above + _ONE
+                se = below + _ONE
+                sw = below - _ONE
+                nw = above - _ONE
                 if not corners:
-                    north = cost[u - s]
+                    north = cost[above]
                     east = cost[u + _ONE]
-                    south = cost[u + s]
+                    south = cost[below]
                     west = cost[u - _ONE]
-                    ne = key if min(north, east) >= np.float32(0.0) else INF
-                    se = key if min(south, east) >= np.float32(0.0) else INF
-                    sw = key if min(south, west) >= np.float32(0.0) else INF
-                    nw = key if min(north, west) >= np.float32(0.0) else INF
-                i = u - s + _ONE
-                old = cost[i]
-                cost[i] = min(old, ne)
-                touched[count] = i
-                count += np.uint64((old == INF) & (ne < INF))
-                i = u + s + _ONE
-                old = cost[i]
-                cost[i] = min(old, se)
-                touched[count] = i
-                count += np.uint64((old == INF) & (se < INF))
-                i = u + s - _ONE
-                old = cost[i]
-                cost[i] = min(old, sw)
-                touched[count] = i
-                count += np.uint64((old == INF) & (sw < INF))
-                i = u - s - _ONE
-                old = cost[i]
-                cost[i] = min(old, nw)
-                touched[count] = i
-                count += np.uint64((old == INF) & (nw < INF))
+                    if min(min(north, east), min(south, west)) < np.float32(0.0):
+                        ne = ne if min(north, east) >= np.float32(0.0) else _ZERO
+                        se = se if min(south, east) >= np.float32(0.0) else _ZERO
+                        sw = sw if min(south, west) >= np.float32(0.0) else _ZERO
+                        nw = nw if min(north, west) >= np.float32(0.0) else _ZERO
+                old = cost[ne]
+                cost[ne] = min(old, key)
+                touched[count] = ne
+                count += np.uint64(old == INF)
+                old = cost[se]
+                cost[se] = min(old, key)
+                touched[count] = se
+                count += np.uint64(old == INF)
+                old = cost[sw]
+                cost[sw] = min(old, key)
+                touched[count] = sw
+                count += np.uint64(old == INF)
+                old = cost[nw]
+                cost[nw] = min(old, key)
+                touched[count] = nw
+                count += np.uint64(old == INF)
             if end >> sh == position >> sh:
                 position = end
             else:
@@ -457,57 +459,73 @@ def flood_octile(weight, cost, stride, root, corners, width, ring, shift):
 
 @njit(cache=True, nogil=True)
 def point_to_parents(weight, cost, stride, rule, corners, root, box, parent):
-    """Parent of each cell of a window: the neighbour with the smallest exit key; of equals the first clockwise from
-    north. Costs grow strictly along such parents, backwards, so that they cannot form a cycle."""
+    """Parent of each cell of a window: the neighbour with the smallest exit key; of equals the first of north,
+    east, south, west, then of the diagonals clockwise. Costs grow strictly along such parents, backwards, so that
+    they cannot form a cycle. box = (row0, col0, row1, col1)."""
     row0, col0, row1, col1 = box
-    s = np.uint64(stride)
-    step = SQRT2 if rule == RULE_OCTILE else _ONE32
     for row in range(row0, row1):
         first = np.uint64((row + 1) * stride + 1 + col0)
         last = np.uint64((row + 1) * stride + 1 + col1)
-        for i in range(first, last):
-            north = cost[i - s] + weight[i - s]
-            east = cost[i + _ONE] + weight[i + _ONE]
-            south = cost[i + s] + weight[i + s]
-            west = cost[i - _ONE] + weight[i - _ONE]
-            best = north
-            code = np.uint8(0)
-            if east < best:
-                best = east
-                code = np.uint8(2)
-            if south < best:
-                best = south
-                code = np.uint8(4)
-            if west < best:
-                best = west
-                code = np.uint8(6)
-            if rule != RULE_FOUR:
-                j = i - s + _ONE
-                key = cost[j] + weight[j] * step
-                key = key if corners or max(north, east) < INF else INF
-                if key < best:
-                    best = key
-                    code = np.uint8(1)
-                j = i + s + _ONE
-                key = cost[j] + weight[j] * step
-                key = key if corners or max(south, east) < INF else INF
-                if key < best:
-                    best = key
-                    code = np.uint8(3)
-                j = i + s - _ONE
-                key = cost[j] + weight[j] * step
-                key = key if corners or max(south, west) < INF else INF
-                if key < best:
-                    best = key
-                    code = np.uint8(5)
-                j = i - s - _ONE
-                key = cost[j] + weight[j] * step
-                key = key if corners or max(north, west) < INF else INF
-                if key < best:
-                    best = key
-                    code = np.uint8(7)
-            parent[i] = code if cost[i] < INF and best < INF else NONE
+        if rule == RULE_FOUR:
+            _parents_of_four(weight, cost, np.uint64(stride), first, last, parent)
+        else:
+            step = SQRT2 if rule == RULE_OCTILE else _ONE32
+            limit = INF if corners else HUGE
+            _parents_of_eight(weight, cost, np.uint64(stride), first, last, step, limit, parent)
     parent[root] = NONE
+
+
+@njit(cache=True, nogil=True)
+def _parents_of_four(weight, cost, s, first, last, parent):
+    for i in range(first, last):
+        best = cost[i - s] + weight[i - s]
+        code = np.uint8(0)
+        key = cost[i + _ONE] + weight[i + _ONE]
+        code = np.uint8(2) if key < best else code
+        best = min(best, key)
+        key = cost[i + s] + weight[i + s]
+        code = np.uint8(4) if key < best else code
+        best = min(best, key)
+        key = cost[i - _ONE] + weight[i - _ONE]
+        code = np.uint8(6) if key < best else code
+        best = min(best, key)
+        parent[i] = code if max(cost[i], best) < INF else NONE
+
+
+@njit(cache=True, nogil=True)
+def _parents_of_eight(weight, cost, s, first, last, step, limit, parent):
+    """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
+    vectorises."""
+    for i in range(first, last):
+        north = cost[i - s] + weight[i - s]
+        east = cost[i + _ONE] + weight[i + _ONE]
+        south = cost[i + s] + weight[i + s]
+        west = cost[i - _ONE] + weight[i - _ONE]
+        best = north
+        code = np.uint8(0)
+        code = np.uint8(2) if east < best else code
+        best = min(best, east)
+        code = np.uint8(4) if south < best else code
+        best = min(best, south)
+        code = np.uint8(6) if west < best else code
+        best = min(best, west)
+        key = cost[i - s + _ONE] + weight[i - s + _ONE] * step
+        key = key if max(north, east) <= limit else INF
+        code = np.uint8(1) if key < best else code
+        best = min(best, key)
+        key = cost[i + s + _ONE] + weight[i + s + _ONE] * step
+        key = key if max(south, east) <= limit else INF
+        code = np.uint8(3) if key < best else code
+        best = min(best, key)
+        key = cost[i + s - _ONE] + weight[i + s - _ONE] * step
+        key = key if max(south, west) <= limit else INF
+        code = np.uint8(5) if key < best else code
+        best = min(best, key)
+        key = cost[i - s - _ONE] + weight[i - s - _ONE] * step
+        key = key if max(north, west) <= limit else INF
+        code = np.uint8(7) if key < best else code
+        best = min(best, key)
+        parent[i] = code if max(cost[i], best) < INF else NONE
 
 
 @njit(cache=True, nogil=True)
