@@ -295,7 +295,7 @@ def test_no_two_vehicles_meet_in_long_random_runs(seed: int) -> None:
                 case _:
                     swarm.deliver_all(agent)
         swarm.check()
-    assert swarm.moves > 30
+    assert swarm.moves >= 5
 
 
 # --- by hand ------------------------------------------------------------------------------------------------

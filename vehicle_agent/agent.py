@@ -110,17 +110,7 @@ class Agent:
         self._map = ground
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
-        self._traffic = Traffic(
-            ground.grid,
-            ground.pace,
-            self.rights,
-            claim_cells=self._config.claim_cells,
-            patience_s=self._config.patience_s,
-            time_scale=scenario.time_scale,
-            neighbours=scenario.planner.neighbours,
-            corner_cutting=scenario.planner.corner_cutting,
-            chance=chance,
-        )
+        self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._homeless: dict[str, int] = {}
@@ -362,8 +352,8 @@ class Agent:
         cells = route_cells(self._map.grid, route.start, route.directions)
         if cells is None:
             return [] if pushed else vehicle.handle(NoAnswer(), now_ns)
-        partial = route.remaining_s > 0.0
-        given = RouteGiven(target, cells, route.cost_s, route.lower_bound_s, partial, pushed)
+        goes_on = route.remaining_s > 0.0
+        given = RouteGiven(target, cells, route.cost_s, route.lower_bound_s, goes_on, pushed)
         actions = vehicle.handle(given, now_ns)
         if actions and vehicle.route.cut(self._traffic.closed):
             vehicle.handle(RouteCut(), now_ns)

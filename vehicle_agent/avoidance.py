@@ -52,7 +52,9 @@ class _Other:
             for cell in cells:
                 self.held[cell] = vehicle
         self.wanted: dict[int, Rank] = {}
+        self.wanting: dict[int, list[str]] = {}
         for want in claims.wants:
+            self.wanting.setdefault(want.cell, []).append(want.vehicle)
             rank = (want.ticket, claims.agent, want.vehicle)
             if want.cell not in self.wanted or rank < self.wanted[want.cell]:
                 self.wanted[want.cell] = rank
@@ -62,7 +64,7 @@ class _Other:
 class Wanter:
     """Who wants a cell: `stands_on` is None of a vehicle that stands nowhere yet."""
 
-    rank: Rank
+    vehicle: str
     stands_on: int | None
 
 
@@ -80,6 +82,7 @@ class RightOfWay:
         self._clock = 0
         self._mine: dict[str, _Mine] = {}
         self._held_by: dict[int, str] = {}
+        self._wanting: dict[int, list[str]] | None = None
         self._others: dict[str, _Other] = {}
         self._alive: dict[str, int] = {}
         self._changed = True
@@ -138,6 +141,7 @@ class RightOfWay:
         old = {want.cell: want for want in mine.wants}
         if any(cell not in old for cell in wanted):
             self._clock += 1
+        self._wanting = None
         mine.wants = [old.get(cell) or _Wanted(cell, self._clock, self._seq + 1) for cell in wanted]
         self._changed = True
 
@@ -171,6 +175,7 @@ class RightOfWay:
                 mine.holds.append(want.cell)
                 self._held_by[want.cell] = vehicle
                 del mine.wants[0]
+                self._wanting = None
                 any_granted = self._changed = True
         return any_granted
 
@@ -208,11 +213,6 @@ class RightOfWay:
         mine = self._mine.get(vehicle)
         return [want.cell for want in mine.wants] if mine else []
 
-    def rank(self, vehicle: str) -> Rank | None:
-        """The rank of what the vehicle wants next, None if it wants nothing."""
-        mine = self._mine.get(vehicle)
-        return (mine.wants[0].ticket, self.agent, vehicle) if mine and mine.wants else None
-
     def holder(self, cell: int) -> str | None:
         """Who holds a cell, as far as we know; of a dead agent also who wanted it."""
         if cell in self._held_by:
@@ -224,21 +224,24 @@ class RightOfWay:
                 return other.wanted[cell][2]
         return None
 
-    def wanter(self, cell: int, besides: str) -> Wanter | None:
-        """Who, except the vehicle `besides`, is first in line for a cell."""
-        best: Wanter | None = None
-        for vehicle, mine in self._mine.items():
-            if vehicle != besides:
+    def wanters(self, cell: int, besides: str) -> list[Wanter]:
+        """Who wants a cell, the vehicle `besides` and the dead not among them."""
+        if self._wanting is None:
+            self._wanting = {}
+            for vehicle, mine in self._mine.items():
                 for want in mine.wants:
-                    rank = (want.ticket, self.agent, vehicle)
-                    if want.cell == cell and (best is None or rank < best.rank):
-                        best = Wanter(rank, mine.holds[0] if mine.holds else None)
+                    self._wanting.setdefault(want.cell, []).append(vehicle)
+        found = []
+        for vehicle in self._wanting.get(cell, ()):
+            if vehicle != besides:
+                holds = self._mine[vehicle].holds
+                found.append(Wanter(vehicle, holds[0] if holds else None))
         for agent, other in self._others.items():
-            found = other.wanted.get(cell)
-            if found is not None and (best is None or found < best.rank) and not self._dead(agent, other):
-                stands = other.claims.holds.get(found[2])
-                best = Wanter(found, stands[0] if stands else None)
-        return best
+            if cell in other.wanting and not self._dead(agent, other):
+                for vehicle in other.wanting[cell]:
+                    stands = other.claims.holds.get(vehicle)
+                    found.append(Wanter(vehicle, stands[0] if stands else None))
+        return found
 
     def answers(self) -> list[Claims]:
         """What a starting agent is told: where we are now, and the last words of all who cannot tell it."""

@@ -1,8 +1,13 @@
 """How vehicles get past each other: whom to wait for, when to make way, how to drive around.
 
 Right of way alone keeps vehicles apart but lets them block each other for good. Two rules undo that. Whoever stands
-on a cell that somebody wants, with nowhere to go, makes way. Of two that block each other the one whose want
-came later makes way: it is pushed along until it is out of the other's path, rests there, and asks for a new route.
+on a cell that somebody wants, with nowhere to go, makes way. Of two that face each other the weaker makes way: it
+steps back or aside, pushing others if it must, until it is out of the other's path, rests, and asks for a new
+route. And nobody wants a cell that a stronger one wants.
+
+How strong a vehicle is follows from its name and the hour, so that all agree without a word; and it is as strong as
+the strongest that waits behind it. So the strongest of a jam always gets through (priority inheritance: Okumura et
+al., "Priority inheritance with backtracking", 2019), and the lots are drawn anew before long.
 """
 
 from __future__ import annotations
@@ -10,6 +15,7 @@ from __future__ import annotations
 import heapq
 import math
 import random
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,11 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
+from swarm.config import Scenario
 from swarm.grid import GridSpec
 from swarm.messages import VehicleState
 from vehicle_agent.avoidance import RightOfWay, Wanter
 from vehicle_agent.vehicle import MadeWay, MakesWay, StillBlocked, Vehicle
 
+_LONGEST_QUEUE = 40
+_LOTS_LAST = 15.0
+"""Lots are drawn anew after so many times the patience."""
 _DETOUR_CELLS = 6
 _DETOUR_HORIZON = 40
 _POLITE_NS = NS_PER_S * 3 // 10
@@ -50,22 +60,19 @@ class Traffic:
         grid: GridSpec,
         pace: NDArray[np.float32],
         rights: RightOfWay,
-        *,
-        claim_cells: int,
-        patience_s: float,
-        time_scale: float,
-        neighbours: int,
-        corner_cutting: bool,
+        scenario: Scenario,
         chance: random.Random,
     ) -> None:
         self._grid = grid
         self._pace = pace.reshape(-1)
         self._rights = rights
-        self._claim_cells = claim_cells
-        self._patience_s = patience_s
-        self._cell_scale = grid.resolution_m / time_scale
-        self._neighbours = neighbours
-        self._corner_cutting = corner_cutting
+        self._claim_cells = scenario.vehicles.claim_cells
+        self._patience_s = scenario.vehicles.patience_s
+        self._cell_scale = grid.resolution_m / scenario.time_scale
+        flat_s = self._cell_scale / scenario.cost.flat_speed_m_per_s
+        self._lots_ns = max(1, int(_LOTS_LAST * (self._patience_s + 2 * flat_s) * NS_PER_S))
+        self._neighbours = scenario.planner.neighbours
+        self._corner_cutting = scenario.planner.corner_cutting
         self._chance = chance
         self._notes: dict[str, _Standing] = {}
 
@@ -91,25 +98,26 @@ class Traffic:
             return False
         if note.aside is not None and self._aside_goes_on(vehicle, note, now_ns):
             return False
-        wanter = self._rights.wanter(vehicle.cell, besides=vehicle.id)
-        if wanter is None:
+        wanters = self._rights.wanters(vehicle.cell, besides=vehicle.id)
+        if not wanters:
             note.wanted_since_ns = None
         elif note.wanted_since_ns is None:
             note.wanted_since_ns = now_ns
         ahead = self._ahead(vehicle, note, now_ns)
         self._rights.ask(vehicle.id, ahead)
-        if not ahead:
+        next_cell = self.next_cell(vehicle, now_ns)
+        if next_cell is None:
             note.blocked_since_ns = None
-            self._stand(vehicle, note, wanter, in_reach, now_ns)
+            self._stand(vehicle, note, wanters, in_reach, now_ns)
             return False
-        if self._rights.holds(vehicle.id)[1:2] == ahead[:1]:
+        if self._rights.holds(vehicle.id)[1:2] == [next_cell]:
             note.blocked_since_ns = None
             return False
         if note.blocked_since_ns is None:
             note.blocked_since_ns = now_ns
             note.patience_ns = self._patience(vehicle)
-        self._wait(vehicle, note, wanter, in_reach, now_ns)
-        return self._in_the_way(vehicle.id, ahead[0])
+        self._wait(vehicle, note, next_cell, wanters, in_reach, now_ns)
+        return self._in_the_way(vehicle.id, next_cell)
 
     # --- what to claim --------------------------------------------------------------------------------------
 
@@ -121,13 +129,24 @@ class Traffic:
         if vehicle.state is VehicleState.ARRIVED or vehicle.resting(now_ns):
             return [] if entering is None else [entering]
         claims: list[int] = []
+        held = self._rights.holds(vehicle.id)
         for cell in vehicle.route.ahead(self._claim_cells):
-            if self.closed(cell):
+            if self.closed(cell) or (cell not in held and self._deferred(vehicle, cell, now_ns)):
                 break
             claims.append(cell)
             if self._in_the_way(vehicle.id, cell):
                 break
         return claims
+
+    def _deferred(self, vehicle: Vehicle, cell: int, now_ns: int) -> bool:
+        """Whether a stronger one wants the cell."""
+        rivals = self._rights.wanters(cell, besides=vehicle.id)
+        if not rivals:
+            return False
+        behind = self._rights.wanters(vehicle.cell, besides=vehicle.id)
+        rivals = [rival for rival in rivals if rival not in behind]
+        mine = min([self._strength(vehicle.id, now_ns), *self._strengths(vehicle.id, behind, now_ns)])
+        return any(strength < mine for strength in self._strengths(vehicle.id, rivals, now_ns))
 
     def _in_the_way(self, vehicle: str, cell: int) -> bool:
         holder = self._rights.holder(cell)
@@ -140,6 +159,29 @@ class Traffic:
         # Of two that wait for each other one loses patience first.
         return int((self._patience_s + crossing_s) * self._chance.uniform(0.8, 1.6) * NS_PER_S)
 
+    # --- who is the stronger --------------------------------------------------------------------------------
+
+    def _strength(self, vehicle: str, now_ns: int) -> int:
+        """By lot, the same in every process; the lower is the stronger."""
+        return zlib.crc32(f"{now_ns // self._lots_ns}/{vehicle}".encode())
+
+    def _strengths(self, vehicle: str, wanters: list[Wanter], now_ns: int) -> list[int]:
+        """Of each of those who want the vehicle's place: its own, or that of the strongest behind it."""
+        return [self._inherited(wanter, {vehicle}, now_ns) for wanter in wanters]
+
+    def _inherited(self, wanter: Wanter, passed: set[str], now_ns: int) -> int:
+        strength = self._strength(wanter.vehicle, now_ns)
+        passed.add(wanter.vehicle)
+        if wanter.stands_on is not None and len(passed) < _LONGEST_QUEUE:
+            for behind in self._rights.wanters(wanter.stands_on, besides=wanter.vehicle):
+                if behind.vehicle not in passed:
+                    strength = min(strength, self._inherited(behind, passed, now_ns))
+        return strength
+
+    def _strongest(self, vehicle: str, wanters: list[Wanter], now_ns: int) -> Wanter:
+        strengths = self._strengths(vehicle, wanters, now_ns)
+        return wanters[strengths.index(min(strengths))]
+
     # --- making way -----------------------------------------------------------------------------------------
 
     def _aside_goes_on(self, vehicle: Vehicle, note: _Standing, now_ns: int) -> bool:
@@ -151,7 +193,7 @@ class Traffic:
             vehicle.handle(MadeWay(now_ns + 2 * note.patience_ns), now_ns)
             return False
         assert note.aside is not None
-        given_up = now_ns - note.aside_since_ns > note.patience_ns or self.closed(note.aside)
+        given_up = now_ns - note.aside_since_ns > 4 * note.patience_ns or self.closed(note.aside)
         if given_up and self._rights.holds(vehicle.id)[1:2] != [note.aside]:
             note.aside = None
             note.patience_ns = self._patience(vehicle)
@@ -164,13 +206,14 @@ class Traffic:
         self,
         vehicle: Vehicle,
         note: _Standing,
-        wanter: Wanter | None,
+        wanters: list[Wanter],
         in_reach: Callable[[int], bool],
         now_ns: int,
     ) -> None:
         """It has nowhere to go: make way for whoever has. Whoever has arrived stays in reach as long as it can."""
-        if wanter is None or note.wanted_since_ns is None:
+        if not wanters or note.wanted_since_ns is None:
             return
+        wanter = self._strongest(vehicle.id, wanters, now_ns)
         wanted_ns = now_ns - note.wanted_since_ns
         if wanted_ns < (0 if vehicle.resting(now_ns) else _POLITE_NS):
             return
@@ -184,7 +227,8 @@ class Traffic:
         self,
         vehicle: Vehicle,
         note: _Standing,
-        wanter: Wanter | None,
+        next_cell: int,
+        wanters: list[Wanter],
         in_reach: Callable[[int], bool],
         now_ns: int,
     ) -> None:
@@ -193,17 +237,20 @@ class Traffic:
         waited_ns = now_ns - note.blocked_since_ns
         if waited_ns < note.patience_ns:
             return
-        rank = self._rights.rank(vehicle.id)
-        yields = wanter is not None and rank is not None and wanter.rank < rank
-        gives_in = wanter is not None and (yields or waited_ns > 4 * note.patience_ns)
-        if gives_in and wanter is not None and self._step_aside(vehicle, note, wanter, None, now_ns):
-            return
+        facing = [wanter for wanter in wanters if wanter.stands_on == next_cell]
+        behind = [wanter for wanter in wanters if wanter.stands_on != next_cell]
+        mine = min([self._strength(vehicle.id, now_ns), *self._strengths(vehicle.id, behind, now_ns)])
+        weaker = facing and min(self._strengths(vehicle.id, facing, now_ns)) < mine
+        if weaker or (wanters and waited_ns > 8 * note.patience_ns):
+            wanter = self._strongest(vehicle.id, facing or wanters, now_ns)
+            if self._step_aside(vehicle, note, wanter, None, now_ns):
+                return
         if now_ns >= note.detour_due_ns:
-            note.detour_due_ns = now_ns + note.patience_ns
+            note.detour_due_ns = now_ns + max(waited_ns, note.patience_ns)  # less often the longer it is in vain
             if self._detour(vehicle, in_reach):
                 note.blocked_since_ns = None
                 return
-        if waited_ns > 6 * note.patience_ns:
+        if waited_ns > 10 * note.patience_ns:
             note.blocked_since_ns = now_ns
             note.patience_ns = self._patience(vehicle)
             vehicle.handle(StillBlocked(), now_ns)
@@ -227,7 +274,7 @@ class Traffic:
                 if in_reach is not None:
                     continue
                 score += 10.0
-            elif self._rights.wanter(cell, besides=vehicle.id) is not None:
+            elif self._rights.wanters(cell, besides=vehicle.id):
                 score += 3.0
             if best is None or (score, cell) < best:
                 best = (score, cell)
