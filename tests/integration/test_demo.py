@@ -22,7 +22,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
     ) as process:
         out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
-    assert not session_of(process.pid)
+    eventually(lambda: not session_of(process.pid), 5, "the end of all")
     (run_dir,) = tmp_path.iterdir()
     printed, report = json.loads(out), json.loads((run_dir / "report.json").read_text())
     assert {name: report[name] for name in printed} == printed
