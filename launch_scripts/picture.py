@@ -261,7 +261,7 @@ def _draw_scale_bar(axes: Axes, width_km: float, height_km: float) -> None:
         axes.plot([x0, x0 + length_km], [y0, y0], color=colour, linewidth=width, solid_capstyle="butt", zorder=11)
     label = f"{length_km:g} km" if length_km >= 1 else f"{length_km * 1000:g} m"
     axes.annotate(
-        label, (x0 + length_km / 2, y0), xytext=(0, 5), textcoords="offset points", ha="center", fontsize=9.5,
+        label, (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left", fontsize=9.5,
         fontweight="bold", zorder=11, path_effects=halo(),
     )  # fmt: skip
 
