@@ -71,12 +71,18 @@ class MemoryNetwork:
         self.links = links
         self.buses: list[MemoryBus] = []
         self.trace = trace
+        self.subscriptions: dict[tuple[str, str], _Index] = {}
         self._down: set[str] = set()
 
     def bus(self, node: str, namespace: str = "swarm") -> MemoryBus:
         bus = MemoryBus(self, node, namespace)
         self.buses.append(bus)
         return bus
+
+    def subscribers(self, namespace: str, topic: str, fields: Mapping[str, str]) -> list[Interest]:
+        """The subscriptions that a value with these fields reaches, in an order that depends on nothing else."""
+        index = self.subscriptions.get((namespace, topic))
+        return [] if index is None else index.find(fields)
 
     def connected(self, source: MemoryBus, to: MemoryBus) -> bool:
         if source is to:
@@ -129,6 +135,29 @@ class Interest:
         return not self.narrow or _meet(self.narrow, fields)
 
 
+class _Index:
+    """The subscriptions of one topic: a hundred vehicles each listen to a key of their own."""
+
+    def __init__(self) -> None:
+        self._wide: list[Interest] = []
+        self._exact: dict[tuple[str, ...], list[Interest]] = {}
+
+    def add(self, interest: Interest, topic: Topic) -> None:
+        if len(interest.narrow) == len(topic.fields):
+            self._exact.setdefault(tuple(interest.narrow.values()), []).append(interest)
+        else:
+            self._wide.append(interest)
+
+    def remove(self, bus: MemoryBus) -> None:
+        self._wide = [interest for interest in self._wide if interest.bus is not bus]
+        for key, interests in list(self._exact.items()):
+            self._exact[key] = [interest for interest in interests if interest.bus is not bus]
+
+    def find(self, fields: Mapping[str, str]) -> list[Interest]:
+        found = [interest for interest in self._wide if interest.meets(fields)]
+        return found + self._exact.get(tuple(fields.values()), [])
+
+
 def _interest(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post) -> Interest:
     every = topic.every(fields)
     return Interest(bus, {name: chunk for name, chunk in every.items() if chunk != "*"}, post)
@@ -151,31 +180,30 @@ class MemoryBus:
         self.namespace = namespace
         self.closed = False
         self.counts: dict[str, int] = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
-        self.subscriptions: dict[str, list[Interest]] = {}
         self.queryables: dict[str, list[Interest]] = {}
         self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
         self.tokens: list[Peer] = []
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        self.publish_bytes(topic, encode(message), topic.one(fields))
+        self.publish_bytes(topic, encode(message), fields)
 
-    def publish_bytes(self, topic: Topic, payload: bytes, fields: dict[str, str]) -> None:
+    def publish_bytes(self, topic: Topic, payload: bytes, fields: Mapping[str, str | int]) -> None:
         """Put any payload at all: tests send garbage through this."""
         if self.closed:
             return
         self.counts["messages_out"] += 1
-        sample = _Sample(topic, fields, payload)
+        named = topic.one(fields)
+        sample = _Sample(topic, named, payload)
         network = self.network
-        for bus in network.buses:
-            for interest in bus.subscriptions.get(topic.name, ()):
-                if interest.meets(fields) and bus.namespace == self.namespace:
-                    for when_ns in network.arrivals_ns(self, bus, topic.name):
-                        network.scheduler.at(when_ns, _Arrival(self, interest, sample))
+        for interest in network.subscribers(self.namespace, topic.name, named):
+            for when_ns in network.arrivals_ns(self, interest.bus, topic.name):
+                network.scheduler.at(when_ns, _Arrival(self, interest, sample))
 
     def subscribe(self, topic: Topic, post: Post, **fields: str | int) -> None:
         interest = _interest(self, topic, fields, post)
-        self.subscriptions.setdefault(topic.name, []).append(interest)
+        index = self.network.subscriptions.setdefault((self.namespace, topic.name), _Index())
+        index.add(interest, topic)
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         if topic.request is None:
@@ -240,6 +268,8 @@ class MemoryBus:
             return
         self.closed = True
         self.network.buses.remove(self)
+        for index in self.network.subscriptions.values():
+            index.remove(self)
         self.network.compare_tokens()
 
     def later(self, delay_ns: int, post: Post, event: Event) -> None:

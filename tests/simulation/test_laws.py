@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
 from simulated_swarm import SMALL, Laws, missing, planned, replica_of, seeded
 
+from launch_scripts import simulate as simulate_module
 from launch_scripts.faults import Crash, FaultPlan, Partition
 from launch_scripts.simulate import Simulation, simulate
+from swarm.config import load_scenario
 
+SCENARIOS = Path(simulate_module.__file__).parent / "scenarios"
 SECONDS = 24.0
 SETTLED_S = 4.0
 """What was said so long ago has reached everybody, once all is quiet."""
@@ -138,3 +143,18 @@ def test_targets_that_evade_jump_or_stand_still_are_caught():
     assert result.report["captures"] > 0
     assert result.report["collisions"] == result.report["lethal_entries"] == 0
     assert result.report["targets"] == 4
+
+
+@pytest.mark.slow
+def test_the_demo_on_real_terrain_routes_everybody_and_captures():
+    scenario = load_scenario(SCENARIOS / "jacksboro.toml")
+    simulation = Simulation(scenario)
+    laws = Laws(simulation)
+    simulation.run_until(10)
+    simulation.finish()
+    report = simulation.report(10)
+    assert report["vehicles_routed"] == report["vehicles"] == 100
+    assert report["captures"] > 0
+    assert report["marks"] > 0
+    assert report["collisions"] == report["lethal_entries"] == report["lost"] == 0
+    assert laws.collisions == laws.lethal == []
