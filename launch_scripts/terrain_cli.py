@@ -215,15 +215,25 @@ def synth(
     cols: Annotated[int, typer.Option(min=8, max=16384)] = 512,
     resolution_m: Annotated[float, typer.Option(min=0.01)] = 30.0,
     relief_m: Annotated[float, typer.Option(min=0, help="Metres from lowest to highest.")] = 400.0,
+    rivers: Annotated[int, typer.Option(min=0, max=50)] = 2,
+    roads: Annotated[int, typer.Option(min=0, max=200)] = 6,
     seed: Annotated[int, typer.Option(min=0)] = 1,
     photo: Annotated[Path | None, typer.Option(help="Write a photo of it (.tif) too.")] = None,
     picture: PictureOption = None,
 ) -> None:
-    """Make a synthetic landscape: mountains, valleys, rivers, forest. A seed makes the same one again."""
+    """Make a synthetic landscape: mountains, valleys, rivers, forest, roads. A seed makes the same again."""
     from shared_map.terrain import build_terrain
     from swarm.grid import GridSpec
 
-    config = TerrainConfig(source="synthetic", rows=rows, cols=cols, relief_m=relief_m, resolution_m=resolution_m)
+    config = TerrainConfig(
+        source="synthetic",
+        rows=rows,
+        cols=cols,
+        relief_m=relief_m,
+        resolution_m=resolution_m,
+        rivers=rivers,
+        roads=roads,
+    )
     with _bars() as tell:
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")

@@ -58,12 +58,14 @@ def _price(pace: Floats, stride: int) -> Floats:
 
 
 def _places(price: Floats, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Seeded places on cheap ground, apart from each other."""
+    """Seeded places on cheap ground of the largest connected part, apart from each other."""
     rows, cols = price.shape
     passable = price[np.isfinite(price)]
     if passable.size == 0:
         return []
-    candidates = np.flatnonzero(price.reshape(-1) <= np.quantile(passable, 0.3))
+    candidates = np.flatnonzero((price <= np.quantile(passable, 0.3)) & _largest_part(np.isfinite(price)))
+    if len(candidates) == 0:
+        return []
     apart = 0.5 * np.sqrt(rows * cols / count)
     places: list[tuple[int, int]] = []
     for attempt in range(count * 60):
@@ -75,6 +77,16 @@ def _places(price: Floats, count: int, rng: np.random.Generator) -> list[tuple[i
             if len(places) == count:
                 break
     return places
+
+
+def _largest_part(passable: Bools) -> Bools:
+    """Only places that can reach each other get roads."""
+    from scipy import ndimage
+
+    labels, _ = ndimage.label(passable)
+    sizes = np.bincount(labels.reshape(-1))
+    sizes[0] = 0
+    return np.asarray(labels == np.argmax(sizes), np.bool_)
 
 
 def _drawn(laid: Bools, stride: int, pace: Floats) -> Bools:

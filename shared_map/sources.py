@@ -65,7 +65,7 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
     from shared_map.synthetic import landscape
 
     resolution_m = config.resolution_m or SYNTHETIC_RESOLUTION_M
-    elevation_m, classes = landscape(config.rows, config.cols, resolution_m, config.relief_m, seed)
+    elevation_m, classes = landscape(config.rows, config.cols, resolution_m, config.relief_m, seed, config.rivers)
     grid = GridSpec(config.rows, config.cols, resolution_m)
     return Source(grid, elevation_m, classes, notes=(f"synthetic landscape, seed {seed}",))
 

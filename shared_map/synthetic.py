@@ -65,13 +65,57 @@ def _along(lattice: Floats, count: int, scale: float, offset: float) -> Floats:
     return between
 
 
+def mountains(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
+    """As `fractal`, of gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the work."""
+    field = np.zeros((rows, cols), np.float32)
+    amplitude, scale, total = 1.0, float(coarsest), 0.0
+    while scale >= 2.0 and amplitude > 0.01:
+        octave = _gradient_noise(rng, rows, cols, scale)
+        if ridged:
+            np.abs(octave, out=octave)
+            octave *= np.float32(-2)
+            octave += np.float32(1)
+        octave *= np.float32(amplitude)
+        field += octave
+        total += amplitude
+        amplitude *= 0.45
+        scale /= 2.0
+    field /= np.float32(max(total, 1.0))
+    return field
+
+
+def _gradient_noise(rng: np.random.Generator, rows: int, cols: int, scale: float) -> Floats:
+    """Each lattice point has a slope; between points the four slopes are blended. Separable, hence two sums."""
+    high, wide = int(rows / scale) + 3, int(cols / scale) + 3
+    south, east = (rng.uniform(-1.0, 1.0, (high, wide)).astype(np.float32) for _ in range(2))
+    low_row, near_row, far_row, row_part = _blend(rows, scale, float(rng.uniform()))
+    low_col, near_col, far_col, col_part = _blend(cols, scale, float(rng.uniform()))
+    near, far = (near_row * row_part)[:, None], (far_row * (row_part - np.float32(1)))[:, None]
+    rising = south[low_row] * near + south[low_row + 1] * far
+    across = east[low_row] * near_row[:, None] + east[low_row + 1] * far_row[:, None]
+    field: Floats = rising[:, low_col] * near_col + rising[:, low_col + 1] * far_col
+    field += across[:, low_col] * (near_col * col_part)
+    field += across[:, low_col + 1] * (far_col * (col_part - np.float32(1)))
+    field *= np.float32(1.5)
+    return field
+
+
+def _blend(count: int, scale: float, offset: float) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
+    """Lattice point before each cell, the weights of it and of the next, and how far along the cell lies."""
+    at = np.arange(count) / scale + offset
+    low = at.astype(np.intp)
+    part = (at - low).astype(np.float32)
+    far = part * part * part * (part * (part * np.float32(6) - np.float32(15)) + np.float32(10))
+    return low, (np.float32(1) - far).astype(np.float32), far.astype(np.float32), part
+
+
 def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Floats:
     """Mountains with sharp crests, broad valleys and plains, `relief_m` from lowest to highest."""
     rng = np.random.default_rng([seed, 1])
     broad = max(min(rows, cols) / 2.5, 8.0)
-    ridges = fractal(rng, rows, cols, broad, ridged=True)
-    where = fractal(rng, rows, cols, broad * 1.5)
-    hills = fractal(rng, rows, cols, broad / 2)
+    ridges = mountains(rng, rows, cols, broad, ridged=True)
+    where = mountains(rng, rows, cols, broad * 1.5)
+    hills = mountains(rng, rows, cols, broad / 2)
     where -= np.float32(where.min())
     where /= np.float32(max(float(where.max()), 1e-6))
     height = ridges * where * where + hills * np.float32(0.15)
@@ -80,10 +124,20 @@ def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Flo
     return height
 
 
-def landscape(rows: int, cols: int, resolution_m: float, relief_m: float, seed: int) -> tuple[Floats, Bytes]:
+def landscape(
+    rows: int, cols: int, resolution_m: float, relief_m: float, seed: int, rivers: int = 0
+) -> tuple[Floats, Bytes]:
     """Heights and classes of a synthetic terrain."""
     elevation_m = synthetic_elevation(rows, cols, relief_m, seed)
-    return elevation_m, cover(elevation_m, resolution_m, seed)
+    if rivers == 0:
+        return elevation_m, cover(elevation_m, resolution_m, seed)
+    from shared_map.rivers import carve
+
+    elevation_m, water, fords = carve(elevation_m, rivers, resolution_m, seed)
+    classes = cover(elevation_m, resolution_m, seed)
+    classes[water] = TerrainClass.WATER
+    classes[fords] = TerrainClass.SOIL
+    return elevation_m, classes
 
 
 def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:

@@ -71,6 +71,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     height_scale  metres per unit of height, where the file does not say it (.png)
     nodata        voids are lethal, or filled from their surroundings
     roads         how many roads to lay between seeded places, as there is no map of them
+    rows, cols    size of a synthetic terrain; relief_m from its lowest to its highest cell, rivers across it
     """
 
     source: str = "jacksboro"
@@ -84,6 +85,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     rows: Annotated[int, Meta(ge=1, le=16384)] = 256
     cols: Annotated[int, Meta(ge=1, le=16384)] = 256
     relief_m: NotNegative = 400.0
+    rivers: Annotated[int, Meta(ge=0, le=50)] = 0
     hidden: HiddenConfig = HiddenConfig()
 
 

@@ -130,3 +130,22 @@ def test_agents_that_load_a_prepared_terrain_import_nothing_slow(tmp_path: Path)
         f"found = [m for m in {slow!r} if m in sys.modules]; assert not found, found"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent.parent, timeout=60)
+
+
+@pytest.mark.parametrize("size", [(120, 150), (700, 640)])
+def test_rivers_cross_a_synthetic_terrain_and_can_be_forded(size: tuple[int, int]) -> None:
+    rows, cols = size
+    source = TerrainConfig(source="synthetic", rows=rows, cols=cols, rivers=2, roads=3)
+    terrain = build_terrain(Scenario(seed=6, terrain=source, cost=CostConfig(max_slope_deg=60)))
+    water = terrain.classes == TerrainClass.WATER
+    assert rows / 2 < water.sum() < 6 * (rows + cols)
+    assert water.any(axis=1).mean() > 0.75
+    labels, _ = ndimage.label(np.isfinite(terrain.pace_s_per_m))
+    assert np.bincount(labels.ravel())[1:].max() > 0.97 * np.isfinite(terrain.pace_s_per_m).sum()
+    assert terrain.elevation_m[water].mean() < terrain.elevation_m.mean()
+
+
+def test_a_small_synthetic_terrain_is_built_too() -> None:
+    for rows, cols in ((1, 1), (2, 3), (9, 9)):
+        source = TerrainConfig(source="synthetic", rows=rows, cols=cols, relief_m=1.0)
+        assert build_terrain(Scenario(terrain=source)).grid.cells == rows * cols
