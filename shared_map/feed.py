@@ -219,4 +219,3 @@ class MapFeed:
     def _silent(self, author: str, now_ns: int) -> bool:
         heard_ns = self._heard_ns.get(author, self._started_ns)
         return author != self.replica.author and now_ns - heard_ns > 3 * self._digest_ns
-
