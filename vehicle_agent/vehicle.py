@@ -19,19 +19,19 @@ PREFETCH_CELLS = 8
 
 
 class Reason(enum.Enum):
-    """Why a vehicle asks for a route. All but the first three are re-route requests."""
+    """Why a vehicle asks for a route. The last three are re-route requests: its own route does not lead it on."""
 
     ASSIGNED = "assigned"
     CONTINUED = "continued"
     PLANNER_BACK = "planner back"
+    JUMPED = "target jumped"
     RAN_OUT = "ran out"
     CUT = "cut"
     BLOCKED = "blocked"
-    JUMPED = "jumped"
 
     @property
     def is_reroute(self) -> bool:
-        return self in (Reason.RAN_OUT, Reason.CUT, Reason.BLOCKED, Reason.JUMPED)
+        return self in (Reason.RAN_OUT, Reason.CUT, Reason.BLOCKED)
 
 
 # --- events -------------------------------------------------------------------------------------------------
