@@ -6,6 +6,9 @@ root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 venv="$root/.venv"
 stamp="$venv/.installed"
 
+# Where it is set, every start would compile every module of every dependency again: seconds. They stay in this folder.
+unset PYTHONDONTWRITEBYTECODE
+
 say() { echo "$@" >&2; }
 
 suits() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; }
