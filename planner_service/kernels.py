@@ -97,10 +97,15 @@ def weight_range(weight):
 
 
 @njit(cache=True, nogil=True)
-def open_costs(weight, cost):
-    """Before a flood: inf on passable cells, LETHAL on the others."""
+def open_costs(weight, active, cost):
+    """Before a flood: inf on passable cells, LETHAL on the others; 0 on passable ones that are not to take part,
+    which is below every key too. `active` is empty if all take part."""
+    if active.size == 0:
+        for i in range(weight.size):
+            cost[i] = INF if weight[i] < INF else LETHAL
+        return
     for i in range(weight.size):
-        cost[i] = INF if weight[i] < INF else LETHAL
+        cost[i] = (INF if active[i] else np.float32(0.0)) if weight[i] < INF else LETHAL
 
 
 @njit(cache=True, nogil=True)
@@ -112,8 +117,10 @@ def close_costs(cost):
 
 
 @njit(cache=True, nogil=True)
-def flood_single(weight, cost, stride, root, diagonals, corners, width, ring, shift):
+def flood_single(weight, active, cost, stride, root, diagonals, corners, width, ring, shift):
     """First-touch flood where every step has length 1: one exit key per cell. `cost` is written whole.
+
+    active uint8    the cells that take part; empty if all
 
     width  of a bucket, s: below the smallest weight, so that nothing in a bucket leads back into it
     ring   buckets in the circular queue, a power of two; ring * width exceeds the largest weight by two widths
@@ -142,7 +149,7 @@ def flood_single(weight, cost, stride, root, diagonals, corners, width, ring, sh
     touched = np.empty(1024 + 8 * 64, np.uint32)
     capacity = np.uint64(touched.size - 8)
 
-    open_costs(weight, cost)
+    open_costs(weight, active, cost)
     root = np.uint64(root)
     cost[root] = np.float32(0.0)
     touched[0] = root
@@ -265,7 +272,7 @@ def flood_single(weight, cost, stride, root, diagonals, corners, width, ring, sh
 
 
 @njit(cache=True, nogil=True)
-def flood_octile(weight, cost, stride, root, corners, width, ring, shift):
+def flood_octile(weight, active, cost, stride, root, corners, width, ring, shift):
     """As `flood_single`, for octile steps: a cell waits twice, under its straight and under its diagonal exit key.
 
     Buckets 0..ring-1 of the queue hold straight exits, ring..2*ring-1 diagonal ones.
@@ -292,7 +299,7 @@ def flood_octile(weight, cost, stride, root, corners, width, ring, shift):
     touched = np.empty(1024 + 4 * 64, np.uint32)
     capacity = np.uint64(touched.size - 8)
 
-    open_costs(weight, cost)
+    open_costs(weight, active, cost)
     root = np.uint64(root)
     cost[root] = np.float32(0.0)
     touched[0] = root

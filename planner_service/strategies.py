@@ -1,11 +1,12 @@
 """How one target's tree is kept up with: what is grown when the target moves or the map changes.
 
-    full                              the exact tree, every time
-    variable_range                    the paper's: a window around the target, as wide as its movement asks for
-    rotation                          small windows every move, every `full_every` moves a full growth on a worker
-    multi_resolution                  the whole terrain, coarser with the distance from the target
-    variable_range+multi_resolution   the paper's combination: windows near, the coarse tree far
-    auto                              full while it fits `cpu_budget`, then rotation, then coarse and rotation
+    full              the exact tree, every time
+    variable_range    the paper's: a window around the target, as wide as its movement asks for
+    rotation          small windows every move, and every `full_every` moves a full growth on a worker
+    multi_resolution  every move: all cells near the target, far away only those that carry the traffic
+    variable_range+multi_resolution
+                      the paper's combination: small windows, and the coarse tree where a window gets wide
+    auto              full while it fits `cpu_budget`, then rotation as often as that allows
 
 `TargetTree` has no thread, no clock and no bus: `full_job` returns the long work as a closure for a worker, `adopt`
 takes its result. Whatever happened, the tree that `routes` reads has no cycle and crosses no lethal cell.
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service import kernels
-from planner_service.tree import Changes, CostToGoTree, Floats, Ground, check_pace, flood
+from planner_service.tree import Changes, CostToGoTree, Floats, Ground, Skeleton, check_pace, find_skeleton, flood
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.messages import Route, RouteStatus
@@ -51,6 +52,8 @@ MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
 REPAIR_SHARE = 16
 """A repair that concerns more than one cell in so many gives way to a full growth."""
+WIDE_SHARE = 16
+"""A window over one cell in so many gives way to a coarse growth, where there is a skeleton for it."""
 ROUNDING = 2.0**-23
 """Relative error of one float32 step, doubled for the sum over a route's steps."""
 
@@ -97,6 +100,7 @@ class GrownTree:
     reach: float
     offered: NDArray[np.uint8] | None
     stride: int
+    skeleton: Skeleton | None = None
 
     @property
     def cost_to_go(self) -> Floats:
@@ -132,6 +136,8 @@ class TargetTree:
         self._stale = True
         self._moves = 0
         self._job_out = False
+        # Of the coarse strategies. It holds for the map on which it was found, so that a change unmakes it.
+        self._skeleton: Skeleton | None = None
         self._full_ns = self.measured_model_ns()
         # Lower bounds: `_potential` is an exact tree of an earlier root; no step costs less than it falls by.
         self._potential: Floats | None = None
@@ -171,6 +177,7 @@ class TargetTree:
         serves_it = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if serves_it else None
         self._job_out = True
+        wants_skeleton = self._coarse
 
         def job() -> GrownTree:
             ground = Ground(grid, config)
@@ -178,6 +185,7 @@ class TargetTree:
             cost = np.full(ground.size, np.inf, np.float32)
             parent = np.full(ground.size, kernels.NONE, np.uint8)
             reach = 0.0
+            skeleton = None
             if grid.inside(*divmod(target_cell, grid.cols)) and ground.passable(target_cell):
                 root = ground.pad(target_cell)
                 reach = flood(
@@ -191,7 +199,10 @@ class TargetTree:
                     cost,
                     parent,
                 )
-            return GrownTree(target_cell, map_version, cost, parent, ground.weight, reach, offered, ground.stride)
+                skeleton = find_skeleton(ground) if wants_skeleton else None
+            return GrownTree(
+                target_cell, map_version, cost, parent, ground.weight, reach, offered, ground.stride, skeleton
+            )
 
         return job
 
@@ -224,6 +235,7 @@ class TargetTree:
         tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
         self._potential = grown.cost.copy()
         self._stale = False
+        self._skeleton = None if since.cells.size else grown.skeleton
         moved = target_cell != tree.root
         if moved and not self._windows:
             return self._grow_full(target_cell)
@@ -334,6 +346,10 @@ class TargetTree:
         return strategy != "full"
 
     @property
+    def _coarse(self) -> bool:
+        return self._config.strategy in ("multi_resolution", "variable_range+multi_resolution")
+
+    @property
     def _budget_ns(self) -> float:
         """CPU time that a tick may take."""
         return self._config.cpu_budget * 1e9 / self._config.tick_hz
@@ -354,6 +370,10 @@ class TargetTree:
             self._loaded = True
             return None
         changes = self._ground.apply(pace, dirty)
+        if changes.cells.size:
+            self._skeleton = None
+        if changes.any_lower:
+            self._tree.near = None
         if self._potential is not None and changes.any_lower:
             ground = self._ground
             limit = self._grid.cells // REPAIR_SHARE + 1024
@@ -416,6 +436,12 @@ class TargetTree:
             tree.relabel()
         window = block_window(self._grid, tree.root, target_cell, self._config.k_min)
         cells = 0
+        wide = self._config.strategy == "multi_resolution" or window.cells * WIDE_SHARE > self._grid.cells
+        if self._skeleton is not None and wide:
+            fine = self._grid.around(target_cell, 2 << self._config.k_min)
+            if tree.grow_coarse(target_cell, self._skeleton, fine):
+                return Update("coarse", self._grid.window, self._grid.cells)
+            return self._grow_full(target_cell)
         while window.cells * 2 < self._grid.cells:
             grown = tree.move(target_cell, window)
             if grown:
@@ -427,7 +453,10 @@ class TargetTree:
 
     def _with_wish(self, update: Update) -> Update:
         due = self._full_every
-        wants = bool(due) and self._moves >= due and not self._job_out and update.kind != "full"
+        wants = bool(due) and self._moves >= due and update.kind != "full"
+        if self._coarse and self._skeleton is None:
+            wants = self._moves >= self._config.full_every
+        wants = wants and not self._job_out
         return Update(update.kind, update.window, update.cells, wants)
 
     def _inside(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -435,22 +464,52 @@ class TargetTree:
         return asked[(asked >= 0) & (asked < self._grid.cells)]
 
     def _lower_bounds(self, starts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Proven lower bounds on the time from padded cells to the target now."""
+        """Proven lower bounds on the time from padded cells to the target now: docs/certificates.md."""
         ground, tree = self._ground, self._tree
-        potential = tree.cost if tree.exact else self._potential
-        if potential is None:
-            return np.zeros(starts.size)
-        at_target = 0.0 if tree.exact else float(potential[ground.pad(tree.root)])
-        if not at_target < math.inf:
-            return np.zeros(starts.size)
-        own = potential[starts].astype(np.float64)
-        own[~np.isfinite(own)] = 0.0
-        bound = own * (1.0 - self._rounding(own)) - at_target * (1.0 + self._rounding(np.asarray(at_target)))
-        bound = np.maximum(bound, 0.0)
+        if tree.exact:
+            own = tree.cost[starts].astype(np.float64)
+            bound = own * (1.0 - self._rounding(own))
+        else:
+            bound = self._shifted(starts)
         if self._config.length_weight:
-            # Of the key's optimum only the share that is travel time counts, at least low / (low + lambda).
+            # Of the key's optimum only the share that is travel time counts, at least 1 - lambda / smallest weight.
             bound = bound * (1.0 - ground.length_weight_s / ground.low)
-        return np.asarray(bound)
+        return np.maximum(bound, 0.0)
+
+    def _shifted(self, starts: NDArray[np.int64]) -> NDArray[np.float64]:
+        """No way to the target is cheaper than the potential falls along it; and it either stays in the window
+        around the target, or comes in over its rim for the last time and costs from there what the window says."""
+        ground, tree = self._ground, self._tree
+        potential = self._potential
+        own = np.zeros(starts.size)
+        at_target = math.inf
+        if potential is not None:
+            own = potential[starts].astype(np.float64)
+            own[~np.isfinite(own)] = 0.0
+            own = own * (1.0 - self._rounding(own))
+            at_target = float(potential[ground.pad(tree.root)])
+            at_target *= 1.0 + float(self._rounding(np.asarray(at_target)))
+        bound = np.maximum(own - at_target, 0.0)
+        near = tree.near
+        if near is None:
+            return bound
+        rim_cost = near.rim_cost * (1.0 - self._rounding(near.rim_cost))
+        outside = np.full(starts.size, rim_cost.min(initial=math.inf))
+        if potential is not None and near.rim.size:
+            at_rim = potential[near.rim].astype(np.float64)
+            at_rim = at_rim * (1.0 + self._rounding(at_rim))
+            outside = np.maximum(outside, own - (at_rim - rim_cost).max())
+        rows, cols = np.divmod(starts, ground.stride)
+        rows, cols = rows - 1 - near.window.row0, cols - 1 - near.window.col0
+        height, width = near.cost.shape
+        within = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
+        inside = np.full(starts.size, math.inf)
+        own_way = near.cost[rows[within], cols[within]].astype(np.float64)
+        known = np.where(np.isfinite(own_way), own_way, 0.0)
+        inside[within] = own_way * (1.0 - self._rounding(known))
+        found = np.minimum(inside, outside)
+        # A route was found, so that no bound is infinite; a rim that leads nowhere would be.
+        return np.maximum(bound, np.where(np.isfinite(found), found, 0.0))
 
     def _rounding(self, costs: NDArray[np.float64]) -> NDArray[np.float64]:
         """How far float32 may have put these costs off, relatively: no optimal route has more steps than this."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service import kernels
+from planner_service import coarse_kernels, kernels
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
 
@@ -45,6 +45,9 @@ class Changes:
 
 
 NO_CHANGES = Changes(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
+
+
+ALL_CELLS = np.empty(0, np.uint8)
 
 
 def rule_of(config: PlannerConfig) -> int:
@@ -197,18 +200,24 @@ def flood(
     corners: bool,
     cost: Floats,
     parent: NDArray[np.uint8] | None,
+    active: NDArray[np.uint8] = ALL_CELLS,
 ) -> float:
-    """Grow the exact tree of a padded root. Returns a bound that no cost exceeds."""
+    """Grow the exact tree of a padded root. Returns a bound that no cost exceeds.
+
+    active  cells that take part; the cost of others is without meaning, and so are all parents. inf is returned,
+    and
+            nothing done, where the weights' ratio is too large for that
+    """
     longest = high * (kernels.SQRT2_EXACT if rule == kernels.RULE_OCTILE else 1.0)
     if longest <= MAX_RATIO * low:
         width = np.float32(low * 0.98)
         ring = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
         shift = 6 if ring <= 64 else 4
         if rule == kernels.RULE_OCTILE:
-            last = kernels.flood_octile(weight, cost, stride, root, corners, width, ring, shift)
+            last = kernels.flood_octile(weight, active, cost, stride, root, corners, width, ring, shift)
         else:
             diagonals = rule == kernels.RULE_PAPER
-            last = kernels.flood_single(weight, cost, stride, root, diagonals, corners, width, ring, shift)
+            last = kernels.flood_single(weight, active, cost, stride, root, diagonals, corners, width, ring, shift)
         if last != kernels.TOO_FINE:
             if parent is not None:
                 rows = weight.size // stride - 2
@@ -216,6 +225,8 @@ def flood(
                     weight, cost, stride, rule, corners, root, (0, 0, rows, stride - 2), parent
                 )
             return float((last + 1) * width)
+    if active.size:
+        return math.inf
     touched = np.empty(weight.size, np.uint8) if parent is None else parent
     reach = float(kernels.flood_wide(weight, cost, stride, root, rule, corners, touched))
     if parent is not None and reach <= FINE * low:
@@ -224,11 +235,80 @@ def flood(
     return reach
 
 
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """The cells that carry the traffic, connected, and how all others reach them. Padded arrays.
+
+    cells   uint8    1 on the skeleton
+    attach  float32  s; what the way to the skeleton costs; inf where there is none
+    parent  uint8    direction of that way; 255 on the skeleton
+    anchor  uint32   the skeleton cell it leads to
+    reach   s; no way there costs more
+    """
+
+    cells: NDArray[np.uint8]
+    attach: Floats
+    parent: NDArray[np.uint8]
+    anchor: NDArray[np.uint32]
+    reach: float
+
+
+def find_skeleton(ground: Ground, samples: int = 8) -> Skeleton:
+    """Let exact trees of cells all over the ground vote: where many ways pass in one of them is skeleton."""
+    grid = ground.grid
+    rule, corners, stride = ground.rule, ground.corners, ground.stride
+    passable = np.flatnonzero(ground.weight < np.inf)
+    roots = passable[np.linspace(0, passable.size - 1, samples).astype(np.int64)]
+    roots = np.concatenate((passable[passable.size // 2 :][:1], roots))
+    cells = np.zeros(ground.size, np.uint8)
+    cost = np.empty(ground.size, np.float32)
+    parent = np.full(ground.size, kernels.NONE, np.uint8)
+    least = max(16, max(grid.rows, grid.cols) // 8)
+    first = int(roots[0])
+    flood(ground.weight, ground.low, ground.high, stride, first, rule, corners, cost, parent)
+    connected = [int(root) for root in roots[1:] if cost[root] < np.inf]
+    cells[first] = 1
+    coarse_kernels.mark_traffic(parent, stride, least, cells)
+    for root in connected:
+        # The way between two roots joins what their trees vote for.
+        coarse_kernels.mark_way(parent, stride, root, cells)
+    for root in connected:
+        flood(ground.weight, ground.low, ground.high, stride, root, rule, corners, cost, parent)
+        coarse_kernels.mark_traffic(parent, stride, least, cells)
+    chosen = np.flatnonzero(cells)
+    attach = np.full(ground.size, np.inf, np.float32)
+    attach[chosen] = 0.0
+    before = np.full(chosen.size, np.inf, np.float32)
+    kernels.lower(ground.weight, attach, stride, rule, corners, chosen, before, ground.size)
+    box = (0, 0, grid.rows, grid.cols)
+    kernels.point_to_parents(ground.weight, attach, stride, rule, corners, first, box, parent)
+    parent[chosen] = kernels.NONE
+    anchor = np.zeros(ground.size, np.uint32)
+    coarse_kernels.find_anchors(parent, stride, cells, anchor)
+    finite = attach[attach < np.inf]
+    return Skeleton(cells, attach, parent, anchor, float(finite.max(initial=0.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Surrounding:
+    """What a window around the root cost on its own: a lower bound on every way that stays inside.
+
+    cost   (rows, cols) of the window, s; exact inside it
+    rim    padded cells of the window from which a step leads out of it
+    """
+
+    window: Window
+    cost: Floats
+    rim: Cells
+    rim_cost: NDArray[np.float64]
+
+
 class CostToGoTree:
     """The tree of one root on a `Ground`.
 
     root    the target's cell
     offset  s; a cell's cost-to-go is at most its stored cost plus this
+    near    of the last window, as long as it is where the root is; None otherwise
     exact   whether cost-to-go is exact on the ground as it is now (then offset is 0)
     reach   s; no stored cost exceeds it
     """
@@ -241,6 +321,7 @@ class CostToGoTree:
         self.offset = 0.0
         self.exact = False
         self.reach = 0.0
+        self.near: Surrounding | None = None
         self._scratch: NDArray[np.uint8] | None = None
 
     def grow(self, root: int) -> None:
@@ -259,6 +340,7 @@ class CostToGoTree:
         )
         self.root = root
         self.offset = 0.0
+        self.near = None
         self.exact = True
 
     def take(self, root: int, cost: Floats, parent: NDArray[np.uint8], reach: float) -> None:
@@ -267,8 +349,35 @@ class CostToGoTree:
         self.parent = parent
         self.root = root
         self.offset = 0.0
+        self.near = None
         self.exact = True
         self.reach = reach
+
+    def grow_coarse(self, root: int, skeleton: Skeleton, window: Window) -> bool:
+        """Grow the tree over the skeleton and a window around the root only; all other cells lead to the skeleton.
+        False if that cannot be done: then the tree is of no use any more and must be grown."""
+        ground = self.ground
+        start = ground.pad(root)
+        active = skeleton.cells.copy()
+        if not skeleton.attach[start] < np.inf:
+            return False
+        coarse_kernels.mark_way(skeleton.parent, ground.stride, start, active)
+        shape = (ground.grid.rows + 2, ground.stride)
+        active.reshape(shape)[window.row0 + 1 : window.row1 + 1, window.col0 + 1 : window.col1 + 1] = 1
+        rule, corners, stride = ground.rule, ground.corners, ground.stride
+        reach = flood(ground.weight, ground.low, ground.high, stride, start, rule, corners, self.cost, None, active)
+        if not reach < math.inf:
+            return False
+        if coarse_kernels.fill_in(self.cost, active, skeleton.attach, skeleton.anchor):
+            return False
+        box = (0, 0, ground.grid.rows, ground.grid.cols)
+        kernels.point_to_parents(ground.weight, self.cost, stride, rule, corners, start, box, self.parent)
+        self.root = root
+        self.offset = 0.0
+        self.near = None
+        self.exact = False
+        self.reach = reach + skeleton.reach
+        return self.fine
 
     def move(self, root: int, window: Window) -> int:
         """Lead to a new root, by growing only a window that holds it and the old root.
@@ -318,7 +427,19 @@ class CostToGoTree:
         )
         self.exact = self.exact and root == self.root
         self.root = root
+        self.near = self._surrounding(window, cost.reshape(-1, stride)[1:-1, 1:-1])
         return window.cells
+
+    def _surrounding(self, window: Window, cost: Floats) -> Surrounding:
+        grid = self.ground.grid
+        on_rim = np.zeros(cost.shape, bool)
+        on_rim[0] |= window.row0 > 0
+        on_rim[-1] |= window.row1 < grid.rows
+        on_rim[:, 0] |= window.col0 > 0
+        on_rim[:, -1] |= window.col1 < grid.cols
+        rows, cols = np.nonzero(on_rim & (cost < np.inf))
+        rim = (rows + window.row0 + 1) * self.ground.stride + cols + window.col0 + 1
+        return Surrounding(window, cost, rim, cost[rows, cols].astype(np.float64))
 
     def repair(self, changes: Changes, limit: int) -> int:
         """Bring the tree up to date after the ground changed. Returns cells visited, or -1 if more than `limit` are

@@ -105,7 +105,7 @@ class Play:
 
 
 @given(paces(), planner_configs(), happenings())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=300, deadline=None)
 def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_hold(
     pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job]
 ) -> None:

@@ -34,7 +34,7 @@ def rough_terrain(size: int, rng: np.random.Generator) -> Pace:
     coarse = -(-size // 8) + 2
     relief = zoom(gaussian_filter(rng.standard_normal((coarse, coarse)), 4), 8, order=1)[:size, :size]
     relief = relief / relief.std() + 0.5 * gaussian_filter(rng.standard_normal((size, size)), 2) * 2
-    pace = (0.1 + 0.12 * np.abs(relief) ** 1.5).astype(np.float32)
+    pace: Pace = (0.1 + 0.12 * np.abs(relief) ** 1.5).astype(np.float32)
     walls = gaussian_filter(rng.standard_normal((size, size)), 6)
     pace[walls > 1.5 * walls.std()] = np.inf
     along = np.arange(size)
@@ -51,9 +51,9 @@ def maze(size: int, rng: np.random.Generator, corridor: int = 3) -> Pace:
     many = max(1, (size - 1) // pitch)
     passable = np.zeros((size, size), bool)
     rooms = np.arange(many) * pitch + 1
-    for row in rooms:
-        for col in rooms:
-            passable[row : row + corridor, col : col + corridor] = True
+    for top in rooms:
+        for left in rooms:
+            passable[top : top + corridor, left : left + corridor] = True
     seen = np.zeros((many, many), bool)
     seen[0, 0] = True
     trail = [(0, 0)]

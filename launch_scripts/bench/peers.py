@@ -184,7 +184,7 @@ def _scipy(pace: Pace, edge: str) -> dict[str, Tool]:
     )
 
     def csgraph(root: int) -> Costs:
-        found = dijkstra(graph, indices=root, return_predecessors=True)[0]
+        found = dijkstra(graph, indices=np.array([root]), return_predecessors=True)[0]
         return np.asarray(found, np.float32).reshape(pace.shape)
 
     return {"scipy.csgraph.dijkstra": csgraph}
