@@ -21,6 +21,8 @@ from dataclasses import dataclass, field
 
 from swarm.messages import Claims, Want
 
+_CLOCK_LIMIT = 1 << 61
+
 Rank = tuple[int, str, str]
 """(ticket, agent, vehicle): the lower goes first."""
 
@@ -97,7 +99,7 @@ class RightOfWay:
     def heard(self, claims: Claims) -> None:
         """Take in another agent's claims; only the newest of an agent count. Sequence 0 says "not placed yet"."""
         if claims.agent == self.agent:
-            if claims.incarnation < self.incarnation:
+            if claims.incarnation < self.incarnation and claims.clock < _CLOCK_LIMIT:
                 self._clock = max(self._clock, claims.clock)
             return
         if claims.seq == 0:
@@ -106,7 +108,8 @@ class RightOfWay:
         if known is not None and (claims.incarnation, claims.seq) <= _stamp(known.claims):
             return
         self._others[claims.agent] = _Other(claims)
-        self._clock = max(self._clock, claims.clock)
+        if claims.clock < _CLOCK_LIMIT:  # an honest one never gets there; ours must stay within what fits the wire
+            self._clock = max(self._clock, claims.clock)
         self._changed = self._changed or bool(claims.wants)
 
     def set_alive(self, agents: Mapping[str, int]) -> None:
