@@ -3,7 +3,7 @@
 The merge rule, per cell, in this order:
 
 1. pace = flat pace x slope factor x class factor; on a road it is the road pace instead.
-2. Voids, ground steeper than `max_slope_deg`, and classes whose factor is infinite are lethal.
+2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
 3. Zones in the order painted: a road sets the road pace (over cliffs and water too: a bridge, a cutting; not over a
    void), preferred halves, rough doubles; then every forbidden zone is lethal, whatever else was painted there.
 4. This is the ground. The prior map is the ground with inflation: a cell is lethal where a vehicle of
@@ -228,7 +228,7 @@ def class_factors(cost: CostConfig) -> Floats:
     for kind, factor in CLASS_FACTOR.items():
         factors[kind] = factor
     for name, value in cost.class_factor.items():
-        factors[TerrainClass[name.upper()]] = value
+        factors[TerrainClass[name.upper()]] = LETHAL if value == "lethal" else value
     return factors
 
 

@@ -42,6 +42,15 @@ class Source:
 
 def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progress) -> Source:
     """Read or make what the scenario names. Raises TerrainError with one sentence."""
+    try:
+        return _loaded(config, seed, progress)
+    except MemoryError as error:
+        raise TerrainError(
+            f"terrain {config.source} does not fit into memory; crop it or set a larger terrain.resolution_m"
+        ) from error
+
+
+def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
     if config.source == "synthetic":
         source = _synthetic(config, seed)
     elif config.source == "jacksboro":

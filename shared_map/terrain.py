@@ -73,8 +73,9 @@ def build_terrain(scenario: Scenario, progress: Progress = no_progress) -> Terra
     """The terrain of a scenario. Raises TerrainError with one sentence."""
     from shared_map.sources import load_source
 
+    source = load_source(scenario.terrain, scenario.seed, progress)
     try:
-        return _built(scenario, load_source(scenario.terrain, scenario.seed, progress), progress)
+        return _built(scenario, source, progress)
     except MemoryError as error:
         raise TerrainError(
             f"terrain {scenario.terrain.source} does not fit into memory; set a larger terrain.resolution_m"

@@ -96,7 +96,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
                    Tobler's hiking function; energy is a wheeled vehicle of constant power
     max_slope_deg  steeper ground is lethal
     classes        whether what covers the ground (water, forest, rock ...) counts
-    class_factor   pace of a class relative to open ground, instead of the built-in factors; inf is lethal
+    class_factor   pace of a class relative to open ground, or "lethal", instead of the built-in factors
     """
 
     flat_speed_m_per_s: Positive = 10.0
@@ -105,7 +105,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     steep_factor: Annotated[float, Meta(ge=1)] = 6.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
     classes: bool = True
-    class_factor: dict[ClassName, Positive] = msgspec.field(default_factory=dict)
+    class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0
     zones: tuple[ZoneConfig, ...] = ()
 

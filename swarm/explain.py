@@ -65,7 +65,7 @@ def _field_type(section: Any, key: str) -> Any:
 
 def _item_type(section: Any) -> Any:
     args = typing.get_args(section)
-    return _plain(args[0]) if args else None
+    return _plain(args[-1] if typing.get_origin(section) is dict else args[0]) if args else None
 
 
 def _choices(section: Any) -> str:

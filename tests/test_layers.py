@@ -158,7 +158,7 @@ def test_the_merge_rule_cell_by_cell() -> None:
 def test_a_scenario_sets_the_factor_of_a_class() -> None:
     classes = np.array([[TerrainClass.WATER, TerrainClass.FOREST]], np.uint8)
     level = np.zeros((1, 2), np.float32)
-    pace = terrain_pace(level, classes, CostConfig(class_factor={"water": 4.0, "forest": math.inf}))
+    pace = terrain_pace(level, classes, CostConfig(class_factor={"water": 4.0, "forest": "lethal"}))
     np.testing.assert_allclose(pace, [[0.4, math.inf]])
     ignored = terrain_pace(level, classes, CostConfig(classes=False))
     np.testing.assert_allclose(ignored, [[0.1, 0.1]])

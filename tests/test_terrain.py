@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import textwrap
 import time
 from pathlib import Path
 
@@ -149,3 +150,29 @@ def test_a_small_synthetic_terrain_is_built_too() -> None:
     for rows, cols in ((1, 1), (2, 3), (9, 9)):
         source = TerrainConfig(source="synthetic", rows=rows, cols=cols, relief_m=1.0)
         assert build_terrain(Scenario(terrain=source)).grid.cells == rows * cols
+
+
+def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
+    import re
+
+    import rasterio
+    from rasterio.transform import from_origin
+
+    text = (Path(__file__).parent.parent / "docs" / "terrain.md").read_text()
+    block = re.search(r"(?:^ {7}.*\n)+", text, re.MULTILINE)
+    assert block is not None
+    (tmp_path / "mine.toml").write_text(textwrap.dedent(block[0]))
+    base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(5e5, 5e6, 20, 20)}
+    with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
+        file.write(np.random.default_rng(1).uniform(0, 2, (60, 70)).astype(np.float32), 1)
+    with rasterio.open(tmp_path / "photo.tif", "w", height=60, width=70, count=3, dtype="uint8", **base) as file:
+        file.write(np.full((3, 60, 70), 120, np.uint8))
+    roads = np.zeros((60, 70), np.uint8)
+    roads[30] = 1
+    with rasterio.open(
+        tmp_path / "roads.png", "w", driver="PNG", height=60, width=70, count=1, dtype="uint8"
+    ) as file:
+        file.write(roads, 1)
+    terrain = build_terrain(load_scenario(tmp_path / "mine.toml"))
+    assert (terrain.pace_s_per_m[30, 45:] == np.float32(0.05)).all()
+    assert np.isinf(terrain.pace_s_per_m[20, 40])
