@@ -73,7 +73,7 @@ class MapFeed:
         self._join_due_ns: int | None = None
         self._join_tries = 0
         self._claims: dict[str, _Claim] = {}
-        self._asking: dict[str, None] = {}
+        self._asking: dict[str, int] = {}  # author -> when asked for
         self._heard_ns: dict[str, int] = {}
         self._kept: Held | None = None
         self._started_ns = 0
@@ -195,8 +195,11 @@ class MapFeed:
         """Ask for what they hold and we miss; give a keeper what we hold and it misses of those who are gone."""
         missing = self.replica.compare(claim.digest.held)
         for author, tiles in missing:
-            if author not in self._asking and len(self._asking) < _ASKS_AT_ONCE:
-                self._asking[author] = None
+            # Not only when an ask has ended: where its end was lost, that takes until its timeout.
+            asked_ns = self._asking.get(author)
+            again = asked_ns is not None and now_ns - asked_ns >= _RETRY_NS
+            if again or (asked_ns is None and len(self._asking) < _ASKS_AT_ONCE):
+                self._asking[author] = now_ns
                 request = MarksRequest(authors=[author], tiles=tiles)
                 self._bus.ask(MARKS, request, self._post, tag=_RESYNC + author, author=author)
         if claim.digest.role == "keeper" and not self._serves_all and claim.tries == 0:
