@@ -131,6 +131,7 @@ class Process:
         self._clock = clock
         self._tick_ns = int(NS_PER_S / tick_hz)
         self._stopping = False
+        self._signals: tuple[signal.Signals, ...] = ()
 
     def stop(self) -> None:
         """From any thread, and from a signal handler: so no lock that the interrupted thread might hold."""
@@ -138,8 +139,9 @@ class Process:
         self._inbox.wake()
 
     def stop_on_signals(self) -> None:
-        """SIGTERM and SIGINT end the loop after the event in hand. Call on the main thread."""
-        for number in (signal.SIGTERM, signal.SIGINT):
+        """SIGTERM and SIGINT end the loop after the event in hand. Call on the main thread, and run there."""
+        self._signals = (signal.SIGTERM, signal.SIGINT)
+        for number in self._signals:
             signal.signal(number, lambda *_: self.stop())
 
     def run(self) -> None:
@@ -165,6 +167,9 @@ class Process:
                 if event is not None:
                     self._service.handle(event, self._clock.now_ns())
         finally:
+            # We are ending: another signal, as late as in the end of Python itself, must not kill us half-way.
+            for number in self._signals:
+                signal.signal(number, signal.SIG_IGN)
             self._service.stop(self._clock.now_ns())
 
 

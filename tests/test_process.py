@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -228,21 +227,23 @@ def idle(how: str) -> subprocess.Popen[bytes]:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_the_loop_in_good_order(number):
     process = idle("signal")
-    os.kill(process.pid, number)
-    os.kill(process.pid, signal.SIGTERM)
-    out, _ = process.communicate(timeout=5)
+    for _ in range(50):  # impatient, until it is gone
+        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.002)
+    out, _ = process.communicate(timeout=20)
     assert out == b"stopped\n"
     assert process.returncode == 0
 
 
 def test_a_process_ends_with_its_parent():
     process = idle("parent")
-    out, _ = process.communicate(timeout=5)
+    out, _ = process.communicate(timeout=20)
     assert out == b"stopped\n"
     assert process.returncode == 0
 
 
 def test_a_process_that_hangs_at_its_end_is_ended():
     process = idle("hang")
-    process.communicate(timeout=5)
+    process.communicate(timeout=20)
     assert process.returncode == 1
