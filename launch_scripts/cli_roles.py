@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 Scenario = Annotated[
-    str, typer.Option(help="A .toml file or a built-in name: the same for all processes of a run.")
+    str,
+    typer.Argument(metavar="SCENARIO", help="A .toml file or a built-in name: the same for all of a run."),
 ]
 Connect = Annotated[
     str | None, typer.Option(help="The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.")
@@ -76,7 +77,7 @@ def planner(
 ) -> None:
     """Plan for one target.
 
-    swarm planner --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
+    swarm planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
     _run("planner", target, scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
 

@@ -99,7 +99,7 @@ def test_an_unknown_role_is_refused(run) -> None:  # type: ignore[no-untyped-def
 
 
 def test_a_planner_for_a_target_that_the_scenario_does_not_have(run) -> None:  # type: ignore[no-untyped-def]
-    code, _, err = run("planner", "--target", "t9", "--scenario", "synthetic")
+    code, _, err = run("planner", "--target", "t9", "synthetic")
     assert (code, err) == (2, "swarm: scenario synthetic has no planner 't9'; it has t0, t1\n")
 
 

@@ -55,7 +55,7 @@ def hands(tmp_path: Path) -> Iterator[Hands]:
 
 
 def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) -> None:
-    scenario = ("--scenario", str(hands.path))
+    scenario = (str(hands.path),)
     hands.start("router", *scenario, "--run-id", "by-hand")
     eventually(lambda: swarm("status", "--connect", hands.network.connect[0]).returncode == 0, 30, "the router")
     for role in (("keeper",), ("targets",), ("planner", "--target", "t0")):
@@ -84,7 +84,7 @@ def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) ->
 def test_a_role_without_a_router_says_so(hands: Hands) -> None:
     path = hands.folder / "impatient.toml"
     path.write_text(hands.path.read_text().replace("[network]", "[network]\nconnect_timeout_s = 1"))
-    told = swarm("keeper", "--scenario", path, "--runs", hands.folder / "runs")
+    told = swarm("keeper", path, "--runs", hands.folder / "runs")
     assert told.returncode == 4
     assert "cannot reach a router at" in told.stderr
     assert "Traceback" not in told.stderr
