@@ -2,7 +2,7 @@
 
 The merge rule, per cell, in this order:
 
-1. pace = flat pace x slope factor x class factor; on a road it is the road pace instead.
+1. pace = flat pace x slope factor x class factor x (1 + rough_per_m x roughness); on a road the road pace instead.
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
 3. Zones in the order painted: a road sets the road pace (over cliffs and water too: a bridge, a cutting; not over a
    void), preferred halves, rough doubles; then every forbidden zone is lethal, whatever else was painted there.
@@ -210,15 +210,22 @@ def _energy(rise: Floats) -> Floats:
     return floored
 
 
-def roughness_m(elevation_m: Floats) -> Floats:
-    """Largest difference in height between a cell and its eight neighbours (as GDAL's `roughness`, about the
-    cell); a void beside a cell counts as level with it."""
-    padded = np.pad(elevation_m, 1, mode="edge")
-    rows, cols = elevation_m.shape
+def roughness_m(elevation_m: Floats, resolution_m: float) -> Floats:
+    """How far the eight neighbours lie off the plane that leans on a cell, at most: 0 on any even slope."""
+    return roughness_of_padded(np.pad(elevation_m, 1, mode="reflect", reflect_type="odd"), resolution_m)
+
+
+def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
+    """`roughness_m` of an array that brings its own border of one cell; a void beside a cell does not count."""
+    east, north = gradient_of_padded(padded_m, resolution_m)
+    rows, cols = east.shape
+    centre = padded_m[1:-1, 1:-1]
     most = np.zeros((rows, cols), np.float32)
-    for dr in (0, 1, 2):
-        for dc in (0, 1, 2):
-            np.fmax(most, np.abs(padded[dr : dr + rows, dc : dc + cols] - elevation_m), out=most)
+    for dr in (-1, 0, 1):
+        for dc in (-1, 0, 1):
+            plane = centre + (east * np.float32(dc) - north * np.float32(dr)) * np.float32(resolution_m)
+            off = np.abs(padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols] - plane)
+            np.fmax(most, off, out=most)
     return most
 
 
@@ -232,12 +239,14 @@ def class_factors(cost: CostConfig) -> Floats:
     return factors
 
 
-def terrain_pace(grade_: Floats, classes: Bytes, cost: CostConfig) -> Floats:
+def terrain_pace(grade_: Floats, classes: Bytes, cost: CostConfig, rough_m: Floats | None = None) -> Floats:
     """Steps 1 and 2 of the merge rule. A NaN grade is a void."""
     pace = slope_factor(grade_, cost)
     pace *= np.float32(1 / cost.flat_speed_m_per_s)
     if cost.classes:
         pace *= class_factors(cost)[classes]
+    if rough_m is not None:
+        pace *= np.float32(1) + np.float32(cost.rough_per_m) * rough_m
     road = classes == TerrainClass.ROAD
     if road.any():
         np.copyto(pace, np.float32(1 / cost.road_speed_m_per_s), where=road & np.isfinite(pace))

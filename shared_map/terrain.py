@@ -26,6 +26,7 @@ from shared_map.layers import (
     inflate,
     inflation_halves,
     paint_zones,
+    roughness_of_padded,
     terrain_pace,
 )
 from swarm.config import CostConfig, Scenario
@@ -109,9 +110,11 @@ def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress
     ground = np.empty(source.elevation_m.shape, np.float32)
 
     def work(row0: int, row1: int) -> None:
-        steepness = grade_of_padded(padded_rows(source.elevation_m, row0, row1), source.grid.resolution_m)
+        padded_m, resolution_m = padded_rows(source.elevation_m, row0, row1), source.grid.resolution_m
+        steepness = grade_of_padded(padded_m, resolution_m)
         np.copyto(steepness, np.float32(np.nan), where=np.isnan(source.elevation_m[row0:row1]))
-        pace = terrain_pace(steepness, classes[row0:row1], cost)
+        rough_m = roughness_of_padded(padded_m, resolution_m) if cost.rough_per_m else None
+        pace = terrain_pace(steepness, classes[row0:row1], cost, rough_m)
         if source.factor is not None:
             pace *= source.factor[row0:row1]
         ground[row0:row1] = pace

@@ -95,6 +95,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     slope_rule     linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
                    Tobler's hiking function; energy is a wheeled vehicle of constant power
     max_slope_deg  steeper ground is lethal
+    rough_per_m    how much a metre of roughness (neighbours off the even slope) adds to the pace, as a share of it
     classes        whether what covers the ground (water, forest, rock ...) counts
     class_factor   pace of a class relative to open ground, or "lethal", instead of the built-in factors
     """
@@ -104,6 +105,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     slope_rule: Literal["linear", "quadratic", "tobler", "energy"] = "quadratic"
     steep_factor: Annotated[float, Meta(ge=1)] = 6.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
+    rough_per_m: NotNegative = 0.0
     classes: bool = True
     class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0
