@@ -36,6 +36,7 @@ from swarm.role import RoleSetup
 from swarm.scheduler import Scheduler
 from swarm.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.service import AgentService
+from vehicle_agent.vehicle import Vehicle
 
 START_NS = 1_000 * NS_PER_S
 
@@ -251,7 +252,7 @@ class AgentWorld:
 
     def _look_around(self) -> None:
         where: dict[int, str] = {}
-        standing = [(v.id, v.cell) for service in self.agents.values() for v in service.agent.vehicles.values()]
+        standing = [(vehicle.id, vehicle.cell) for vehicle in self.vehicles()]
         for agent, vehicles in list(self.ghosts.items()):
             if agent in self.agents and self.agents[agent].agent.vehicles:
                 del self.ghosts[agent]  # they are vehicles again
@@ -314,8 +315,11 @@ class AgentWorld:
 
     # --- what there is to see -------------------------------------------------------------------------------
 
+    def vehicles(self) -> list[Vehicle]:
+        return [vehicle for service in self.agents.values() for vehicle in service.agent.vehicles.values()]
+
     def states(self) -> dict[str, VehicleState]:
-        return {v.id: v.state for service in self.agents.values() for v in service.agent.vehicles.values()}
+        return {vehicle.id: vehicle.state for vehicle in self.vehicles()}
 
     def all_in(self, state: VehicleState) -> bool:
         states = self.states()
@@ -326,9 +330,7 @@ class AgentWorld:
 
     def where(self) -> dict[str, tuple[int, int]]:
         grid = self.terrain.grid
-        return {
-            v.id: grid.row_col(v.cell) for service in self.agents.values() for v in service.agent.vehicles.values()
-        }
+        return {vehicle.id: grid.row_col(vehicle.cell) for vehicle in self.vehicles()}
 
     def describe(self) -> str:
         states = self.states()

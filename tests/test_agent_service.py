@@ -10,6 +10,7 @@ from agent_world import AgentWorld, pace_of
 
 from swarm.errors import ConfigError
 from swarm.messages import VehicleState
+from vehicle_agent.placement import spawn_cells
 
 SCENARIO = """
 name = "test"
@@ -307,6 +308,49 @@ def test_whoever_has_arrived_in_a_corridor_moves_up_for_those_behind() -> None:
     world.start_all()
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
     world.assert_lawful()
+
+
+def maze(seed: int, size: int = 14) -> list[str]:
+    """Ways one cell wide around pillars, with some of them walled up."""
+    chance = random.Random(seed)
+    return [
+        "".join(
+            "#" if (row % 2 and col % 2) or ((row % 2 or col % 2) and chance.random() < 0.25) else "."
+            for col in range(size)
+        )
+        for row in range(size)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
+    chance = random.Random(seed)
+    text = scenario(24, per_agent=6, capture=15.0).replace('name = "t"\n', 'name = "t"\ncount = 3\n')
+    world = AgentWorld(text, pace_of(maze(seed)), links=Lossy(seed, loss=0.05))
+    homes = sorted(cell for spawns in spawn_cells_of(world).values() for cell in spawns.values())
+    places = [world.terrain.grid.row_col(cell) for cell in homes]
+    for target in world.scenario.target_ids:
+        world.put_target(target, *chance.choice(places))
+    world.start_all()
+    stands_since: dict[str, tuple[tuple[int, int], int]] = {}
+    longest_s = captures = 0
+    for second in range(100):
+        world.run_s(1.0)
+        for target in world.scenario.target_ids:
+            if any(v.target == target and v.in_reach for v in world.vehicles()):
+                captures += 1
+                world.put_target(target, *chance.choice(places), jumped=True)
+        for id, place in world.where().items():
+            if id not in stands_since or stands_since[id][0] != place:
+                stands_since[id] = (place, second)
+            longest_s = max(longest_s, second - stands_since[id][1])
+    assert captures > 30
+    assert longest_s < 50
+    world.assert_lawful()
+
+
+def spawn_cells_of(world: AgentWorld) -> dict[str, dict[str, int]]:
+    return spawn_cells(world.scenario, world.terrain.grid, world.terrain.pace_s_per_m, world.truth)
 
 
 # --- crashes and bad links ----------------------------------------------------------------------------------
