@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from shared_map.digest import Held
+from shared_map.quota import Quota
 from shared_map.replica import MapReplica, PublishSet
 from swarm.bus import Asked, AskEnded, Bus, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
@@ -23,6 +24,7 @@ _JOIN_TRIES = 5
 _GRACE_NS = NS_PER_S // 10
 """A digest may overtake the sets that it tells of: only what is missing after this is asked for."""
 _RETRY_NS = NS_PER_S // 2
+_NAME_AGAIN_NS = 60 * NS_PER_S
 _ASKS_AT_ONCE = 16
 _OFFERS_AT_ONCE = 256
 
@@ -68,6 +70,8 @@ class MapFeed:
         self._serves_all = serves_all
         self._held = held or replica.own_digest
         self._on_accepted = on_accepted
+        self._quota = Quota(config.author_marks_per_s)
+        self._named_ns: dict[str, int] = {}
         self._digest_ns = int(config.digest_s * NS_PER_S)
         self._digest_due_ns = 0
         self._join_due_ns: int | None = None
@@ -93,13 +97,14 @@ class MapFeed:
         """True if the event was about the map and nobody else's business."""
         match event:
             case Heard(topic=topic, message=MarkSet() as heard) if topic is MARKS:
-                self._merge(heard, event.fields, measured=True)
+                self._admit(heard, event.fields, now_ns)
             case Heard(topic=topic, message=Digest() as digest) if topic is DIGEST:
                 self._hear_digest(digest, now_ns)
             case Replied(tag=tag, message=MarkSet() as reply) if tag == _JOIN:
-                self._merge(reply, event.fields, measured=False)
+                if self._in_its_place(reply, event.fields):
+                    self._merge(reply, measured=False)
             case Replied(tag=tag, message=MarkSet() as reply) if tag.startswith(_RESYNC):
-                self._merge(reply, event.fields, measured=True)
+                self._admit(reply, event.fields, now_ns)
             case AskEnded(tag=tag) if tag == _JOIN:
                 self._join_ended(event, now_ns)
             case AskEnded(tag=tag) if tag.startswith(_RESYNC):
@@ -117,6 +122,7 @@ class MapFeed:
 
     def tick(self, now_ns: int) -> None:
         """Publish what is due, compare the digests that have waited long enough, ask for what is missing."""
+        self._merge_waiting(now_ns)
         self.publish(self.replica.tick(now_ns))
         if self._join_due_ns is not None and now_ns >= self._join_due_ns:
             self._join()
@@ -135,6 +141,11 @@ class MapFeed:
             self._put(action.mark_set)
 
     @property
+    def throttled(self) -> list[str]:
+        """Authors that mark more than their share and are heard with delay now."""
+        return self._quota.throttled
+
+    @property
     def unacknowledged(self) -> int | None:
         """How many of our own sets no keeper has committed yet in this form; None before any keeper spoke."""
         if self._kept is None or self.replica.author is None:
@@ -147,13 +158,35 @@ class MapFeed:
         region = self.replica.grid.region_of_tile(mark_set.tile)
         self._bus.publish(MARKS, mark_set, region=region, tile=mark_set.tile, author=mark_set.author)
 
-    def _merge(self, mark_set: MarkSet, key: Mapping[str, str], *, measured: bool) -> None:
-        if key.get("author") != mark_set.author or key.get("tile") != str(mark_set.tile):
-            self.replica.counts["sets_refused"] += 1  # access is granted by key: nobody speaks for another
+    def _admit(self, mark_set: MarkSet, key: Mapping[str, str], now_ns: int) -> None:
+        """Merge a set now, or later if its author says too much."""
+        if not self._in_its_place(mark_set, key):
             return
+        if self._quota.admits(mark_set, now_ns):
+            self._quota.charge(mark_set.author, self._merge(mark_set, measured=True), now_ns)
+        elif now_ns - self._named_ns.get(mark_set.author, -_NAME_AGAIN_NS) >= _NAME_AGAIN_NS:
+            self._named_ns[mark_set.author] = now_ns
+            log.warning("author %s marks more than its share: it is heard with delay", mark_set.author)
+
+    def _merge_waiting(self, now_ns: int) -> None:
+        while (mark_set := self._quota.due(now_ns)) is not None:
+            self._quota.charge(mark_set.author, self._merge(mark_set, measured=False), now_ns)
+        self._quota.forget(now_ns)
+
+    def _in_its_place(self, mark_set: MarkSet, key: Mapping[str, str]) -> bool:
+        if key.get("author") == mark_set.author and key.get("tile") == str(mark_set.tile):
+            return True
+        self.replica.counts["sets_refused"] += 1  # access is granted by key: nobody speaks for another
+        return False
+
+    def _merge(self, mark_set: MarkSet, *, measured: bool) -> int:
+        """Returns how many cells changed."""
         changed = self.replica.merge(mark_set, measured=measured)
-        if changed is not None and self._on_accepted is not None:
+        if changed is None:
+            return 0
+        if self._on_accepted is not None:
             self._on_accepted(mark_set)
+        return len(changed)
 
     def _answer(self, asked: Asked, request: MarksRequest) -> None:
         named = asked.fields.get("author", "*")
@@ -194,7 +227,10 @@ class MapFeed:
     def _compare(self, sender: str, claim: _Claim, now_ns: int) -> None:
         """Ask for what they hold and we miss; give a keeper what we hold and it misses of those who are gone."""
         missing = self.replica.compare(claim.digest.held)
+        throttled = self.throttled
         for author, tiles in missing:
+            if author in throttled:
+                continue  # what it said waits here already
             # Not only when an ask has ended: where its end was lost, that takes until its timeout.
             asked_ns = self._asking.get(author)
             again = asked_ns is not None and now_ns - asked_ns >= _RETRY_NS

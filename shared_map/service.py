@@ -45,6 +45,7 @@ class KeeperService:
             self.counters.count(name, 0)
         self._save_due_ns = 0
         self._noted_ns: int | None = None
+        self._named: list[str] = []
         store.bind(terrain.digest, terrain.grid)
         for mark_set in store.load():
             if self.replica.merge(mark_set, measured=False) is not None:
@@ -63,6 +64,7 @@ class KeeperService:
         if now_ns >= self._save_due_ns:
             self._save(now_ns)
         self._feed.tick(now_ns)
+        self._name_throttled(now_ns)
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]
         self.counters.counts["sets_refused"] = counts["sets_refused"]
@@ -72,6 +74,17 @@ class KeeperService:
     def stop(self, now_ns: int) -> None:
         self._save(now_ns)
         self._member.publish_stats(now_ns)
+
+    def _name_throttled(self, now_ns: int) -> None:
+        """Tell people once who marks more than its share."""
+        throttled = self._feed.throttled
+        self.counters.gauge("authors_throttled", float(len(throttled)))
+        for author in throttled:
+            if author not in self._named:
+                self._named.append(author)
+                text = f"author {author} marks more than its share: it is heard with delay"
+                self._member.note(now_ns, "quota", text)
+        self._named = [author for author in self._named if author in throttled]
 
     def _save(self, now_ns: int) -> None:
         """Commit what waits. A disk that refuses is told of, tried again, and no reason to stop serving."""

@@ -195,12 +195,14 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
 class MapConfig(Section, frozen=True, kw_only=True):
     """How the shared map is replicated.
 
-    publish_hz  a tile's set is put at most this often by its author
-    digest_s    every replica tells this often what it holds
+    publish_hz          a tile's set is put at most this often by its author
+    digest_s            every replica tells this often what it holds
+    author_marks_per_s  who changes more cells than this for ten seconds is heard with delay, and named
     """
 
     publish_hz: Positive = 10.0
     digest_s: Positive = 1.0
+    author_marks_per_s: Positive = 20_000.0
 
 
 class TlsConfig(Section, frozen=True, kw_only=True):

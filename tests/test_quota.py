@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+from map_strategies import MapSwarm, set_of
+
+from shared_map.keeper import KeeperStore
+from shared_map.quota import Quota
+from swarm.bus import Event, Heard
+from swarm.clock import NS_PER_S
+from swarm.config import MapConfig
+from swarm.messages import MarkKind, Note
+from swarm.topics import NOTE
+
+
+def test_an_author_that_overdraws_its_budget_waits_until_it_has_filled_up_and_others_do_not() -> None:
+    quota = Quota(marks_per_s=10)
+    loud, calm = set_of("loud", 0, 1, {}), set_of("calm", 0, 1, {})
+    assert quota.admits(loud, 0)
+    quota.charge("loud", 150, 0)  # of ten seconds' worth: 50 too many
+    assert not quota.admits(loud, NS_PER_S)
+    assert quota.admits(calm, NS_PER_S)
+    assert quota.throttled == ["loud"]
+    assert quota.due(5 * NS_PER_S) is None
+    assert quota.due(6 * NS_PER_S) == loud
+    assert quota.due(6 * NS_PER_S) is None
+    assert quota.throttled == []
+
+
+def test_of_a_waiting_tile_only_the_newest_set_is_kept() -> None:
+    quota = Quota(marks_per_s=1)
+    quota.charge("loud", 100, 0)
+    for seq in (3, 9, 5):
+        assert not quota.admits(set_of("loud", 0, seq, {}), 0)
+    assert quota.due(1000 * NS_PER_S) == set_of("loud", 0, 9, {})
+    assert quota.due(1000 * NS_PER_S) is None
+
+
+def test_budgets_that_are_full_again_are_forgotten() -> None:
+    quota = Quota(marks_per_s=1)
+    quota.charge("a", 1, 0)
+    quota.forget(100 * NS_PER_S)
+    assert quota._left == {}
+
+
+def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up() -> None:
+    swarm = MapSwarm()
+    swarm.config = MapConfig(author_marks_per_s=20)
+    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
+    keeper._feed._quota = Quota(20)
+    notes: list[str] = []
+
+    def hear(event: Event) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Note):
+            notes.append(event.message.text)
+
+    swarm.network.bus("ear").subscribe(NOTE, hear)
+    loud, calm, listener = swarm.writer("loud.1"), swarm.writer("calm.1"), swarm.listener("p")
+    swarm.run(1)
+    cells = np.arange(40 * 70)
+    for kind in (MarkKind.LETHAL, MarkKind.CLEAR):
+        loud.feed.publish(loud.replica.write(cells, kind, 0.0, swarm.now_ns))
+        swarm.run(0.2)
+    calm.feed.publish(calm.replica.write([5], MarkKind.LETHAL, 0.0, swarm.now_ns))
+    swarm.run(1)
+    assert listener.feed.throttled == ["loud.1"]
+    assert "calm.1" in listener.replica.digest()
+    assert notes == ["author loud.1 marks more than its share: it is heard with delay"]
+    swarm.run(400)
+    assert listener.feed.throttled == []
+    assert listener.replica.fingerprint() == loud.replica.fingerprint() == keeper.replica.fingerprint()
