@@ -15,8 +15,8 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
     [
         ('source = "synthetic"', 'source = "nowhere.tif"', 3, "nowhere.tif does not exist"),
         (
-            "relief_m = 300",
-            "relief_m = 300\n[cost]\nmax_slope_deg = 0.0001",
+            "roads = 4",
+            "roads = 4\n[cost]\nmax_slope_deg = 0.0001",
             3,
             "every cell of the terrain is lethal",
         ),
