@@ -49,6 +49,10 @@ _ASK_AGAIN_NS = NS_PER_S // 10
 _MOURN_NS = NS_PER_S // 2
 """An agent whose token fell is waited for a little longer: if our own link is cut, word of that may come later."""
 _CLAIMS_IDLE_NS = NS_PER_S // 2
+_FIRST_START_NS = 5 * NS_PER_S
+_ALONE_NS = 30 * NS_PER_S
+"""An agent that starts later in a run than the first and sees no other waits so long before it takes itself to be
+alone: more likely it is cut off, and its vehicles do not stand where they began."""
 
 
 class AgentService:
@@ -90,6 +94,9 @@ class AgentService:
         self._lease_ns = int(scenario.network.lease_s * NS_PER_S)
         self._claims_due_ns = 0
         self._asked_ns: dict[str, int] = {}
+        restarted = setup.incarnation - setup.started_ns > _FIRST_START_NS
+        self._expects_others = restarted and len(plan_agents(scenario)) > 1
+        self._alone_ns = 0
 
     @property
     def agent(self) -> Agent:
@@ -106,6 +113,7 @@ class AgentService:
         for vehicle in self._agent.plan.vehicle_ids:
             self._bus.subscribe(PUSHED_ROUTE, self._post, vehicle=vehicle)
         self._resume_due_ns = now_ns + _SETTLE_NS
+        self._alone_ns = now_ns + _ALONE_NS
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._feed.handle(event, now_ns):
@@ -198,7 +206,8 @@ class AgentService:
         if known is None:
             return
         agents = self._roster.alive("agent")
-        if not known.complete(agents):
+        cut_off = not agents and self._expects_others and now_ns < self._alone_ns
+        if cut_off or not known.complete(agents):
             self._resume_due_ns = now_ns + _ASK_AGAIN_NS
             return
         self._resumption = None

@@ -13,6 +13,8 @@ from launch_scripts import simulate as simulate_module
 from launch_scripts.faults import Crash, FaultPlan, Partition
 from launch_scripts.simulate import Simulation, simulate
 from swarm.config import load_scenario
+from vehicle_agent.agent import Agent
+from vehicle_agent.service import AgentService
 
 SCENARIOS = Path(simulate_module.__file__).parent / "scenarios"
 SECONDS = 24.0
@@ -29,6 +31,12 @@ def run_with_laws(simulation: Simulation) -> Laws:
     for name, held in laws.held().items():
         assert missing(held, said) == [], name
     return laws
+
+
+def agent_of(simulation: Simulation, name: str) -> Agent:
+    service = simulation.nodes[name].service
+    assert isinstance(service, AgentService)
+    return service.agent
 
 
 def silence_agents(simulation: Simulation) -> None:
@@ -106,13 +114,29 @@ def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
     simulation = Simulation(seeded(2), faults=plan)
     laws = Laws(simulation)
     simulation.run_until(4)
-    agent = simulation.nodes["agent-a1"].service.agent  # type: ignore[union-attr]
+    agent = agent_of(simulation, "agent-a1")
     simulation.run_until(4.2)  # what was echoed before the cut may still be granted
     held = {id: list(agent.rights.holds(id)) for id in agent.vehicles}
     simulation.run_until(12)
     assert all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
     simulation.run_until(20)
     assert not all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
+    assert laws.collisions == []
+
+
+def test_an_agent_restarted_while_cut_off_waits_until_somebody_tells_where_its_vehicles_stood():
+    plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), crashes=(Crash(9, "agent-a1"),), quiet_s=16)
+    simulation = Simulation(seeded(1), faults=plan)
+    laws = Laws(simulation)
+    simulation.run_until(8.9)
+    stood = {id: vehicle.cell for id, vehicle in agent_of(simulation, "agent-a1").vehicles.items()}
+    simulation.run_until(12)
+    assert agent_of(simulation, "agent-a1").vehicles == {}
+    simulation.run_until(13)
+    back = {id: vehicle.cell for id, vehicle in agent_of(simulation, "agent-a1").vehicles.items()}
+    assert back.keys() == stood.keys()
+    assert max(simulation.terrain.grid.distance_cells(cell, stood[id]) for id, cell in back.items()) <= 8
+    simulation.run_until(20)
     assert laws.collisions == []
 
 
