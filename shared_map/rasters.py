@@ -24,6 +24,8 @@ from swarm.grid import GridSpec
 
 MAX_CELLS = 16384 * 16384
 _FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937}
+MAX_SPAN_DEG = 12.0
+"""Beyond this, a local projection stretches by more than half a percent at its borders."""
 _READ_ROWS = 512
 
 
@@ -76,6 +78,10 @@ def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_pr
     with opened(path, "terrain") as dataset:
         if dataset.count >= 3:
             raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
+        if np.dtype(dataset.dtypes[0]).kind not in "iuf":
+            raise TerrainError(
+                f"terrain {path} holds {dataset.dtypes[0]} values; heights are whole or real numbers"
+            )
         crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
         grid, target, notes = plan_grid(
             dataset.transform, dataset.height, dataset.width, crs, config.resolution_m, f"terrain {path}"
@@ -250,7 +256,17 @@ def plan_grid(
         )
     degrees = rasterio.CRS.from_epsg(4326)
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees, what)
+    if crs.is_geographic and not -90.000001 <= south <= north <= 90.000001:
+        raise TerrainError(f"{what} reaches from latitude {south:.4g} to {north:.4g}; its georeference is damaged")
     target = metric_crs(crs, (west + east) / 2, (south + north) / 2, north - south)
+    if (
+        target != crs
+        and max(north - south, (east - west) * math.cos(math.radians((south + north) / 2))) > MAX_SPAN_DEG
+    ):
+        raise TerrainError(
+            f"{what} spans {north - south:.4g} x {east - west:.4g} degrees: no flat grid is true over more than"
+            f" {MAX_SPAN_DEG:g}; crop it, or reproject it to metres yourself"
+        )
     width, height = _pixel_m(transform, rows, cols, crs, target)
     notes = [f"{rows} x {cols} pixels of {width:.4g} x {height:.4g} m in {_name(crs)}"]
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e

@@ -265,9 +265,24 @@ def labels_without_photo(folder: Path) -> dict[str, Any]:
     return {"source": write(folder / "a.tif", heights()), "labels": "labels.toml"}
 
 
+def the_whole_world(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights(), from_origin(-180, 90, 7.2, 4.5), "EPSG:4326")}
+
+
+def beyond_the_pole(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights(), from_origin(9, 91, 0.1, 0.1), "EPSG:4326")}
+
+
+def complex_heights(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights().astype(np.complex64))}
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (the_whole_world, "no flat grid is true over more than 12; crop it"),
+        (beyond_the_pole, "to 91; its georeference is damaged"),
+        (complex_heights, "holds complex64 values"),
         (no_crs, r"does not say in which coordinate system.*set terrain\.crs"),
         (without_metres, r"without metres or degrees.*set terrain\.crs"),
         (photo_elsewhere, "photo .*p.tif does not overlap the terrain: it covers x 600000"),
