@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
         ('source = "synthetic"', 'source = "nowhere.tif"', 3, "nowhere.tif does not exist"),
         (
             "roads = 4",
-            "roads = 4\n[cost]\nmax_slope_deg = 0.0001",
+            "roads = 0\n[cost]\nmax_slope_deg = 0.0001",
             3,
             "every cell of the terrain is lethal",
         ),
