@@ -434,7 +434,9 @@ class TargetTree:
             return self._grow_full(target_cell)
         if not tree.precise:
             tree.relabel()
-        window = block_window(self._grid, tree.root, target_cell, self._config.k_min)
+        # Between full growths a window twice as wide costs little and keeps routes nearer to the optimum.
+        k_min = self._config.k_min + (1 if self._full_every else 0)
+        window = block_window(self._grid, tree.root, target_cell, k_min)
         cells = 0
         wide = self._config.strategy == "multi_resolution" or window.cells * WIDE_SHARE > self._grid.cells
         if self._skeleton is not None and wide:

@@ -24,9 +24,8 @@ from swarm.grid import GridSpec, Window
 Floats = NDArray[np.float32]
 Cells = NDArray[np.int64]
 
-MAX_RATIO = 512.0
-"""Between dearest and cheapest cell: beyond it the flood with a heap is faster than buckets as wide as the
-cheapest."""
+MAX_RATIO = 1 << 14
+"""Between dearest and cheapest step: beyond it buckets as wide as the cheapest give way to a heap."""
 FINE = float(1 << 20)
 """While no cost exceeds so many smallest weights, float32 tells any cell's cost from its parent's."""
 
@@ -209,7 +208,7 @@ def flood(
             nothing done, where the weights' ratio is too large for that
     """
     longest = high * (kernels.SQRT2_EXACT if rule == kernels.RULE_OCTILE else 1.0)
-    if longest <= MAX_RATIO * low:
+    if longest <= min(MAX_RATIO, max(512, weight.size // 16)) * low:
         width = np.float32(low * 0.98)
         ring = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
         shift = 6 if ring <= 64 else 4
@@ -393,10 +392,11 @@ class CostToGoTree:
         part = np.empty((window.row1 - window.row0 + 2) * stride, np.float32)
         kernels.cut_window(ground.weight, ground.stride, box, part)
         cost = np.empty_like(part)
+        low, high = kernels.weight_range(part)
         flood(
             part,
-            ground.low,
-            ground.high,
+            float(low),
+            float(high),
             stride,
             (row - window.row0 + 1) * stride + col - window.col0 + 1,
             ground.rule,
