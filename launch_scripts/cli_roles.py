@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -58,9 +59,16 @@ def keeper(
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
+    store: Annotated[
+        Path | None, typer.Option(help="The SQLite file of marks; if not given, RUNS/RUN_ID/map.sqlite.")
+    ] = None,
+    rebuild: Annotated[
+        bool, typer.Option(help="Move a damaged store aside and fill a new one from the swarm.")
+    ] = False,
 ) -> None:
     """Keep the shared map's marks in a store that survives every crash."""
-    _run("keeper", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+    kept = {"store_path": store, "rebuild": rebuild}
+    _run("keeper", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key), more=kept)
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -138,6 +146,7 @@ def _run(
     runs: Path,
     tls: tuple[str | None, str | None, str | None],
     listen: str | None = None,
+    more: Mapping[str, Any] | None = None,
 ) -> None:
     import msgspec
 
@@ -175,7 +184,7 @@ def _run(
     now_ns = time.time_ns()
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir.resolve())
-    load_entry(ENTRIES[role])(setup, None)
+    load_entry(ENTRIES[role])(setup, None, **(more or {}))
 
 
 def _found(network: NetworkConfig) -> list[RunInfo]:
