@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable
 
@@ -18,15 +17,15 @@ StopWhen = Callable[[], None] | None
 def quiet(setup: RoleSetup, stop_when: StopWhen) -> None:
     """Runs until SIGTERM, and writes down when it began and ended."""
     assert setup.run_dir is not None
-    ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ended.set())
+    ended: list[int] = []  # an Event would deadlock if the signal came in the middle of its wait
+    signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))
     if stop_when is not None:
-        end_with(stop_when, ended.set)
+        end_with(stop_when, lambda: ended.append(0))
     with (setup.run_dir / "order.txt").open("a") as order:
         order.write(f"+{setup.role}-{setup.id}\n")
     sys.stdout.write(f"hello from {setup.id}\n")
-    while not ended.wait(0.05):
-        pass
+    while not ended:
+        time.sleep(0.05)
     with (setup.run_dir / "order.txt").open("a") as order:
         order.write(f"-{setup.role}-{setup.id}\n")
 

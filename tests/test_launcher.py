@@ -165,13 +165,15 @@ def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Pat
 
 
 _LAUNCHER = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from launch_scripts.local_swarm import LocalSwarm, WarmUp
 from launch_scripts.processes import ProcessSpec
 from swarm.config import Scenario
 from swarm.role import RoleSetup
 
+asked = []
+signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
 folder = Path(sys.argv[1])
 warm_up = WarmUp([])
 warm_up.begin()
@@ -179,10 +181,8 @@ while not warm_up.done(0.05): pass
 specs = [ProcessSpec("planner", "t0", "dummy_roles:quiet"), ProcessSpec("agent", "a0", sys.argv[2])]
 swarm = LocalSwarm(specs, lambda s: RoleSetup(Scenario(), "r", s.role, s.id, 1, 0, folder), folder)
 swarm.start()
-try:
-    while True: time.sleep(0.1); swarm.poll()
-except KeyboardInterrupt:
-    sys.exit(len(swarm.stop(lambda: time.sleep(0.02))))
+while not asked: time.sleep(0.1); swarm.poll()
+sys.exit(len(swarm.stop(lambda: time.sleep(0.02))))
 """
 
 
@@ -205,7 +205,10 @@ def test_a_ctrl_c_that_reaches_the_whole_group_is_for_the_launcher_alone(tmp_pat
         for name in ("+planner-t0", "+agent-a0"):
             wait_for_line(tmp_path / "order.txt", name, within_s=20)
         os.killpg(process.pid, signal.SIGINT)
-        assert process.wait(10) == 0
+        try:
+            assert process.wait(20) == 0
+        finally:
+            process.kill()
     order = (tmp_path / "order.txt").read_text().split()
     assert order[2:] == ["-agent-a0", "-planner-t0"]
     assert "KeyboardInterrupt" not in (tmp_path / "planner-t0.log").read_text()
