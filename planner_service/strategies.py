@@ -50,10 +50,12 @@ class Update:
 
 MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
-REPAIR_SHARE = 16
+REPAIR_SHARE = 100
 """A repair that concerns more than one cell in so many gives way to a full growth."""
 WIDE_SHARE = 16
 """A window over one cell in so many gives way to a coarse growth, where there is a skeleton for it."""
+LOWER_SHARE = 16
+"""A potential is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""
 ROUNDING = 2.0**-23
 """Relative error of one float32 step, doubled for the sum over a route's steps."""
 
@@ -376,7 +378,7 @@ class TargetTree:
             self._tree.near = None
         if self._potential is not None and changes.any_lower:
             ground = self._ground
-            limit = self._grid.cells // REPAIR_SHARE + 1024
+            limit = self._grid.cells // LOWER_SHARE + 1024
             done = kernels.lower(
                 ground.weight,
                 self._potential,
@@ -420,7 +422,7 @@ class TargetTree:
         tree = self._tree
         if not tree.fine or not self._ground.weight[self._ground.pad(tree.root)] < np.inf:
             return None
-        visited = tree.repair(changes, self._grid.cells // REPAIR_SHARE + 1024)
+        visited = tree.repair(changes, self._grid.cells // REPAIR_SHARE + 64)
         if visited < 0 or not tree.fine:
             return None
         rows = changes.cells // self._ground.stride - 1
