@@ -50,6 +50,8 @@ class Update:
 
 MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
+INLINE_NS = 100_000_000
+"""A forced range is grown at once where a full growth takes less."""
 REPAIR_SHARE = 100
 """A repair that concerns more than one cell in so many gives way to a full growth."""
 WIDE_SHARE = 16
@@ -252,13 +254,16 @@ class TargetTree:
         return Update("full", self._grid.window, cells)
 
     def force(self, pace: Floats, cells: Any) -> Update:
-        """The range is forced to cover these cells: what they get afterwards is the best there is."""
+        """The range is forced to cover these cells: what they get afterwards is the best there is. Where growing
+        would hold up answers for long, a worker is asked to, and they get it when that is adopted."""
         target = self.target_cell
         if not self.ready or target is None:
             return Update("none")
         wanted = self._inside(np.asarray(cells, np.int64))
         if wanted.size == 0 or self._tree.exact:
             return Update("none")
+        if self._full_ns > INLINE_NS:
+            return Update("none", wants_full=not self._job_out)
         grown = self._grow_full(target)
         return Update("forced", grown.window, grown.cells)
 
