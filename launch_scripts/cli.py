@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from launch_scripts import cli_ask, cli_roles
+from launch_scripts.commands import ask, roles
 from swarm.errors import SwarmError
 
 
@@ -120,9 +120,9 @@ def up(
     namespace: Annotated[
         str | None, typer.Option(help="Prefix of all keys: runs in different ones do not meet.")
     ] = None,
-    tls_ca: cli_roles.TlsCa = None,
-    tls_cert: cli_roles.TlsCert = None,
-    tls_key: cli_roles.TlsKey = None,
+    tls_ca: roles.TlsCa = None,
+    tls_cert: roles.TlsCert = None,
+    tls_key: roles.TlsKey = None,
     no_live: NoLive = False,
     plain: Plain = False,
     as_json: AsJson = False,
@@ -171,9 +171,9 @@ def _up(
 ) -> None:
     import msgspec
 
-    from launch_scripts import options
+    from launch_scripts.launcher import options
+    from launch_scripts.launcher.up import UpOptions, run_swarm
     from launch_scripts.processes import ROLES
-    from launch_scripts.up import UpOptions, run_swarm
     from swarm.errors import ConfigError
 
     scenario = options.with_network(
@@ -224,11 +224,11 @@ def simulate(
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
     """
-    cli_ask.simulate(scenario, seed, seconds, trace, as_json)
+    ask.simulate(scenario, seed, seconds, trace, as_json)
 
 
-app.add_typer(cli_roles.app)
-app.add_typer(cli_ask.app)
+app.add_typer(roles.app)
+app.add_typer(ask.app)
 
 
 def _mount(name: str, module: str, help: str) -> None:
@@ -249,8 +249,8 @@ def _mount(name: str, module: str, help: str) -> None:
 _mount(
     "bench", "launch_scripts.bench.cli", "Measure: the paper's tables, scale, the wire. See `swarm bench --help`."
 )
-_mount("terrain", "launch_scripts.terrain_cli", "Look at terrains. See `swarm terrain --help`.")
-_mount("map", "launch_scripts.map_cli", "Look at shared maps and the keeper's store. See `swarm map --help`.")
+_mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swarm terrain --help`.")
+_mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
 
 
 def main() -> int:

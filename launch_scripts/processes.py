@@ -16,11 +16,11 @@ STOP_ORDER = ("agent", "targets", "planner", "monitor", "keeper", "router")
 """Each role outlives those that still talk to it."""
 
 ENTRIES = {
-    "router": "launch_scripts.router:run",
+    "router": "launch_scripts.launcher.router:run",
     "keeper": "shared_map.main:run",
     "monitor": "launch_scripts.monitor.main:run",
     "planner": "planner_service.main:run",
-    "targets": "launch_scripts.targets_main:run",
+    "targets": "launch_scripts.world.main:run",
     "agent": "vehicle_agent.main:run",
 }
 """Where each role's `run(setup, stop_when)` is found."""

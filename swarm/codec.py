@@ -45,7 +45,11 @@ def decode(payload: bytes, message_type: type[M]) -> M:
         # A list has room made for as many items as it claims: let it claim no more than there are bytes.
         items = min(len(payload), _MAX_ITEMS)
         fields = msgpack.unpackb(payload, max_array_len=items, max_map_len=items, **_UNPACK_LIMITS)
+        if not isinstance(fields, dict) or "schema" not in fields:
+            raise ProtocolError("no map with a schema")  # msgspec would take a missing tag for the right one
         return msgspec.convert(fields, message_type, builtin_types=(bytes,))
+    except ProtocolError:
+        raise
     except RecursionError as error:
         raise ProtocolError("nested too deeply") from error
     except Exception as error:  # msgpack raises a dozen kinds; none may pass the door

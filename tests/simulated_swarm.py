@@ -8,9 +8,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from launch_scripts.faults import FaultPlan, random_plan
 from launch_scripts.processes import processes_of
-from launch_scripts.simulate import SIMULATED_ROLES, Node, Simulation
+from launch_scripts.simulation.faults import FaultPlan, random_plan
+from launch_scripts.simulation.simulate import SIMULATED_ROLES, Node, Simulation
 from shared_map.replica import MapReplica
 from swarm.bus import Event, Heard
 from swarm.config import Scenario, parse_scenario

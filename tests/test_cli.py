@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from launch_scripts import options
 from launch_scripts.cli import main
+from launch_scripts.launcher import options
 from swarm.config import Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
 
@@ -63,7 +63,7 @@ def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:
 
 
 def test_the_launcher_never_imports_numba_or_rerun() -> None:
-    program = "import launch_scripts.up, sys; sys.exit('numba' in sys.modules or 'rerun' in sys.modules)"
+    program = "import launch_scripts.launcher.up, sys; sys.exit('numba' in sys.modules or 'rerun' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
@@ -186,7 +186,7 @@ def test_two_runs_of_one_second_get_two_folders(tmp_path: Path) -> None:
 
 
 def test_simulate_prints_the_same_report_as_a_run(run) -> None:  # type: ignore[no-untyped-def]
-    pytest.importorskip("launch_scripts.simulate")
+    pytest.importorskip("launch_scripts.simulation.simulate")
     code, out, _ = run("simulate", "synthetic", "--seconds", "2", "--json")
     assert code == 0
     assert json.loads(out)["scenario"] == "synthetic"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from launch_scripts.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks, Partition, random_plan
+from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks, Partition, random_plan
 from swarm.clock import NS_PER_S
 
 BEGAN_NS = 1_000 * NS_PER_S

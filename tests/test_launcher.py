@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from processes_alive import eventually, session_of
 
-from launch_scripts.local_swarm import Backoff, Ending, LocalSwarm, WarmUp
+from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm, WarmUp
 from launch_scripts.processes import ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config import GroupConfig, Scenario, TargetConfig
 from swarm.role import RoleSetup
@@ -148,7 +148,7 @@ def test_an_error_of_the_users_comes_up_as_its_sentence_and_code(swarms: list[Lo
 def test_who_does_not_end_when_asked_is_killed_and_named(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("launch_scripts.local_swarm.STOP_GRACE_S", 0.5)
+    monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 0.5)
     swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
     swarm.start()
     wait_for_line(tmp_path / "order.txt", "+router-0")
@@ -167,7 +167,7 @@ def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Pat
 _LAUNCHER = """
 import signal, sys, time
 from pathlib import Path
-from launch_scripts.local_swarm import LocalSwarm, WarmUp
+from launch_scripts.launcher.local_swarm import LocalSwarm, WarmUp
 from launch_scripts.processes import ProcessSpec
 from swarm.config import Scenario
 from swarm.role import RoleSetup

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from map_strategies import GRID, mark_sets, set_of
 from typer.testing import CliRunner
 
-from launch_scripts.map_cli import app
+from launch_scripts.commands.map import app
 from shared_map.exchange import from_json, to_bands, to_json
 from shared_map.keeper import KeeperStore
 from swarm.errors import StoreError

@@ -12,7 +12,7 @@ from memory_world import MemoryWorld
 from naive import cost_to_go
 from numpy.typing import NDArray
 
-from launch_scripts.targets import TargetsService
+from launch_scripts.world.targets import TargetsService
 from planner_service.events import AnswerRoutes, PoseHeard, RoutesAsked
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.service import PlannerService

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from launch_scripts.record import Recorder
-from launch_scripts.tracks import Tracks
+from launch_scripts.report.record import Recorder
+from launch_scripts.report.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config import Scenario, parse_scenario
 from swarm.grid import GridSpec

@@ -15,10 +15,10 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 from numpy.typing import NDArray
 
-from launch_scripts import picture
-from launch_scripts.record import Recorder
-from launch_scripts.relief import hillshade
-from launch_scripts.report import write_report
+from launch_scripts.report import picture
+from launch_scripts.report.record import Recorder
+from launch_scripts.report.relief import hillshade
+from launch_scripts.report.write import write_report
 from shared_map.terrain import Terrain, terrain_of_pace
 from swarm.config import Scenario, parse_scenario
 from swarm.errors import StoreError

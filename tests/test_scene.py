@@ -20,8 +20,8 @@ from launch_scripts.monitor.scene import (
     window_outline,
 )
 from launch_scripts.monitor.summary import level_of, summary_markdown
-from launch_scripts.observed import VehicleNow
-from launch_scripts.record import Recorder
+from launch_scripts.report.observed import VehicleNow
+from launch_scripts.report.record import Recorder
 from shared_map.terrain import Terrain, terrain_of_pace
 from swarm.config import Scenario
 from swarm.grid import Window

@@ -11,9 +11,17 @@ from hypothesis import strategies as st
 from memory_world import MemoryWorld
 from numpy.typing import NDArray
 
-from launch_scripts.referee import Collision, LethalEntry, Referee
-from launch_scripts.targets import LISTEN_NS, PATIENCE_NS, Action, Captured, Publish, TargetsService, TargetWorld
-from launch_scripts.walks import Budget, Ground, Walk, Walker, far_place, slowness_of
+from launch_scripts.world.referee import Collision, LethalEntry, Referee
+from launch_scripts.world.targets import (
+    LISTEN_NS,
+    PATIENCE_NS,
+    Action,
+    Captured,
+    Publish,
+    TargetsService,
+    TargetWorld,
+)
+from launch_scripts.world.walks import Budget, Ground, Walk, Walker, far_place, slowness_of
 from shared_map.terrain import terrain_of_pace
 from swarm.bus import Event, Heard
 from swarm.clock import NS_PER_S

@@ -10,7 +10,7 @@ import pytest
 import rasterio
 from typer.testing import CliRunner
 
-from launch_scripts.terrain_cli import app
+from launch_scripts.commands.terrain import app
 from shared_map.sources import load_source
 from swarm.config import TerrainConfig
 from swarm.errors import SwarmError

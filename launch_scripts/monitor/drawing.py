@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from launch_scripts import palette
 from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, Ground, MeshTile, Points
-from launch_scripts.record import Sample
+from launch_scripts.report import palette
+from launch_scripts.report.record import Sample
 from swarm.messages import VehicleState
 
 _NAMES_SHOWN = 40

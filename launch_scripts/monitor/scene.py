@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observed import VehicleNow
-from launch_scripts.relief import hillshade
+from launch_scripts.report.observed import VehicleNow
+from launch_scripts.report.relief import hillshade
 from shared_map.terrain import Terrain
 from swarm.grid import GridSpec, Window
 from swarm.messages import VehicleState

@@ -22,8 +22,8 @@ from launch_scripts.monitor.scene import (
     window_outline,
 )
 from launch_scripts.monitor.summary import level_of, summary_markdown
-from launch_scripts.observed import VehicleNow
-from launch_scripts.record import RECORDED_TOPICS, Recorder, messages_per_s
+from launch_scripts.report.observed import VehicleNow
+from launch_scripts.report.record import RECORDED_TOPICS, Recorder, messages_per_s
 from shared_map.cost_map import CostMap
 from shared_map.feed import MapFeed
 from shared_map.replica import MapReplica

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from launch_scripts.record import LiveSummary
+from launch_scripts.report.record import LiveSummary
 from swarm.role import RoleSetup
 
 _WARNINGS = ("restart", "crash", "lost", "stranded", "collision", "lethal", "mismatch", "gone")

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from processes_alive import eventually, session_of
 
-from launch_scripts.options import free_ports
+from launch_scripts.launcher.options import free_ports
 from swarm.bus import AskEnded, Replied
 from swarm.config import NetworkConfig, Scenario, load_scenario
 from swarm.messages import Message

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from simulated_swarm import Laws, seeded
 from wire_strategies import EXAMPLES, MESSAGES
 
-from launch_scripts.simulate import Simulation
+from launch_scripts.simulation.simulate import Simulation
 from swarm.bus import Event
 from swarm.codec import encode
 from swarm.messages import Message, RunInfo

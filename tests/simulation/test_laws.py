@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from simulated_swarm import SMALL, Laws, missing, planned, replica_of, seeded
 
-from launch_scripts import simulate as simulate_module
-from launch_scripts.faults import Crash, FaultPlan, Partition
-from launch_scripts.simulate import Simulation, simulate
+from launch_scripts.simulation import simulate as simulate_module
+from launch_scripts.simulation.faults import Crash, FaultPlan, Partition
+from launch_scripts.simulation.simulate import Simulation, simulate
 from swarm.config import load_scenario
 from vehicle_agent.agent import Agent
 from vehicle_agent.service import AgentService
 
-SCENARIOS = Path(simulate_module.__file__).parent / "scenarios"
+SCENARIOS = Path(simulate_module.__file__).parents[1] / "scenarios"
 SECONDS = 24.0
 SETTLED_S = 4.0
 """What was said so long ago has reached everybody, once all is quiet."""

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from launch_scripts.observed import MarkedCells, Observed, VehicleNow, count_states
-from launch_scripts.tracks import TrackKey, Tracks
+from launch_scripts.report.observed import MarkedCells, Observed, VehicleNow, count_states
+from launch_scripts.report.tracks import TrackKey, Tracks
 from swarm.clock import NS_PER_S
 from swarm.config import Scenario, plan_agents
 from swarm.grid import GridSpec

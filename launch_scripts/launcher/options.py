@@ -15,7 +15,7 @@ import msgspec
 from swarm.config import NetworkConfig, Scenario, TlsConfig, check_endpoint, load_scenario
 from swarm.errors import BusError, ConfigError, StoreError
 
-SCENARIOS = Path(__file__).parent / "scenarios"
+SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
 def find_scenario(name: str) -> Scenario:

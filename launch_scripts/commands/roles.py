@@ -150,10 +150,10 @@ def _run(
 ) -> None:
     import msgspec
 
-    from launch_scripts import options
-    from launch_scripts.child import load_entry, log_to
+    from launch_scripts.launcher import options
+    from launch_scripts.launcher.child import load_entry, log_to
+    from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.processes import ENTRIES, processes_of
-    from launch_scripts.watcher import check_vacant
     from swarm.errors import ConfigError, StoreError
     from swarm.role import RoleSetup
 
@@ -189,7 +189,7 @@ def _run(
 
 def _found(network: NetworkConfig) -> list[RunInfo]:
     """Who is in the namespace."""
-    from launch_scripts.watcher import ask_run
+    from launch_scripts.launcher.watcher import ask_run
     from swarm.zenoh_bus import open_bus
 
     with open_bus(network) as bus:

@@ -13,8 +13,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.live_table import live_table, plain_line
-from launch_scripts.record import LiveSummary
+from launch_scripts.launcher.live_table import live_table, plain_line
+from launch_scripts.report.record import LiveSummary
 
 log = logging.getLogger(__name__)
 

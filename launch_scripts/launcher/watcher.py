@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from launch_scripts.record import RECORDED_TOPICS, Recorder
+from launch_scripts.report.record import RECORDED_TOPICS, Recorder
 from swarm.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError

@@ -70,7 +70,7 @@ def _bars() -> Iterator[Tell]:
 
 
 def _scenario(name: str) -> Scenario:
-    from launch_scripts.options import find_scenario
+    from launch_scripts.launcher.options import find_scenario
 
     return find_scenario(name)
 
@@ -197,7 +197,7 @@ def _write(path: Path, bands: list[Any], grid: GridSpec, **profile: Any) -> None
 
 
 def _draw(terrain: Terrain, path: Path, title: str) -> None:
-    from launch_scripts.terrain_picture import draw
+    from launch_scripts.commands.terrain_picture import draw
 
     draw(terrain, path, title)
 

@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
-from launch_scripts.child import LastWords, run_child
+from launch_scripts.launcher.child import LastWords, run_child
 from launch_scripts.processes import STOP_ORDER, ProcessSpec
 from swarm.role import RoleSetup
 

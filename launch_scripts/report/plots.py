@@ -15,8 +15,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from launch_scripts.palette import BLUE, DARK_GREEN, FAINT, GREEN, INK, ORANGE, SKY, STATE_COLOURS, VIOLET
-from launch_scripts.record import Recorder, Sample, messages_per_s
+from launch_scripts.report.palette import BLUE, DARK_GREEN, FAINT, GREEN, INK, ORANGE, SKY, STATE_COLOURS, VIOLET
+from launch_scripts.report.record import Recorder, Sample, messages_per_s
 from swarm.stats import Histogram
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.referee import Collision, LethalEntry, Referee
-from launch_scripts.walks import Budget, Ground, Walker, far_place, slowness_of
+from launch_scripts.world.referee import Collision, LethalEntry, Referee
+from launch_scripts.world.walks import Budget, Ground, Walker, far_place, slowness_of
 from shared_map.layers import inflate, inflation_halves
 from shared_map.terrain import Terrain
 from swarm.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied

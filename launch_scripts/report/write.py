@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.record import Recorder
+from launch_scripts.report.record import Recorder
 from shared_map.terrain import Terrain
 from swarm.errors import StoreError
 
@@ -64,7 +64,7 @@ def write_report(
 def _draw(
     path: Path, recorder: Recorder, report: dict[str, Any], terrain: Terrain, truth: NDArray[np.float32] | None
 ) -> None:
-    from launch_scripts.picture import save_picture  # matplotlib takes a moment
+    from launch_scripts.report.picture import save_picture  # matplotlib takes a moment
 
     partial = path.with_name(path.name + ".part")
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from launch_scripts.targets import TargetsService
+from launch_scripts.world.targets import TargetsService
 from shared_map.terrain import load_terrain, load_truth
 from swarm.clock import MonotonicClock
 from swarm.process import Inbox, Process, end_with

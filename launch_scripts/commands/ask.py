@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.cli_roles import TlsCa, TlsCert, TlsKey
+from launch_scripts.commands.roles import TlsCa, TlsCert, TlsKey
 
 if TYPE_CHECKING:
     from swarm.config import NetworkConfig
@@ -31,7 +31,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 def _network(connect: str, namespace: str, tls: tuple[str | None, str | None, str | None]) -> NetworkConfig:
     import msgspec
 
-    from launch_scripts.options import tls_of, with_network
+    from launch_scripts.launcher.options import tls_of, with_network
     from swarm.config import Scenario
 
     chosen = with_network(Scenario(), connect=connect, namespace=namespace, tls=tls_of(*tls)).network
@@ -134,7 +134,7 @@ def status(
     as_json: AsJson = False,
 ) -> None:
     """Show who takes part in the running swarm and how the planners are doing."""
-    from launch_scripts.watcher import ask_run
+    from launch_scripts.launcher.watcher import ask_run
     from swarm.bus import Heard
     from swarm.errors import BusError
     from swarm.messages import PlannerStatus, Stats
@@ -230,9 +230,9 @@ def simulate(name: str, seed: int | None, seconds: float | None, trace: Path | N
     """See `swarm simulate`."""
     import contextlib
 
-    from launch_scripts.options import find_scenario
-    from launch_scripts.screen import Screen
-    from launch_scripts.simulate import simulate as run_simulation
+    from launch_scripts.launcher.options import find_scenario
+    from launch_scripts.launcher.screen import Screen
+    from launch_scripts.simulation.simulate import simulate as run_simulation
     from swarm.errors import StoreError
 
     scenario = find_scenario(name)

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from launch_scripts.palette import (
+from launch_scripts.report.palette import (
     BLACK,
     DARK_GREEN,
     FAINT,
@@ -29,9 +29,9 @@ from launch_scripts.palette import (
     RULE,
     YELLOW,
 )
-from launch_scripts.plots import draw_plots, duration, halo
-from launch_scripts.record import Recorder
-from launch_scripts.relief import hillshade
+from launch_scripts.report.plots import draw_plots, duration, halo
+from launch_scripts.report.record import Recorder
+from launch_scripts.report.relief import hillshade
 from shared_map.terrain import Terrain
 from swarm.messages import MarkKind
 

@@ -14,11 +14,11 @@ from typing import Any, TextIO
 
 import msgspec
 
-from launch_scripts.event_log import EventLog
-from launch_scripts.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.processes import STOP_ORDER, ProcessSpec, processes_of
-from launch_scripts.record import RECORDED_TOPICS, Recorder
-from launch_scripts.targets import TargetsService
+from launch_scripts.report.record import RECORDED_TOPICS, Recorder
+from launch_scripts.simulation.event_log import EventLog
+from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
+from launch_scripts.world.targets import TargetsService
 from planner_service.service import PlannerService
 from shared_map.keeper import KeeperStore
 from shared_map.service import KeeperService

@@ -14,11 +14,11 @@ import signal
 import sys
 
 MODULES = (
-    "launch_scripts.child",
-    "launch_scripts.router",
+    "launch_scripts.launcher.child",
+    "launch_scripts.launcher.router",
     "shared_map.main",
     "vehicle_agent.main",
-    "launch_scripts.targets_main",
+    "launch_scripts.world.main",
     "planner_service.main",
 )
 

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from launch_scripts.child import log_to
-from launch_scripts.local_swarm import Ending, LocalSwarm, WarmUp
-from launch_scripts.options import check_ports, listening, make_run_dir, new_run_id
+from launch_scripts.launcher.child import log_to
+from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
+from launch_scripts.launcher.options import check_ports, listening, make_run_dir, new_run_id
+from launch_scripts.launcher.screen import Screen
+from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.processes import ROLES, ProcessSpec, processes_of
-from launch_scripts.record import Recorder
-from launch_scripts.report import write_report
-from launch_scripts.screen import Screen
-from launch_scripts.watcher import Watcher, ask_run, check_vacant
+from launch_scripts.report.record import Recorder
+from launch_scripts.report.write import write_report
 from shared_map.terrain import prepare
 from swarm.bus import Bus
 from swarm.clock import MonotonicClock
@@ -30,7 +30,7 @@ from swarm.zenoh_bus import open_bus
 
 log = logging.getLogger(__name__)
 
-PRELOAD = ("launch_scripts.warm_kernels",)
+PRELOAD = ("launch_scripts.launcher.warm_kernels",)
 
 _TURN_S = 0.05
 _LISTEN_WITHIN_S = 20.0

@@ -1,0 +1,1 @@
+"""The sub-commands of `swarm`; each module is one."""

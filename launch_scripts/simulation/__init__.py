@@ -1,0 +1,1 @@
+"""The whole swarm in one process, on a memory bus and a manual clock, with seeded faults."""
