@@ -70,7 +70,7 @@ def test_the_launcher_never_imports_numba_or_rerun() -> None:
 def test_an_unknown_scenario_gets_the_nearest_name(run) -> None:  # type: ignore[no-untyped-def]
     code, out, err = run("up", "jaksboro")
     assert (code, out) == (2, "")
-    assert err.startswith("swarm: no scenario 'jaksboro', did you mean 'jacksboro'?")
+    assert err.startswith("swarm: no scenario 'jaksboro' (did you mean 'jacksboro'?)")
 
 
 def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

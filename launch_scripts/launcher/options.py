@@ -28,8 +28,8 @@ def find_scenario(name: str) -> Scenario:
         return load_scenario(built_in)
     names = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    hint = f", did you mean {close[0]!r}?" if close else ";"
-    raise ConfigError(f"no scenario {name!r}{hint} Give a .toml file or one of: {', '.join(names)}")
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    raise ConfigError(f"no scenario {name!r}{hint}: give a .toml file or one of: {', '.join(names)}")
 
 
 def with_network(
