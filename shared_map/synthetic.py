@@ -5,6 +5,8 @@ Only additions, products and square roots of seeded numbers, so that a seed give
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,10 +33,28 @@ TINT = np.array(
 def fractal(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
     """Smooth noise of many scales, roughly -1..1, the broadest hills `coarsest` cells wide. Ridged has sharp crests
     and broad valleys."""
+    return _octaves(_lattice_noise, 0.5, rng, rows, cols, coarsest, ridged)
+
+
+def mountains(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
+    """As `fractal`, of gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the work."""
+    return _octaves(_gradient_noise, 0.45, rng, rows, cols, coarsest, ridged)
+
+
+def _octaves(
+    noise: Callable[[np.random.Generator, int, int, float], Floats],
+    decay: float,
+    rng: np.random.Generator,
+    rows: int,
+    cols: int,
+    coarsest: float,
+    ridged: bool,
+) -> Floats:
+    """The sum of noise at scales halved again and again, each `decay` as high as the one before."""
     field = np.zeros((rows, cols), np.float32)
     amplitude, scale, total = 1.0, float(coarsest), 0.0
     while scale >= 2.0 and amplitude > 0.01:
-        octave = _lattice_noise(rng, rows, cols, scale)
+        octave = noise(rng, rows, cols, scale)
         if ridged:
             np.abs(octave, out=octave)
             octave *= np.float32(-2)
@@ -42,7 +62,7 @@ def fractal(rng: np.random.Generator, rows: int, cols: int, coarsest: float, rid
         octave *= np.float32(amplitude)
         field += octave
         total += amplitude
-        amplitude *= 0.5
+        amplitude *= decay
         scale /= 2.0
     field /= np.float32(max(total, 1.0))
     return field
@@ -63,25 +83,6 @@ def _along(lattice: Floats, count: int, scale: float, offset: float) -> Floats:
     part = (part * part * (np.float32(3) - np.float32(2) * part))[:, None]
     between: Floats = lattice[low] * (np.float32(1) - part) + lattice[low + 1] * part
     return between
-
-
-def mountains(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
-    """As `fractal`, of gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the work."""
-    field = np.zeros((rows, cols), np.float32)
-    amplitude, scale, total = 1.0, float(coarsest), 0.0
-    while scale >= 2.0 and amplitude > 0.01:
-        octave = _gradient_noise(rng, rows, cols, scale)
-        if ridged:
-            np.abs(octave, out=octave)
-            octave *= np.float32(-2)
-            octave += np.float32(1)
-        octave *= np.float32(amplitude)
-        field += octave
-        total += amplitude
-        amplitude *= 0.45
-        scale /= 2.0
-    field /= np.float32(max(total, 1.0))
-    return field
 
 
 def _gradient_noise(rng: np.random.Generator, rows: int, cols: int, scale: float) -> Floats:
