@@ -22,8 +22,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service import kernels
-from planner_service.tree import Changes, CostToGoTree, Floats, Ground, Skeleton, check_pace, find_skeleton, flood
+from planner_service.bounds import LowerBounds
+from planner_service.ground import Changes, Floats, Ground, check_pace
+from planner_service.growth import flood
+from planner_service.kernels.rules import NONE
+from planner_service.kernels.walk import walk_routes
+from planner_service.routes import read_routes
+from planner_service.skeleton import Skeleton, find_skeleton
+from planner_service.tree import CostToGoTree
+from planner_service.windows import block_window
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.messages import Route, RouteStatus
@@ -56,43 +63,13 @@ REPAIR_SHARE = 100
 """A repair that concerns more than one cell in so many gives way to a full growth."""
 WIDE_SHARE = 16
 """A window over one cell in so many gives way to a coarse growth, where there is a skeleton for it."""
-LOWER_SHARE = 16
-"""A potential is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""
-ROUNDING = 2.0**-23
-"""Relative error of one float32 step, doubled for the sum over a route's steps."""
-
-
-def block_window(grid: GridSpec, old: int, new: int, k_min: int) -> Window:
-    """The paper's variable range: the largest k >= k_min whose block index of 2**k cells changed between two cells
-    gives a window 2**(k+2)+1 wide; if none did, the one of k_min. At least as far out as the move was long, and
-    shut around both cells."""
-    row, col = grid.row_col(new)
-    old_row, old_col = grid.row_col(old)
-    k = k_min
-    top = max(grid.rows, grid.cols)
-    for exponent in range(k_min, top.bit_length() + 1):
-        if row >> exponent != old_row >> exponent or col >> exponent != old_col >> exponent:
-            k = exponent
-    return grid.around(new, max(2 << k, 2 * grid.distance_cells(old, new)))
-
-
-def literal_window(grid: GridSpec, old: int, new: int) -> Window:
-    """The paper's rule as it is printed: a block must be crossed in row and column at once, so that it never widens
-    for a move along an axis. For comparison only."""
-    row, col = grid.row_col(new)
-    old_row, old_col = grid.row_col(old)
-    k = 1
-    for exponent in range(1, max(grid.rows, grid.cols).bit_length() + 1):
-        if row >> exponent != old_row >> exponent and col >> exponent != old_col >> exponent:
-            k = exponent
-    return grid.around(new, 2 << k)
 
 
 @dataclass(frozen=True, eq=False)
 class GrownTree:
     """An exact tree, grown by a worker on a snapshot.
 
-    cost, parent, weight  padded, as in `kernels`
+    cost, parent, weight  padded, as `kernels.rules` says
     offered               padded parents of the tree that was served when the snapshot was taken; None before any
     """
 
@@ -143,8 +120,7 @@ class TargetTree:
         # Of the coarse strategies. It holds for the map on which it was found, so that a change unmakes it.
         self._skeleton: Skeleton | None = None
         self._full_ns = self.measured_model_ns()
-        # Lower bounds: `_potential` is an exact tree of an earlier root; no step costs less than it falls by.
-        self._potential: Floats | None = None
+        self._bounds = LowerBounds(self._ground)
 
     # --- keeping up ---------------------------------------------------------------------------------------------
 
@@ -187,7 +163,7 @@ class TargetTree:
             ground = Ground(grid, config)
             ground.load(pace_snapshot)
             cost = np.full(ground.size, np.inf, np.float32)
-            parent = np.full(ground.size, kernels.NONE, np.uint8)
+            parent = np.full(ground.size, NONE, np.uint8)
             reach = 0.0
             skeleton = None
             if grid.inside(*divmod(target_cell, grid.cols)) and ground.passable(target_cell):
@@ -237,7 +213,7 @@ class TargetTree:
         if grown.cost[self._ground.pad(grown.target_cell)] != 0.0:
             return self._grow_full(target_cell)
         tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
-        self._potential = grown.cost.copy()
+        self._bounds.take(grown.cost.copy())
         self._stale = False
         self._skeleton = None if since.cells.size else grown.skeleton
         moved = target_cell != tree.root
@@ -282,55 +258,7 @@ class TargetTree:
         asked = np.asarray(cells, np.int64).reshape(-1)
         if not self.ready:
             return [Route(status=RouteStatus.NO_TARGET, start=int(cell)) for cell in asked]
-        ground, tree = self._ground, self._tree
-        inside = (asked >= 0) & (asked < self._grid.cells)
-        starts = ground.pad_all(np.where(inside, asked, 0))
-        lethal = inside & ~(ground.weight[starts] < np.inf)
-        ok = inside & (tree.cost[starts] < np.inf)
-        directions, ends, driven, diagonals, last = kernels.walk_routes(
-            ground.weight,
-            tree.parent,
-            ground.stride,
-            ground.rule,
-            ground.pad(tree.root),
-            starts[ok],
-            max_cells,
-            self._grid.cells,
-        )
-        if (ends < 0).any():
-            raise AssertionError("a route does not end at the target: the tree is broken")
-        begins = np.concatenate(([0], ends))[:-1]
-        steps = ends - begins
-        lengths = (steps + diagonals * (ground.diagonal - 1.0)) * self._grid.resolution_m
-        remaining = np.maximum(tree.cost[last] + tree.offset, 0.0).astype(np.float64)
-        remaining[last == ground.pad(tree.root)] = 0.0
-        costs = driven - lengths * self._config.length_weight + remaining
-        bounds = np.minimum(self._lower_bounds(starts[ok]), costs)
-        packed = directions.tobytes()
-        routes: list[Route] = []
-        n = 0
-        for i, cell in enumerate(asked.tolist()):
-            if ok[i]:
-                routes.append(
-                    Route(
-                        status=RouteStatus.OK,
-                        start=cell,
-                        directions=packed[begins[n] : ends[n]],
-                        cost_s=float(costs[n]),
-                        lower_bound_s=float(bounds[n]),
-                        length_m=float(lengths[n]),
-                        remaining_s=float(remaining[n]),
-                    )
-                )
-                n += 1
-                continue
-            status = RouteStatus.UNREACHABLE
-            if not inside[i]:
-                status = RouteStatus.OUTSIDE
-            elif lethal[i]:
-                status = RouteStatus.LETHAL_START
-            routes.append(Route(status=status, start=cell))
-        return routes
+        return read_routes(self._tree, self._bounds, asked, max_cells)
 
     def cost_to_go_at(self, cells: Any) -> Floats:
         """float32, s, per cell; inf where there is no way or the cell is outside."""
@@ -381,21 +309,7 @@ class TargetTree:
             self._skeleton = None
         if changes.any_lower:
             self._tree.near = None
-        if self._potential is not None and changes.any_lower:
-            ground = self._ground
-            limit = self._grid.cells // LOWER_SHARE + 1024
-            done = kernels.lower(
-                ground.weight,
-                self._potential,
-                ground.stride,
-                ground.rule,
-                ground.corners,
-                changes.cells,
-                changes.before,
-                limit,
-            )
-            if done < 0:
-                self._potential = None
+        self._bounds.learn(changes)
         return changes
 
     def _aim(self, target_cell: int, changes: Changes | None) -> bool:
@@ -415,7 +329,7 @@ class TargetTree:
         self._stale = False
         self._moves = 0
         if self._windows:
-            self._potential = self._tree.cost.copy()
+            self._bounds.take(self._tree.cost.copy())
         return Update("full", self._grid.window, self._grid.cells)
 
     def _mend(self, changes: Changes | None) -> Update | None:
@@ -472,59 +386,6 @@ class TargetTree:
         asked = cells.reshape(-1)
         return asked[(asked >= 0) & (asked < self._grid.cells)]
 
-    def _lower_bounds(self, starts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Proven lower bounds on the time from padded cells to the target now: docs/certificates.md."""
-        ground, tree = self._ground, self._tree
-        if tree.exact:
-            own = tree.cost[starts].astype(np.float64)
-            bound = own * (1.0 - self._rounding(own))
-        else:
-            bound = self._shifted(starts)
-        if self._config.length_weight:
-            # Of the key's optimum only the share that is travel time counts, at least 1 - lambda / smallest weight.
-            bound = bound * (1.0 - ground.length_weight_s / ground.low)
-        return np.maximum(bound, 0.0)
-
-    def _shifted(self, starts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """No way to the target is cheaper than the potential falls along it; and it either stays in the window
-        around the target, or comes in over its rim for the last time and costs from there what the window says."""
-        ground, tree = self._ground, self._tree
-        potential = self._potential
-        own = np.zeros(starts.size)
-        at_target = math.inf
-        if potential is not None:
-            own = potential[starts].astype(np.float64)
-            own[~np.isfinite(own)] = 0.0
-            own = own * (1.0 - self._rounding(own))
-            at_target = float(potential[ground.pad(tree.root)])
-            at_target *= 1.0 + float(self._rounding(np.asarray(at_target)))
-        bound = np.maximum(own - at_target, 0.0)
-        near = tree.near
-        if near is None:
-            return bound
-        rim_cost = near.rim_cost * (1.0 - self._rounding(near.rim_cost))
-        outside = np.full(starts.size, rim_cost.min(initial=math.inf))
-        if potential is not None and near.rim.size:
-            at_rim = potential[near.rim].astype(np.float64)
-            at_rim = at_rim * (1.0 + self._rounding(at_rim))
-            outside = np.maximum(outside, own - (at_rim - rim_cost).max())
-        rows, cols = np.divmod(starts, ground.stride)
-        rows, cols = rows - 1 - near.window.row0, cols - 1 - near.window.col0
-        height, width = near.cost.shape
-        within = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
-        inside = np.full(starts.size, math.inf)
-        own_way = near.cost[rows[within], cols[within]].astype(np.float64)
-        known = np.where(np.isfinite(own_way), own_way, 0.0)
-        inside[within] = own_way * (1.0 - self._rounding(known))
-        found = np.minimum(inside, outside)
-        # A route was found, so that no bound is infinite; a rim that leads nowhere would be.
-        return np.maximum(bound, np.where(np.isfinite(found), found, 0.0))
-
-    def _rounding(self, costs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far float32 may have put these costs off, relatively: no optimal route has more steps than this."""
-        steps = np.minimum(costs / self._ground.low, self._grid.cells) + 4.0
-        return np.minimum(np.asarray(steps * ROUNDING), 1.0)
-
     def _measure(self, grown: GrownTree, followed_cells: Any) -> None:
         """Driven cost over optimum of what was offered when the snapshot was taken, on the snapshot."""
         cells = self._inside(np.asarray(followed_cells, np.int64))
@@ -532,8 +393,8 @@ class TargetTree:
         root = self._ground.pad(grown.target_cell)
         offered = grown.offered
         assert offered is not None
-        starts = starts[(grown.cost[starts] < np.inf) & (offered[starts] != kernels.NONE)]
-        _, ends, driven, _, _ = kernels.walk_routes(
+        starts = starts[(grown.cost[starts] < np.inf) & (offered[starts] != NONE)]
+        _, ends, driven, _, _ = walk_routes(
             grown.weight, offered, self._ground.stride, self._ground.rule, root, starts, 0, self._grid.cells
         )
         whole = ends >= 0

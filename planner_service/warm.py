@@ -8,8 +8,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.ground import Ground
 from planner_service.strategies import TargetTree
-from planner_service.tree import CostToGoTree, Ground
+from planner_service.tree import CostToGoTree
 from swarm.config import PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
 

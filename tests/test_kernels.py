@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from strategies import RULES, random_pace
 
-from planner_service import kernels
-from planner_service.tree import CostToGoTree, Ground
+from planner_service.ground import Ground
+from planner_service.kernels import flood
+from planner_service.tree import CostToGoTree
 from swarm.config import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -89,7 +90,7 @@ def test_buckets_and_heap_give_the_same_costs_to_the_last_bit() -> None:
         ground = tree.ground
         cost, parent = np.empty_like(tree.cost), np.empty_like(tree.parent)
         root = ground.pad(target)
-        kernels.flood_wide(ground.weight, cost, ground.stride, root, ground.rule, ground.corners, parent)
+        flood.flood_wide(ground.weight, cost, ground.stride, root, ground.rule, ground.corners, parent)
         np.testing.assert_array_equal(cost, tree.cost)
 
 

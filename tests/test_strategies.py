@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import RULES, STRATEGIES, Job, Marks, Move, happenings, paces, planner_configs, random_pace
 
-from planner_service.strategies import GrownTree, TargetTree, block_window, literal_window
+from planner_service.strategies import GrownTree, TargetTree
+from planner_service.windows import block_window, literal_window
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.messages import RouteStatus

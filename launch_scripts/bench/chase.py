@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.bench.fields import Pace, largest_area, random_walk
+from planner_service.ground import Ground
 from planner_service.strategies import GrownTree, TargetTree
-from planner_service.tree import CostToGoTree, Ground
+from planner_service.tree import CostToGoTree
 from swarm.config import PlannerConfig, Strategy
 from swarm.grid import GridSpec
 from swarm.messages import Route, RouteStatus

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.bench.fields import Pace, largest_area, make_field
-from planner_service import kernels
-from planner_service.tree import CostToGoTree, Ground
+from planner_service.ground import Ground
+from planner_service.kernels import flood
+from planner_service.tree import CostToGoTree
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec
 
@@ -106,7 +107,7 @@ def _tools(pace: Pace, edge: str) -> dict[str, Tool]:
     floor_cost = np.empty(ground.size, np.float32)
 
     def floor(root: int) -> None:
-        kernels.breadth_first(ground.weight, floor_cost, ground.stride, ground.pad(root))
+        flood.breadth_first(ground.weight, floor_cost, ground.stride, ground.pad(root))
 
     tools: dict[str, Tool] = {"ours": ours, "floor": floor}
     if edge == "paper":

@@ -1,6 +1,6 @@
 """Kernels of the coarse tree: which cells carry the traffic, and how the others reach them.
 
-Arrays are flat and padded as in `planner_service.kernels`, with which this file shares nothing.
+Arrays are laid out as `rules` says.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-NONE = np.uint8(255)
+from planner_service.kernels.rules import NONE
 
 
 @njit(cache=True, nogil=True)

@@ -1,0 +1,174 @@
+"""The weights of a map as the kernels want them, and what changed in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels import ground as kernels
+from planner_service.kernels.rules import RULE_FOUR, RULE_OCTILE, RULE_PAPER, SQRT2_EXACT
+from swarm.config import PlannerConfig
+from swarm.grid import GridSpec, Window
+
+Floats = NDArray[np.float32]
+Cells = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """Cells whose weight changed (padded, no repetition) and what it was before."""
+
+    cells: Cells
+    before: Floats
+    weight_now: Floats
+
+    @property
+    def any_lower(self) -> bool:
+        return bool((self.weight_now < self.before).any())
+
+
+NO_CHANGES = Changes(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
+
+
+def rule_of(config: PlannerConfig) -> int:
+    if config.neighbours == 4:
+        return RULE_FOUR
+    return RULE_OCTILE if config.edge == "octile" else RULE_PAPER
+
+
+def check_pace(grid: GridSpec, pace: NDArray[np.float32]) -> None:
+    """Raises ValueError unless the array is what kernels may be handed. Values are checked as they are read."""
+    if not isinstance(pace, np.ndarray) or pace.dtype != np.float32:
+        raise ValueError(f"pace must be a float32 array, not {getattr(pace, 'dtype', type(pace).__name__)}")
+    if pace.shape != (grid.rows, grid.cols):
+        raise ValueError(f"pace has shape {pace.shape}, the grid is {grid.rows} x {grid.cols}")
+    if not pace.flags.c_contiguous:
+        raise ValueError("pace must be C-contiguous")
+
+
+class Ground:
+    """The weights of a map: what entering each cell costs, s, padded with a lethal border.
+
+    low, high  bounds of the finite weights, not necessarily reached; (inf, 0) if all is lethal
+    """
+
+    def __init__(self, grid: GridSpec, config: PlannerConfig) -> None:
+        self.grid = grid
+        self.config = config
+        self.rule = rule_of(config)
+        self.corners = config.corner_cutting
+        self.stride = grid.cols + 2
+        self.size = (grid.rows + 2) * self.stride
+        self.diagonal = SQRT2_EXACT if self.rule == RULE_OCTILE else 1.0
+        self.length_weight_s = config.length_weight * grid.resolution_m
+        self.weight: Floats = np.full(self.size, np.inf, np.float32)
+        self.low = math.inf
+        self.high = 0.0
+
+    def pad(self, cell: int) -> int:
+        row, col = divmod(cell, self.grid.cols)
+        return (row + 1) * self.stride + col + 1
+
+    def pad_all(self, cells: Cells) -> Cells:
+        rows, cols = np.divmod(cells, self.grid.cols)
+        padded: Cells = (rows + 1) * self.stride + cols + 1
+        return padded
+
+    def unpad(self, padded: int) -> int:
+        row, col = divmod(padded, self.stride)
+        return (row - 1) * self.grid.cols + col - 1
+
+    def load(self, pace: Floats) -> None:
+        """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative."""
+        check_pace(self.grid, pace)
+        bad = kernels.pad_weights(
+            pace,
+            np.float32(self.grid.resolution_m),
+            np.float32(self.length_weight_s),
+            self.stride,
+            self.weight,
+        )
+        if bad:
+            raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
+        low, high = kernels.weight_range(self.weight)
+        self.low, self.high = float(low), float(high)
+
+    def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
+        """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative."""
+        check_pace(self.grid, pace)
+        found: list[Changes] = []
+        for window in dirty:
+            row0, col0 = max(window.row0, 0), max(window.col0, 0)
+            row1, col1 = min(window.row1, self.grid.rows), min(window.col1, self.grid.cols)
+            if row1 <= row0 or col1 <= col0:
+                continue
+            room = (row1 - row0) * (col1 - col0)
+            cells = np.empty(room, np.int64)
+            before = np.empty(room, np.float32)
+            count, bad = kernels.changed_cells(
+                pace,
+                np.float32(self.grid.resolution_m),
+                np.float32(self.length_weight_s),
+                (row0, col0, row1, col1),
+                self.stride,
+                self.weight,
+                cells,
+                before,
+            )
+            if bad:
+                raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
+            if count:
+                found.append(Changes(cells[:count], before[:count], self.weight[cells[:count]]))
+        if not found:
+            return NO_CHANGES
+        changes = found[0]
+        if len(found) > 1:
+            # A cell in two overlapping windows changes in the first only, so there is no repetition.
+            changes = Changes(
+                np.concatenate([part.cells for part in found]),
+                np.concatenate([part.before for part in found]),
+                np.concatenate([part.weight_now for part in found]),
+            )
+        finite = changes.weight_now[np.isfinite(changes.weight_now)]
+        if finite.size:
+            self.low = min(self.low, float(finite.min()))
+            self.high = max(self.high, float(finite.max()))
+        return changes
+
+    def difference(self, older: Floats, dirty: Sequence[Window]) -> Changes:
+        """What changed inside the dirty windows since `older` weights."""
+        parts: list[Cells] = []
+        for window in dirty:
+            row0, col0 = max(window.row0, 0), max(window.col0, 0)
+            row1, col1 = min(window.row1, self.grid.rows), min(window.col1, self.grid.cols)
+            if row1 <= row0 or col1 <= col0:
+                continue
+            shape = (self.grid.rows + 2, self.stride)
+            box = (slice(row0 + 1, row1 + 1), slice(col0 + 1, col1 + 1))
+            rows, cols = np.nonzero(self.weight.reshape(shape)[box] != older.reshape(shape)[box])
+            parts.append((rows + row0 + 1) * self.stride + cols + col0 + 1)
+        if not parts:
+            return NO_CHANGES
+        cells = np.unique(np.concatenate(parts))
+        return Changes(cells, older[cells], self.weight[cells])
+
+    def passable(self, cell: int) -> bool:
+        return bool(self.weight[self.pad(cell)] < np.inf)
+
+    def is_step(self, a: int, b: int) -> bool:
+        """Whether a vehicle may go from padded cell a to its neighbour b."""
+        gap = b - a
+        row_step = round(gap / self.stride)
+        col_step = gap - row_step * self.stride
+        if max(abs(row_step), abs(col_step)) != 1 or not self.weight[a] < np.inf or not self.weight[b] < np.inf:
+            return False
+        if row_step == 0 or col_step == 0:
+            return True
+        if self.rule == RULE_FOUR:
+            return False
+        corners = self.weight[a + row_step * self.stride], self.weight[a + col_step]
+        return self.corners or bool(max(corners) < np.inf)
