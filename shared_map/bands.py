@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 
 import numpy as np
 
-from shared_map.layers import Floats
+from shared_map.arrays import Floats
 
 BAND_ROWS = 128
 Progress = Callable[[str, float], None]

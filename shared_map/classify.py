@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.bands import Progress, in_bands, no_progress, padded_rows
-from shared_map.layers import Bools, Bytes, Floats, TerrainClass, grade_of_padded
+from shared_map.layers import TerrainClass, grade_of_padded
 
 HALO = 6
 """Rows around a band that its features look at."""

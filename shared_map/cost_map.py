@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.layers import LETHAL, Floats, inflate, inflation_halves
+from shared_map.arrays import Floats
+from shared_map.layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain import Terrain
 from swarm.errors import OutsideGridError
 from swarm.grid import TILE_CELLS, Window

@@ -21,7 +21,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from shared_map.layers import Bytes, TerrainClass, polygon_mask
+from shared_map.arrays import Bytes
+from shared_map.layers import TerrainClass, polygon_mask
 from swarm.config import ClassName, Point, Section
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

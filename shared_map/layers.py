@@ -24,15 +24,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shared_map.arrays import Bools, Bytes, Floats
 from swarm.config import CostConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
-
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
-Bools = NDArray[np.bool_]
 
 LETHAL = np.float32(np.inf)
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.arrays import Bools, Bytes
 from shared_map.bands import Progress, bands, no_progress
-from shared_map.layers import Bools, Bytes
 from shared_map.rasters import bounds_in, crs_of, opened, resampling
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

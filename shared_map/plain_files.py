@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.layers import Bytes, Floats
+from shared_map.arrays import Bytes, Floats
 from swarm.errors import TerrainError
 
 MAX_CELLS = 16384 * 16384

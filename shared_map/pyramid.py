@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.layers import Bytes, Floats
+from shared_map.arrays import Bytes, Floats
 from shared_map.terrain import Terrain
 from swarm.grid import GridSpec
 

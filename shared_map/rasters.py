@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.arrays import Floats
 from shared_map.bands import Progress, bands, no_progress
-from shared_map.layers import Floats
 from swarm.config import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared_map.layers import Floats
+from shared_map.arrays import Floats
 
 
 def resample(values: Floats, rows: int, cols: int, row_step: float, col_step: float) -> Floats:

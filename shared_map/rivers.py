@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.layers import Bools, Floats
-from shared_map.synthetic import fractal
+from shared_map.arrays import Bools, Floats
+from shared_map.noise import fractal
 
 FORD_EVERY, FORD_LENGTH = 64, 4
 """Cells along a river from one shallow place to the next, and how long it is: a river never cuts a map in two."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared_map.layers import Bools, Floats
+from shared_map.arrays import Bools, Floats
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.bands import Progress, no_progress
-from shared_map.layers import Bools, Bytes, Floats, TerrainClass
+from shared_map.layers import TerrainClass
 from swarm.config import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

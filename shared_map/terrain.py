@@ -16,10 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.arrays import Bytes, Floats
 from shared_map.bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.layers import (
-    Bytes,
-    Floats,
     TerrainClass,
     grade,
     grade_of_padded,
@@ -29,6 +28,7 @@ from shared_map.layers import (
     roughness_of_padded,
     terrain_pace,
 )
+from shared_map.truth import hide
 from swarm.config import CostConfig, Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -192,9 +192,15 @@ def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
     """The true pace of the ground: the prior ground changed by what `terrain.hidden` asks for.
 
     Without inflation: it is what a sensor sees of each cell. Never shown to planners."""
-    from shared_map.truth import hide
-
-    return hide(scenario.terrain.hidden, scenario.cost, terrain, scenario.seed)
+    return hide(
+        scenario.terrain.hidden,
+        scenario.cost,
+        terrain.grid,
+        terrain.ground_s_per_m,
+        terrain.elevation_m,
+        terrain.classes,
+        scenario.seed,
+    )
 
 
 # --- prepared: built once by the launcher, read by every process in a blink -----------------------------------

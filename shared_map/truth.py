@@ -9,24 +9,37 @@ import heapq
 
 import numpy as np
 
-from shared_map.layers import LETHAL, Bools, Floats, TerrainClass, paint_zones
-from shared_map.synthetic import fractal
-from shared_map.terrain import Terrain
+from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.layers import LETHAL, TerrainClass, paint_zones
+from shared_map.noise import fractal
 from swarm.config import CostConfig, HiddenConfig
-from swarm.grid import STEP_COL, STEP_ROW
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 RUBBLE_FACTOR = np.float32(3.0)
 CONNECTED_SHARE = 0.85
 """At least this share of what was passable and connected stays so."""
 
 
-def hide(hidden: HiddenConfig, cost: CostConfig, terrain: Terrain, seed: int) -> Floats:
-    """True pace of the ground, float32 (rows, cols); the terrain's own array is left alone."""
-    truth = np.array(terrain.ground_s_per_m, np.float32)
+def hide(
+    hidden: HiddenConfig,
+    cost: CostConfig,
+    grid: GridSpec,
+    ground: Floats,
+    elevation_m: Floats,
+    classes: Bytes,
+    seed: int,
+) -> Floats:
+    """True pace of the ground, float32 (rows, cols): that of the map, changed. The map's array is left alone.
+
+    ground       float32  (rows, cols)  s/m; what the map says, before inflation; inf is lethal
+    elevation_m  float32  (rows, cols)  NaN is a void
+    classes      uint8    (rows, cols)  TerrainClass
+    """
+    truth = np.array(ground, np.float32)
     rng = np.random.default_rng([seed, 5])
     whole = _largest(np.isfinite(truth))
-    _rubble(truth, terrain, hidden.rubble_fields, rng)
-    flood = _flood(terrain, truth, hidden.flooded_share, rng)
+    _rubble(truth, hidden.rubble_fields, rng)
+    flood = _flood(truth, elevation_m, hidden.flooded_share, rng)
     while flood:
         wet = np.array(flood, np.intp)
         kept = truth.reshape(-1)[wet]
@@ -35,9 +48,10 @@ def hide(hidden: HiddenConfig, cost: CostConfig, terrain: Terrain, seed: int) ->
             break
         truth.reshape(-1)[wet] = kept
         flood = flood[: len(flood) // 2]
+    roads = classes == TerrainClass.ROAD
     for _ in range(hidden.closed_roads):
-        _close_a_road(truth, terrain, rng, whole * (CONNECTED_SHARE - hidden.flooded_share))
-    paint_zones(truth, hidden.zones, terrain.grid, cost, np.isnan(terrain.elevation_m))
+        _close_a_road(truth, roads, rng, whole * (CONNECTED_SHARE - hidden.flooded_share))
+    paint_zones(truth, hidden.zones, grid, cost, np.isnan(elevation_m))
     return truth
 
 
@@ -49,9 +63,9 @@ def _largest(passable: Bools) -> int:
     return int(np.bincount(labels.ravel())[1:].max()) if count else 0
 
 
-def _close_a_road(truth: Floats, terrain: Terrain, rng: np.random.Generator, least: float) -> None:
+def _close_a_road(truth: Floats, road: Bools, rng: np.random.Generator, least: float) -> None:
     """A barrier: a stretch of road and the ground beside it is lethal, so that it has to be driven around."""
-    roads = np.flatnonzero((terrain.classes.reshape(-1) == TerrainClass.ROAD) & np.isfinite(truth.reshape(-1)))
+    roads = np.flatnonzero((road & np.isfinite(truth)).reshape(-1))
     if len(roads) == 0:
         return
     cols = truth.shape[1]
@@ -66,7 +80,7 @@ def _close_a_road(truth: Floats, terrain: Terrain, rng: np.random.Generator, lea
         truth[block] = kept
 
 
-def _rubble(truth: Floats, terrain: Terrain, count: int, rng: np.random.Generator) -> None:
+def _rubble(truth: Floats, count: int, rng: np.random.Generator) -> None:
     """Ragged fields of three times the pace, 4 to 10 cells in radius."""
     if count == 0:
         return
@@ -89,13 +103,12 @@ def _rubble(truth: Floats, terrain: Terrain, count: int, rng: np.random.Generato
     truth[rubble] *= RUBBLE_FACTOR
 
 
-def _flood(terrain: Terrain, truth: Floats, share: float, rng: np.random.Generator) -> list[int]:
+def _flood(truth: Floats, height: Floats, share: float, rng: np.random.Generator) -> list[int]:
     """Cells of one valley as water reaches them from a seeded low place: always the lowest cell at its shore."""
     passable = np.isfinite(truth)
     wanted = int(share * passable.sum())
     if wanted == 0:
         return []
-    height = terrain.elevation_m
     rows, cols = height.shape
     low = np.flatnonzero(passable.reshape(-1) & (height <= np.quantile(height[passable], 0.2)).reshape(-1))
     start = int(low[rng.integers(len(low))])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from shared_map.arrays import Floats
 from shared_map.bands import bands
-from shared_map.layers import Floats
 
 HIGHEST_M = 20_000.0
 """Heights beyond this, up or down, are somebody's undeclared voids."""

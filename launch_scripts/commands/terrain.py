@@ -16,7 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from shared_map.layers import Bytes, TerrainClass, slope_deg
+from shared_map.arrays import Bytes
+from shared_map.layers import TerrainClass, slope_deg
 from swarm.config import Scenario, TerrainConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
 

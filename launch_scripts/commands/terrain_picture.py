@@ -13,7 +13,8 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from shared_map.layers import Bytes, TerrainClass
+from shared_map.arrays import Bytes
+from shared_map.layers import TerrainClass
 from shared_map.synthetic import TINT, hillshade
 from shared_map.terrain import Terrain
 from swarm.errors import TerrainError
