@@ -120,6 +120,10 @@ class Bus(Protocol):
         """Post `Heard` for every sample; what does not parse is counted, logged and dropped."""
         ...
 
+    def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
+        """End every subscription that was made with these very fields. What is on its way may still be posted."""
+        ...
+
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         """Post `Asked` for every query."""
         ...

@@ -148,10 +148,15 @@ class _Index:
         else:
             self._wide.append(interest)
 
-    def remove(self, bus: MemoryBus) -> None:
-        self._wide = [interest for interest in self._wide if interest.bus is not bus]
+    def remove(self, bus: MemoryBus, narrow: Mapping[str, str] | None = None) -> None:
+        """Forget a node's subscriptions: all, or those with these fields."""
+
+        def goes(interest: Interest) -> bool:
+            return interest.bus is bus and (narrow is None or interest.narrow == narrow)
+
+        self._wide = [interest for interest in self._wide if not goes(interest)]
         for key, interests in list(self._exact.items()):
-            self._exact[key] = [interest for interest in interests if interest.bus is not bus]
+            self._exact[key] = [interest for interest in interests if not goes(interest)]
 
     def find(self, fields: Mapping[str, str]) -> list[Interest]:
         found = [interest for interest in self._wide if interest.meets(fields)]
@@ -204,6 +209,12 @@ class MemoryBus:
         interest = _interest(self, topic, fields, post)
         index = self.network.subscriptions.setdefault((self.namespace, topic.name), _Index())
         index.add(interest, topic)
+
+    def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
+        narrow = {name: chunk for name, chunk in topic.every(fields).items() if chunk != "*"}
+        index = self.network.subscriptions.get((self.namespace, topic.name))
+        if index is not None:
+            index.remove(self, narrow)
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         if topic.request is None:

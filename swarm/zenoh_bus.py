@@ -104,6 +104,7 @@ class ZenohBus:
         self._counting = threading.Lock()
         self._own_peers: list[Peer] = []
         self._entities: list[Any] = []
+        self._subscribers: dict[str, list[Any]] = {}
         self._threads: list[threading.Thread] = []
         self._logged_s: dict[str, float] = {}
         self._closed = False
@@ -150,10 +151,15 @@ class ZenohBus:
                 return
             post(Heard(topic, named, message))
 
-        subscriber = self._session.declare_subscriber(
-            topic.expression(self._namespace, **fields), zenoh.handlers.RingChannel(topic.buffer)
-        )
+        expression = topic.expression(self._namespace, **fields)
+        subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
+        self._subscribers.setdefault(expression, []).append(subscriber)
         self._read(subscriber, arrive, f"sub-{topic.name}")
+
+    def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
+        for subscriber in self._subscribers.pop(topic.expression(self._namespace, **fields), ()):
+            self._entities.remove(subscriber)
+            subscriber.undeclare()  # which ends the thread that reads its channel
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         request_type = topic.request
@@ -292,7 +298,7 @@ class ZenohBus:
                 while True:
                     arrive(channel.recv())
             except zenoh.ZError:
-                if not self._closed:
+                if not self._closed and entity in self._entities:
                     log.exception("the %s channel ended by itself", name)
 
         thread = threading.Thread(target=run, name=name, daemon=True)

@@ -110,6 +110,26 @@ def test_a_process_hears_itself(world: World):
     assert [event.message for event in box] == [pose()]
 
 
+def test_an_ended_subscription_hears_nothing_more_and_the_others_go_on(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    one, every = Box(), Box()
+    b.subscribe(POSE, one, target="t0")
+    b.subscribe(POSE, every)
+    world.settle()
+    a.publish(POSE, pose("t0", seq=1), target="t0")
+    world.until(lambda: one and every)
+    b.unsubscribe(POSE, target="t0")
+    b.unsubscribe(POSE, target="t7")  # of what never was there is nothing to end
+    world.settle()
+    a.publish(POSE, pose("t0", seq=2), target="t0")
+    world.until(lambda: len(every) == 2)
+    assert len(one) == 1
+    b.subscribe(POSE, one, target="t0")
+    world.settle()
+    a.publish(POSE, pose("t0", seq=3), target="t0")
+    world.until(lambda: len(one) == 2)
+
+
 def test_a_subscription_with_a_field_hears_only_that_key(world: World):
     a, b = world.bus("a"), world.bus("b")
     one, every = Box(), Box()
