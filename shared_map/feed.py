@@ -70,7 +70,7 @@ class MapFeed:
         self._serves_all = serves_all
         self._held = held or replica.own_digest
         self._on_accepted = on_accepted
-        self._quota = Quota(config.author_marks_per_s)
+        self._quota = Quota(config.author_marks_per_s, config.total_marks_per_s)
         self._named_ns: dict[str, int] = {}
         self._digest_ns = int(config.digest_s * NS_PER_S)
         self._digest_due_ns = 0

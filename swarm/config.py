@@ -94,6 +94,8 @@ class CostConfig(Section, frozen=True, kw_only=True):
 
     slope_rule     linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
                    Tobler's hiking function; energy is a wheeled vehicle of constant power
+    directional    uphill is not downhill: a step costs by what it climbs along its way, instead of a cell by how
+                   steep it is; the planner grows whole trees then (strategy auto or full)
     max_slope_deg  steeper ground is lethal
     rough_per_m    how much a metre of roughness (neighbours off the even slope) adds to the pace, as a share of it
     classes        whether what covers the ground (water, forest, rock ...) counts
@@ -103,6 +105,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     flat_speed_m_per_s: Positive = 10.0
     road_speed_m_per_s: Positive = 20.0
     slope_rule: Literal["linear", "quadratic", "tobler", "energy"] = "quadratic"
+    directional: bool = False
     steep_factor: Annotated[float, Meta(ge=1)] = 6.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
     rough_per_m: NotNegative = 0.0
@@ -198,11 +201,13 @@ class MapConfig(Section, frozen=True, kw_only=True):
     publish_hz          a tile's set is put at most this often by its author
     digest_s            every replica tells this often what it holds
     author_marks_per_s  who changes more cells than this for ten seconds is heard with delay, and named
+    total_marks_per_s   the same of all authors together; then those above an equal share of it wait
     """
 
     publish_hz: Positive = 10.0
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0
+    total_marks_per_s: Positive = 100_000.0
 
 
 class TlsConfig(Section, frozen=True, kw_only=True):
@@ -288,6 +293,11 @@ class AgentPlan(msgspec.Struct, frozen=True):
     @property
     def vehicle_ids(self) -> list[str]:
         return [f"{self.id}-{n:02d}" for n in range(self.count)]
+
+
+def agent_of(vehicle: str) -> str:
+    """The agent that hosts a vehicle, by the vehicle's id; one whose id names no agent is its own."""
+    return vehicle.rpartition("-")[0] or vehicle
 
 
 def plan_agents(scenario: Scenario) -> list[AgentPlan]:

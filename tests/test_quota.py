@@ -13,7 +13,7 @@ from swarm.topics import NOTE
 
 
 def test_an_author_that_overdraws_its_budget_waits_until_it_has_filled_up_and_others_do_not() -> None:
-    quota = Quota(marks_per_s=10)
+    quota = Quota(author_marks_per_s=10)
     loud, calm = set_of("loud", 0, 1, {}), set_of("calm", 0, 1, {})
     assert quota.admits(loud, 0)
     quota.charge("loud", 150, 0)  # of ten seconds' worth: 50 too many
@@ -27,7 +27,7 @@ def test_an_author_that_overdraws_its_budget_waits_until_it_has_filled_up_and_ot
 
 
 def test_of_a_waiting_tile_only_the_newest_set_is_kept() -> None:
-    quota = Quota(marks_per_s=1)
+    quota = Quota(author_marks_per_s=1)
     quota.charge("loud", 100, 0)
     for seq in (3, 9, 5):
         assert not quota.admits(set_of("loud", 0, seq, {}), 0)
@@ -36,10 +36,45 @@ def test_of_a_waiting_tile_only_the_newest_set_is_kept() -> None:
 
 
 def test_budgets_that_are_full_again_are_forgotten() -> None:
-    quota = Quota(marks_per_s=1)
+    quota = Quota(author_marks_per_s=1)
     quota.charge("a", 1, 0)
     quota.forget(100 * NS_PER_S)
-    assert quota._left == {}
+    assert quota._authors == {}
+
+
+def test_of_all_together_only_who_exceeds_its_share_waits() -> None:
+    quota = Quota(author_marks_per_s=1000, total_marks_per_s=100)
+    for name in ("loud", "calm"):
+        assert quota.admits(set_of(name, 0, 1, {}), 0)
+    quota.charge("calm", 10, 0)
+    quota.charge("loud", 3000, 0)  # all are allowed 1,000 in ten seconds
+    for second in range(2, 40):
+        now_ns = second * NS_PER_S
+        assert not quota.admits(set_of("loud", 0, second, {}), now_ns), second
+        assert quota.admits(set_of("calm", 0, second, {}), now_ns), second
+        quota.charge("calm", 40, now_ns)
+        assert quota.throttled == ["loud"]
+
+
+def test_what_others_leave_of_the_total_may_be_used() -> None:
+    quota = Quota(author_marks_per_s=1000, total_marks_per_s=100)
+    for second in range(100):
+        now_ns = second * NS_PER_S
+        for name, marks in (("busy", 90), ("calm", 1)):
+            assert quota.admits(set_of(name, 0, second, {}), now_ns), (name, second)
+            quota.charge(name, marks, now_ns)
+
+
+def test_two_that_wait_take_turns() -> None:
+    quota = Quota(author_marks_per_s=10)
+    for name in ("a", "b"):
+        quota.charge(name, 101, 0)
+        for tile in range(3):
+            quota.admits(set_of(name, tile, 1, {}), 0)
+    let_in = []
+    while (each := quota.due(100 * NS_PER_S)) is not None:
+        let_in.append(each.author)
+    assert let_in == ["a", "b"] * 3
 
 
 def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up() -> None:
