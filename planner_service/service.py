@@ -26,6 +26,7 @@ from shared_map.feed import MapFeed
 from shared_map.replica import MapReplica
 from shared_map.terrain import Terrain
 from swarm.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
+from swarm.config import agent_of
 from swarm.membership import Member
 from swarm.messages import CostRequest, Fleet, RouteRequest, TargetPose
 from swarm.role import RoleSetup
@@ -135,6 +136,6 @@ class PlannerService:
                     model_ns = self._planner.tree.measured_model_ns()
                     self._worker.submit(_GROW, self._planner.growth(action), self._post, model_ns)
                 case Push(pushed):
-                    self._bus.publish(PUSHED_ROUTE, pushed, vehicle=pushed.vehicle)
+                    self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(pushed.vehicle), vehicle=pushed.vehicle)
                 case Tell(status):
                     self._bus.publish(STATUS, status, target=self._target)

@@ -26,7 +26,7 @@ from swarm.fields import pack_column as pack_column
 from swarm.grid import TILE_CELLS
 from swarm.stats import TOP_BUCKET, ZERO_BUCKET
 
-WIRE_VERSION = 1
+WIRE_VERSION = 2
 TILE_AREA = TILE_CELLS * TILE_CELLS
 
 

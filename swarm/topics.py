@@ -138,12 +138,12 @@ CLAIMS = Topic(
     request=Nothing, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
-    "followed", "vehicle/{vehicle}/followed", Followed, "the route that a vehicle has begun", "per new route",
-    newest=False, priority=Priority.BACKGROUND,
+    "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
+    "per new route", newest=False, priority=Priority.BACKGROUND,
 )  # fmt: skip
 PUSHED_ROUTE = Topic(
-    "pushed-route", "vehicle/{vehicle}/route", PushedRoute, "a newer route for a vehicle in the updated range",
-    "per update",
+    "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,
+    "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
 )  # fmt: skip
 POSE = Topic("pose", "target/{target}/pose", TargetPose, "where a target is", "every tick")
 ROUTE = Topic(

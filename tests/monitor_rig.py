@@ -114,7 +114,7 @@ def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
         case Note():
             bus.publish(NOTE, message, role=message.role, id=message.id)
         case Followed():
-            bus.publish(FOLLOWED, message, vehicle=message.vehicle)
+            bus.publish(FOLLOWED, message, agent="a0", vehicle=message.vehicle)
         case MarkSet():
             region = terrain.grid.region_of_tile(message.tile)
             bus.publish(MARKS, message, region=region, tile=message.tile, author=message.author)

@@ -29,6 +29,7 @@ from swarm.messages import (
     Stats,
     TargetPose,
     pack_column,
+    schema_of,
 )
 from swarm.topics import TOPICS
 
@@ -63,8 +64,8 @@ def test_a_payload_of_another_type_is_refused(kind):
 def test_a_later_wire_version_is_refused_and_a_later_field_ignored():
     fields = msgpack.unpackb(encode(BY_TYPE[Note]))
     assert decode(msgpack.packb(fields | {"mood": "good"}), Note) == BY_TYPE[Note]
-    with pytest.raises(ProtocolError, match="note/2"):
-        decode(msgpack.packb(fields | {"schema": "note/2"}), Note)
+    with pytest.raises(ProtocolError, match="note/9"):
+        decode(msgpack.packb(fields | {"schema": "note/9"}), Note)
 
 
 def _attempt(payload: bytes, kind: type[Message]) -> bool:
@@ -189,7 +190,7 @@ def test_a_route_leaves_the_eight_directions_never():
 def test_a_route_reply_is_readable_as_json():
     reply = json.loads(encode_readable(BY_TYPE[RouteReply]))
     found, none = reply["routes"]
-    assert reply["schema"] == "route/1"
+    assert reply["schema"] == schema_of("route")
     assert found["status"] == "ok"
     assert found["directions"] == ["E", "SE"]
     assert found["cells_row_col"] == [[1, 1], [1, 2], [2, 3]]

@@ -110,8 +110,7 @@ class AgentService:
         self._member.join()
         self._feed.start(now_ns)
         self._bus.subscribe(POSE, self._post)
-        for vehicle in self._agent.plan.vehicle_ids:
-            self._bus.subscribe(PUSHED_ROUTE, self._post, vehicle=vehicle)
+        self._bus.subscribe(PUSHED_ROUTE, self._post, agent=self._setup.id)
         self._resume_due_ns = now_ns + _SETTLE_NS
         self._alone_ns = now_ns + _ALONE_NS
 
@@ -285,7 +284,7 @@ class AgentService:
                     cost_s=action.cost_s,
                     lower_bound_s=action.lower_bound_s,
                 )
-                self._bus.publish(FOLLOWED, followed, vehicle=action.vehicle)
+                self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=action.vehicle)
 
     def _observe_query(self, tag: str, now_ns: int) -> None:
         asked_ns = self._asked_ns.pop(tag, None)
