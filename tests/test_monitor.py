@@ -100,6 +100,7 @@ def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
     rig.speaker.publish(
         FOLLOWED,
         Followed(vehicle="v", target="t0", start=0, directions=b"\x00", cost_s=1.0, lower_bound_s=1.0),
+        agent="a0",
         vehicle="v",
     )
     rig.until(NS_PER_S)
