@@ -7,9 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.ground import Changes, Floats, Ground
+from planner_service.ground import Changes, Ground
 from planner_service.kernels.repair import lower
 from planner_service.tree import CostToGoTree
+from shared_map.arrays import Floats
 
 LOWER_SHARE = 16
 """A potential is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from planner_service.followers import Follower, Followers
 from planner_service.strategies import TargetTree
+from shared_map.climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec
@@ -32,9 +33,12 @@ Gaps = NDArray[np.float64]
 class GapBooks:
     """What was measured of one planner's routes. `last` is mean, p95 and highest of the last full growth."""
 
-    def __init__(self, grid: GridSpec, config: PlannerConfig, counters: Counters) -> None:
+    def __init__(
+        self, grid: GridSpec, config: PlannerConfig, counters: Counters, climb: Climb | None = None
+    ) -> None:
         self.last: tuple[float, float, float] | None = None
         self._counters = counters
+        self._climb = climb
         self._cols = grid.cols
         self._length_weight = config.length_weight
         self._straight_m = grid.resolution_m
@@ -99,8 +103,11 @@ class GapBooks:
         rows, cols = follower.rows[int(at[0]) :], follower.cols[int(at[0]) :]
         diagonal = (np.diff(rows) != 0) & (np.diff(cols) != 0)
         metres = np.where(diagonal, self._diagonal_m, self._straight_m)
-        costs = (pace[rows[1:], cols[1:]].astype(np.float64) + self._length_weight) * metres
-        return float(costs.sum()), int(rows[-1]) * self._cols + int(cols[-1])
+        paces = pace[rows[1:], cols[1:]].astype(np.float64)
+        cells = rows * self._cols + cols
+        if self._climb is not None:
+            paces *= self._climb.along(cells[:-1], cells[1:])
+        return float(((paces + self._length_weight) * metres).sum()), int(cells[-1])
 
 
 def _some(followers: Followers) -> list[Follower]:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.growth import flood
 from planner_service.kernels import ground as kernels
 from planner_service.kernels.rules import RULE_FOUR, RULE_OCTILE, RULE_PAPER, SQRT2_EXACT
+from planner_service.kernels.walk import walk_routes
+from shared_map.arrays import Floats
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
 
-Floats = NDArray[np.float32]
 Cells = NDArray[np.int64]
 
 
@@ -50,11 +53,24 @@ def check_pace(grid: GridSpec, pace: NDArray[np.float32]) -> None:
         raise ValueError("pace must be C-contiguous")
 
 
+class Walks(NamedTuple):
+    """Routes read off a tree, as `kernels.walk.walk_routes` returns them."""
+
+    directions: NDArray[np.uint8]
+    ends: Cells
+    driven: NDArray[np.float64]
+    diagonals: Cells
+    last: Cells
+
+
 class Ground:
     """The weights of a map: what entering each cell costs, s, padded with a lethal border.
 
     low, high  bounds of the finite weights, not necessarily reached; (inf, 0) if all is lethal
+    directed   whether a step costs by where it comes from too; then only whole trees are grown
     """
+
+    directed = False
 
     def __init__(self, grid: GridSpec, config: PlannerConfig) -> None:
         self.grid = grid
@@ -64,6 +80,7 @@ class Ground:
         self.stride = grid.cols + 2
         self.size = (grid.rows + 2) * self.stride
         self.diagonal = SQRT2_EXACT if self.rule == RULE_OCTILE else 1.0
+        self._metres = np.float32(grid.resolution_m)
         self.length_weight_s = config.length_weight * grid.resolution_m
         self.weight: Floats = np.full(self.size, np.inf, np.float32)
         self.low = math.inf
@@ -78,6 +95,11 @@ class Ground:
         padded: Cells = (rows + 1) * self.stride + cols + 1
         return padded
 
+    def unpad_all(self, padded: Cells) -> Cells:
+        rows, cols = np.divmod(padded, self.stride)
+        cells: Cells = (rows - 1) * self.grid.cols + cols - 1
+        return cells
+
     def unpad(self, padded: int) -> int:
         row, col = divmod(padded, self.stride)
         return (row - 1) * self.grid.cols + col - 1
@@ -85,13 +107,7 @@ class Ground:
     def load(self, pace: Floats) -> None:
         """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative."""
         check_pace(self.grid, pace)
-        bad = kernels.pad_weights(
-            pace,
-            np.float32(self.grid.resolution_m),
-            np.float32(self.length_weight_s),
-            self.stride,
-            self.weight,
-        )
+        bad = kernels.pad_weights(pace, self._metres, np.float32(self.length_weight_s), self.stride, self.weight)
         if bad:
             raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
         low, high = kernels.weight_range(self.weight)
@@ -111,7 +127,7 @@ class Ground:
             before = np.empty(room, np.float32)
             count, bad = kernels.changed_cells(
                 pace,
-                np.float32(self.grid.resolution_m),
+                self._metres,
                 np.float32(self.length_weight_s),
                 (row0, col0, row1, col1),
                 self.stride,
@@ -155,6 +171,17 @@ class Ground:
             return NO_CHANGES
         cells = np.unique(np.concatenate(parts))
         return Changes(cells, older[cells], self.weight[cells])
+
+    def grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
+        """The exact tree of a padded, passable root. Arrays are written whole; no cost exceeds what is returned."""
+        return flood(self.weight, self.low, self.high, self.stride, root, self.rule, self.corners, cost, parent)
+
+    def walk(self, parent: NDArray[np.uint8], root: int, starts: Cells, most: int, weight: Floats) -> Walks:
+        """Routes from padded cells that have a way to a padded root, over the weights of this or an earlier map.
+
+        most  steps of a route; 0 for all of it
+        """
+        return Walks(*walk_routes(weight, parent, self.stride, self.rule, root, starts, most, self.grid.cells))
 
     def passable(self, cell: int) -> bool:
         return bool(self.weight[self.pad(cell)] < np.inf)

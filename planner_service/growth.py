@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.ground import Floats
 from planner_service.kernels import flood as kernels
 from planner_service.kernels.rules import RULE_OCTILE, RULE_PAPER, SQRT2_EXACT, TOO_FINE
+from shared_map.arrays import Floats
 
 MAX_RATIO = 1 << 14
 """Between dearest and cheapest step: beyond it buckets as wide as the cheapest give way to a heap."""

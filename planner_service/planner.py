@@ -99,7 +99,7 @@ class Planner:
         self._exact_ns: int | None = None
         self._window: Window = Window(0, 0, 0, 0)
         self._growth_ms = 0.0
-        self._gaps = GapBooks(self._grid, config, counters)
+        self._gaps = GapBooks(self._grid, config, counters, cost_map.terrain.climb)
         self._took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._status_due_ns = 0
         for name in COUNTS:

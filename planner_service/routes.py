@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.bounds import LowerBounds
-from planner_service.kernels.walk import walk_routes
 from planner_service.tree import CostToGoTree
 from swarm.messages import Route, RouteStatus
 
@@ -18,15 +17,8 @@ def read_routes(tree: CostToGoTree, bounds: LowerBounds, asked: NDArray[np.int64
     starts = ground.pad_all(np.where(inside, asked, 0))
     lethal = inside & ~(ground.weight[starts] < np.inf)
     ok = inside & (tree.cost[starts] < np.inf)
-    directions, ends, driven, diagonals, last = walk_routes(
-        ground.weight,
-        tree.parent,
-        ground.stride,
-        ground.rule,
-        ground.pad(tree.root),
-        starts[ok],
-        max_cells,
-        grid.cells,
+    directions, ends, driven, diagonals, last = ground.walk(
+        tree.parent, ground.pad(tree.root), starts[ok], max_cells, ground.weight
     )
     if (ends < 0).any():
         raise AssertionError("a route does not end at the target: the tree is broken")

@@ -66,7 +66,7 @@ class PlannerService:
             setup.id,
             setup.incarnation,
             scenario.planner,
-            TargetTree(terrain.grid, scenario.planner),
+            TargetTree(terrain.grid, scenario.planner, terrain.climb),
             self._cost_map,
             self.counters,
             route_cells=scenario.vehicles.route_cells,

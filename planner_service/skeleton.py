@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.ground import Floats, Ground
+from planner_service.ground import Ground
 from planner_service.growth import flood
 from planner_service.kernels import coarse, repair
 from planner_service.kernels.flood import point_to_parents
 from planner_service.kernels.rules import NONE
+from shared_map.arrays import Floats
 
 
 @dataclass(frozen=True, eq=False)

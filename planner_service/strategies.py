@@ -23,14 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.bounds import LowerBounds
-from planner_service.ground import Changes, Floats, Ground, check_pace
-from planner_service.growth import flood
+from planner_service.directed import ground_of
+from planner_service.ground import Changes, check_pace
 from planner_service.kernels.rules import NONE
-from planner_service.kernels.walk import walk_routes
 from planner_service.routes import read_routes
 from planner_service.skeleton import Skeleton, find_skeleton
 from planner_service.tree import CostToGoTree
 from planner_service.windows import block_window
+from shared_map.arrays import Floats
+from shared_map.climb import Climb
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.messages import Route, RouteStatus
@@ -104,14 +105,15 @@ class TargetTree:
                  last full growth; empty before
     """
 
-    def __init__(self, grid: GridSpec, config: PlannerConfig) -> None:
+    def __init__(self, grid: GridSpec, config: PlannerConfig, climb: Climb | None = None) -> None:
         self.target_cell: int | None = None
         self.map_version = -1
         self.ready = False
         self.last_gaps: NDArray[np.float64] = np.empty(0, np.float64)
         self._grid = grid
         self._config = config
-        self._ground = Ground(grid, config)
+        self._climb = climb
+        self._ground = ground_of(grid, config, climb)
         self._tree = CostToGoTree(self._ground)
         self._loaded = False
         self._stale = True
@@ -153,32 +155,21 @@ class TargetTree:
     def full_job(self, pace_snapshot: Floats, target_cell: int, map_version: int) -> Callable[[], GrownTree]:
         """A pure, GIL-free full growth. Nobody may write to `pace_snapshot` before it ends."""
         check_pace(self._grid, pace_snapshot)
-        grid, config = self._grid, self._config
+        grid, config, climb = self._grid, self._config, self._climb
         serves_it = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if serves_it else None
         self._job_out = True
         wants_skeleton = self._coarse
 
         def job() -> GrownTree:
-            ground = Ground(grid, config)
+            ground = ground_of(grid, config, climb)
             ground.load(pace_snapshot)
             cost = np.full(ground.size, np.inf, np.float32)
             parent = np.full(ground.size, NONE, np.uint8)
             reach = 0.0
             skeleton = None
             if grid.inside(*divmod(target_cell, grid.cols)) and ground.passable(target_cell):
-                root = ground.pad(target_cell)
-                reach = flood(
-                    ground.weight,
-                    ground.low,
-                    ground.high,
-                    ground.stride,
-                    root,
-                    ground.rule,
-                    ground.corners,
-                    cost,
-                    parent,
-                )
+                reach = ground.grow(ground.pad(target_cell), cost, parent)
                 skeleton = find_skeleton(ground) if wants_skeleton else None
             return GrownTree(
                 target_cell, map_version, cost, parent, ground.weight, reach, offered, ground.stride, skeleton
@@ -276,6 +267,8 @@ class TargetTree:
     def _windows(self) -> bool:
         """Whether a move is followed by a window rather than by a full growth."""
         strategy = self._config.strategy
+        if self._ground.directed:
+            return False
         if strategy == "auto":
             return self._full_ns > self._budget_ns
         return strategy != "full"
@@ -394,9 +387,7 @@ class TargetTree:
         offered = grown.offered
         assert offered is not None
         starts = starts[(grown.cost[starts] < np.inf) & (offered[starts] != NONE)]
-        _, ends, driven, _, _ = walk_routes(
-            grown.weight, offered, self._ground.stride, self._ground.rule, root, starts, 0, self._grid.cells
-        )
-        whole = ends >= 0
+        walks = self._ground.walk(offered, root, starts, 0, grown.weight)
+        whole = walks.ends >= 0
         optimum = grown.cost[starts[whole]].astype(np.float64)
-        self.last_gaps = np.maximum(driven[whole] / optimum, 1.0)
+        self.last_gaps = np.maximum(walks.driven[whole] / optimum, 1.0)

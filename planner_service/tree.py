@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.ground import Cells, Changes, Floats, Ground
+from planner_service.ground import Cells, Changes, Ground
 from planner_service.growth import FINE, flood
 from planner_service.kernels import coarse, walk
 from planner_service.kernels.flood import point_to_parents
@@ -24,6 +24,7 @@ from planner_service.kernels.ground import cut_window, merge_window, weight_rang
 from planner_service.kernels.repair import repair
 from planner_service.kernels.rules import NONE
 from planner_service.skeleton import Skeleton
+from shared_map.arrays import Floats
 from swarm.grid import Window
 
 
@@ -64,18 +65,7 @@ class CostToGoTree:
 
     def grow(self, root: int) -> None:
         """Grow the whole tree of a passable cell, exactly."""
-        ground = self.ground
-        self.reach = flood(
-            ground.weight,
-            ground.low,
-            ground.high,
-            ground.stride,
-            ground.pad(root),
-            ground.rule,
-            ground.corners,
-            self.cost,
-            self.parent,
-        )
+        self.reach = self.ground.grow(self.ground.pad(root), self.cost, self.parent)
         self.root = root
         self.offset = 0.0
         self.near = None
@@ -185,6 +175,8 @@ class CostToGoTree:
         concerned: then it must be grown again before anything else."""
         if changes.cells.size == 0:
             return 0
+        if self.ground.directed:
+            return -1
         if self._scratch is None:
             self._scratch = np.zeros(self.ground.size, np.uint8)
         ground = self.ground

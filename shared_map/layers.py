@@ -3,6 +3,7 @@
 The merge rule, per cell, in this order:
 
 1. pace = flat pace x slope factor x class factor x (1 + rough_per_m x roughness); on a road the road pace instead.
+   Where `cost.directional`, the slope factor is left out here, and each step costs by its rise instead (`climb`).
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
 3. Zones in the order painted: a road sets the road pace (over cliffs and water too: a bridge, a cutting; not over a
    void), preferred halves, rough doubles; then every forbidden zone is lethal, whatever else was painted there.
@@ -164,7 +165,7 @@ def slope_factor(grade_: Floats, cost: CostConfig) -> Floats:
 def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
     """Pace relative to level ground when driving up a rise (metres per metre; negative is downhill).
 
-    Uphill is not downhill: tobler is fastest at 5 % downhill, energy never gains downhill, linear and quadratic
+    Steeper than `max_slope_deg` is inf. Uphill is not downhill: tobler is fastest at 5 % downhill, energy never gains downhill, linear and quadratic
     know only how steep it is.
     """
     steepness = np.abs(rise)
@@ -238,6 +239,8 @@ def class_factors(cost: CostConfig) -> Floats:
 def terrain_pace(grade_: Floats, classes: Bytes, cost: CostConfig, rough_m: Floats | None = None) -> Floats:
     """Steps 1 and 2 of the merge rule. A NaN grade is a void."""
     pace = slope_factor(grade_, cost)
+    if cost.directional:
+        pace[np.isfinite(pace)] = 1
     pace *= np.float32(1 / cost.flat_speed_m_per_s)
     if cost.classes:
         pace *= class_factors(cost)[classes]

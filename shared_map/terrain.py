@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats
 from shared_map.bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.climb import ENTRIES, Climb, climb_of
 from shared_map.layers import (
     TerrainClass,
     grade,
@@ -37,7 +38,7 @@ from swarm.role import RoleSetup
 if TYPE_CHECKING:
     from shared_map.sources import Source
 
-FORMAT = 1
+FORMAT = 2
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
 _META = "terrain.json"
 
@@ -51,7 +52,8 @@ class Terrain:
     pace_s_per_m      float32  the prior: the ground with inflation; inf is lethal
     ground_s_per_m    float32  the ground itself, as a sensor sees it; the same array if the vehicle fits its cell
     classes           uint8    TerrainClass
-    digest            16 hex digits of grid, prior pace and cost rules
+    digest            16 hex digits of grid, prior pace and cost rules (and heights, where steps cost by them)
+    climb             what a step costs for what it climbs; None if it costs the same both ways
     notes             sentences about where it came from and what was done to it
     """
 
@@ -63,6 +65,7 @@ class Terrain:
     digest: str
     ground_s_per_m: Floats
     vehicle_radius_m: float = 0.0
+    climb: Climb | None = None
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -102,7 +105,7 @@ def _built(scenario: Scenario, source: Source, progress: Progress) -> Terrain:
 
         photo = paint_photo(source.elevation_m, classes, grid.resolution_m, scenario.seed, progress)
         notes.append("photo painted from elevation and classes, as there is none")
-    return _finished(grid, source.elevation_m, photo, classes, ground, cost, tuple(notes))
+    return finished(grid, source.elevation_m, photo, classes, ground, cost, tuple(notes))
 
 
 def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress) -> Floats:
@@ -123,7 +126,7 @@ def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress
     return ground
 
 
-def _finished(
+def finished(
     grid: GridSpec,
     elevation_m: Floats,
     photo: Bytes,
@@ -132,12 +135,16 @@ def _finished(
     cost: CostConfig,
     notes: tuple[str, ...],
 ) -> Terrain:
+    """A terrain of its ground: inflated, with its digest. Raises TerrainError where nobody could stand."""
     halves = inflation_halves(cost.vehicle_radius_m, grid.resolution_m)
     pace = inflate(ground, halves) if halves else ground
     if np.isinf(pace).all():
         why = _why_lethal(elevation_m, ground, cost, grid)
         raise TerrainError(f"every cell of the terrain is lethal, no vehicle could stand anywhere: {why}")
-    digest = _digest(grid, pace, cost)
+    climb = climb_of(grid, elevation_m, cost)
+    if climb is not None:
+        notes = (*notes, climb.note)
+    digest = _digest(grid, pace, cost, elevation_m if cost.directional else None)
     return Terrain(
         grid=grid,
         elevation_m=elevation_m,
@@ -147,6 +154,7 @@ def _finished(
         digest=digest,
         ground_s_per_m=ground,
         vehicle_radius_m=cost.vehicle_radius_m,
+        climb=climb,
         notes=notes,
     )
 
@@ -164,11 +172,15 @@ def _why_lethal(elevation_m: Floats, ground: Floats, cost: CostConfig, grid: Gri
     )
 
 
-def _digest(grid: GridSpec, pace: Floats, cost: CostConfig) -> str:
+def _digest(grid: GridSpec, pace: Floats, cost: CostConfig, elevation_m: Floats | None) -> str:
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"{FORMAT} {grid}".encode())
     digest.update(np.ascontiguousarray(pace).data)
-    digest.update(msgspec.json.encode(cost, order="sorted"))
+    if elevation_m is not None:
+        digest.update(np.ascontiguousarray(elevation_m).data)
+    # Where a mask lies differs between machines; what it painted is in the pace.
+    zones = tuple(msgspec.structs.replace(z, mask=z.mask and Path(z.mask).name) for z in cost.zones)
+    digest.update(msgspec.json.encode(msgspec.structs.replace(cost, zones=zones), order="sorted"))
     return digest.hexdigest()
 
 
@@ -185,7 +197,7 @@ def terrain_of_pace(
     height = np.zeros((rows, cols), np.float32) if elevation_m is None else np.array(elevation_m, np.float32)
     cost = CostConfig(vehicle_radius_m=vehicle_radius_m)
     photo = np.full((rows, cols, 3), 128, np.uint8)
-    return _finished(grid, height, photo, np.zeros((rows, cols), np.uint8), ground, cost, ())
+    return finished(grid, height, photo, np.zeros((rows, cols), np.uint8), ground, cost, ())
 
 
 def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
@@ -226,12 +238,15 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
     }
     if terrain.ground_s_per_m is not terrain.pace_s_per_m:
         arrays["ground"] = terrain.ground_s_per_m
+    if terrain.climb is not None:
+        arrays["climb"] = terrain.climb.factors
     meta = {
         "format": FORMAT,
         "key": key,
         "grid": msgspec.to_builtins(terrain.grid),
         "digest": terrain.digest,
         "vehicle_radius_m": terrain.vehicle_radius_m,
+        "steepest": None if terrain.climb is None else terrain.climb.steepest,
         "arrays": sorted(arrays),
         "notes": list(terrain.notes),
     }
@@ -257,20 +272,26 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
     try:
         grid = GridSpec(**meta["grid"])
         digest, radius, notes = str(meta["digest"]), float(meta["vehicle_radius_m"]), tuple(meta["notes"])
-        has_ground = "ground" in meta["arrays"]
+        has_ground, steepest = "ground" in meta["arrays"], meta["steepest"]
     except (KeyError, TypeError, ValueError) as error:
         raise TerrainError(f"prepared terrain {folder / _META} is damaged ({error}); delete the folder") from error
     shape = (grid.rows, grid.cols)
     pace = _read_array(folder, "pace", shape, np.float32)
+    elevation_m = _read_array(folder, "elevation", shape, np.float32)
+    climb = None
+    if steepest is not None:
+        factors = _read_array(folder, "climb", (2 * ENTRIES + 1,), np.float32)
+        climb = Climb(grid, elevation_m, factors, float(steepest))
     return Terrain(
         grid=grid,
-        elevation_m=_read_array(folder, "elevation", shape, np.float32),
+        elevation_m=elevation_m,
         photo=_read_array(folder, "photo", (*shape, 3), np.uint8),
         pace_s_per_m=pace,
         classes=_read_array(folder, "classes", shape, np.uint8),
         digest=digest,
         ground_s_per_m=_read_array(folder, "ground", shape, np.float32) if has_ground else pace,
         vehicle_radius_m=radius,
+        climb=climb,
         notes=notes,
     )
 

@@ -349,6 +349,8 @@ def _check(scenario: Scenario, source: str) -> None:
                 raise ConfigError(f"{source}: {key}[{n}]: missing required field `polygon_m` (or `mask`)")
             if zone.polygon_m is not None and zone.mask is not None:
                 raise ConfigError(f"{source}: {key}[{n}]: polygon_m and mask exclude each other")
+    if scenario.cost.directional:
+        _check_directional(scenario.planner, source)
     names = [group.name for group in scenario.groups]
     if len(set(names)) < len(names):
         raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
@@ -361,6 +363,19 @@ def _check(scenario: Scenario, source: str) -> None:
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
             check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
+
+
+def _check_directional(planner: PlannerConfig, source: str) -> None:
+    if planner.strategy not in ("auto", "full"):
+        raise ConfigError(
+            f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
+            " and coarse trees know one cost per cell; expected 'auto' or 'full', which grow whole trees"
+        )
+    if planner.length_weight:
+        raise ConfigError(
+            f"{source}: planner.length_weight: {planner.length_weight:g} does not go with cost.directional = true;"
+            " leave it out"
+        )
 
 
 def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:

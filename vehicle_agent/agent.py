@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config import AgentPlan, Scenario
 from swarm.grid import GridSpec
@@ -77,6 +78,7 @@ class LocalMap:
     pace    what may be driven, with marks and inflation
     ground  the same without inflation; prior is the ground without marks
     physics the pace at which the ground is really driven
+    climb   what a step costs for what it climbs; None if it costs the same both ways
     """
 
     grid: GridSpec
@@ -84,6 +86,7 @@ class LocalMap:
     ground: NDArray[np.float32]
     prior: NDArray[np.float32]
     physics: NDArray[np.float32]
+    climb: Climb | None = None
 
 
 class Agent:
@@ -205,7 +208,10 @@ class Agent:
                     return 0.0
                 motion.set_out(cell)
             before = vehicle.cell
-            left_s = motion.advance(left_s, float(physics[motion.head]))
+            pace_s_per_m = float(physics[motion.head])
+            if self._map.climb is not None:
+                pace_s_per_m *= self._map.climb.of_step(motion.tail, motion.head)
+            left_s = motion.advance(left_s, pace_s_per_m)
             if vehicle.cell != before:
                 self.rights.moved(vehicle.id, vehicle.cell)
                 vehicle.route.moved(vehicle.cell)

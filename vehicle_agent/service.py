@@ -81,7 +81,7 @@ class AgentService:
         )
         self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
-        local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth)
+        local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
         self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation)
         self._fleet = FleetReport(grid, setup.author, plan.group.name)
