@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from planner_service.ground import Ground
 from planner_service.strategies import TargetTree
 from planner_service.tree import CostToGoTree
-from swarm.config import PlannerConfig, Strategy
+from shared_map.climb import climb_of
+from swarm.config import CostConfig, PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
 
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
@@ -33,6 +34,8 @@ def warm_up() -> None:
             pace = np.full((_SIDE, _SIDE), 0.1, np.float32)
             pace[0, 0] = dearest
             _live(TargetTree(grid, config), pace)
+    level = climb_of(grid, np.zeros_like(pace), CostConfig(directional=True))
+    _live(TargetTree(grid, configs[0], level), pace)
     ground = Ground(grid, configs[0])
     ground.load(pace)
     tree = CostToGoTree(ground)

@@ -14,10 +14,14 @@ from planner_service.strategies import TargetTree
 from shared_map.climb import ENTRIES, Climb, climb_of
 from shared_map.noise import mountains
 from shared_map.terrain import build_terrain, load_prepared, save_prepared
-from swarm.config import CostConfig, PlannerConfig, Scenario, TerrainConfig, parse_scenario
+from swarm.config import CostConfig, PlannerConfig, Scenario, TerrainConfig, parse_scenario, plan_agents
 from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
-from swarm.messages import Route, RouteStatus
+from swarm.messages import Route, RouteReply, RouteStatus, TargetPose
+from vehicle_agent.agent import Agent, AskCosts, AskRoutes, LocalMap
+from vehicle_agent.avoidance import Resumption
+from vehicle_agent.placement import spawn_cells
+from vehicle_agent.sensor import TruthSensor
 
 RES = 10.0
 
@@ -273,3 +277,62 @@ def test_a_prepared_terrain_keeps_its_climb(tmp_path):
 def test_what_does_not_go_with_direction_is_refused(line, says):
     with pytest.raises(ConfigError, match=says):
         parse_scenario(f"[cost]\ndirectional = true\n[planner]\n{line}")
+
+
+def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
+    """(seconds from setting out to standing on the target, what the planner said), of one vehicle on its own."""
+    climb = climb_on(elevation_m)
+    grid, level = climb.grid, np.full(elevation_m.shape, 0.1, np.float32)
+    tree = TargetTree(grid, PlannerConfig(), climb)
+    tree.update(level, target, [], 0)
+    row, col = grid.row_col(start)
+    text = f"[[groups]]\nvehicles = 1\ncells = [[{row}, {col}]]\n[vehicles]\ncapture_range_m = 1\n"
+    scenario = parse_scenario(text)
+    spawns = spawn_cells(scenario, grid, level, level)
+    ground = LocalMap(grid, level, level, level, level, climb)
+    agent = Agent(plan_agents(scenario)[0], scenario, ground, TruthSensor(grid, level, 20.0), spawns, 1)
+    agent.placed_by(Resumption("a0"))
+    agent.set_planners({"t": 1}, 0)
+    x_m, y_m = grid.centre_m(target)
+    agent.hear_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=target, x_m=x_m, y_m=y_m), 0)
+    motion = agent.vehicles["a0-00"].motion
+    set_out_s = None
+    for tick in range(2000):
+        now_ns = tick * 50_000_000
+        agent.begin_drive(now_ns)
+        agent.rights.grant()
+        while agent.drive(now_ns) is not None:
+            agent.rights.grant()
+        if set_out_s is None and not (motion.at_rest and motion.cell == start):
+            set_out_s = (tick - 1) * 0.05
+        if set_out_s is not None and motion.at_rest and motion.cell == target:
+            return tick * 0.05 - set_out_s, tree.routes(level, [start])[0].cost_s
+        asks = agent.decide(now_ns)
+        agent.rights.speak()
+        for asked in asks:
+            if isinstance(asked, AskCosts):
+                agent.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))
+                agent.costs_ended(asked.request, now_ns)
+            elif isinstance(asked, AskRoutes):
+                routes = tree.routes(level, asked.cells)
+                reply = RouteReply(
+                    target="t",
+                    incarnation=1,
+                    target_cell=target,
+                    map_version=0,
+                    tree_age_ms=0.0,
+                    rows=grid.rows,
+                    cols=grid.cols,
+                    routes=routes,
+                )
+                agent.routes_given(asked.request, reply, now_ns)
+    raise AssertionError("the vehicle never arrived")
+
+
+def test_vehicles_drive_up_and_down_as_long_as_the_planner_says():
+    west, east = 3 * 12 + 1, 3 * 12 + 10
+    up_s, promised_up_s = driven_s(west, east, ramp(7, 12))
+    down_s, promised_down_s = driven_s(east, west, ramp(7, 12))
+    assert (promised_up_s, promised_down_s) == (pytest.approx(20.2, abs=0.1), pytest.approx(9.0))
+    assert up_s == pytest.approx(promised_up_s, abs=0.15)
+    assert down_s == pytest.approx(promised_down_s, abs=0.15)
