@@ -24,12 +24,13 @@ def run(
 ) -> None:
     """Keep the map until told to stop.
 
-    store_path  the SQLite file; if not given, `map.sqlite` in the run's folder, or memory where there is none
+    store_path  the SQLite file; if not given, `map.sqlite` in the run's folder (`map-ID.sqlite` of a keeper whose
+                id is not 0), or memory where there is none
     rebuild     a damaged store is moved aside and filled anew from the swarm
     """
     terrain = load_terrain(setup)
     if store_path is None and setup.run_dir is not None:
-        store_path = setup.run_dir / "map.sqlite"
+        store_path = setup.run_dir / ("map.sqlite" if setup.id == "0" else f"map-{setup.id}.sqlite")
     with (
         KeeperStore(store_path or ":memory:", rebuild=rebuild) as store,
         open_bus(setup.scenario.network) as bus,

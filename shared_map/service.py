@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+from shared_map.base_map_bus import BaseMapServer
 from shared_map.feed import MapFeed
 from shared_map.keeper import Keeper, KeeperStore
 from shared_map.replica import MapReplica
@@ -27,6 +28,8 @@ class KeeperService:
     def __init__(self, setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post, store: KeeperStore) -> None:
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
         self.counters = self._member.counters
+        self._bus = bus
+        self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
         self._keeper = Keeper()
         self.replica = MapReplica(terrain.grid)
@@ -53,6 +56,7 @@ class KeeperService:
 
     def start(self, now_ns: int) -> None:
         self._member.join()
+        self._base_map.start(self._bus)
         self._feed.start(now_ns)
         log.info("keeper started: %d tiles in store %s", len(self.replica.tiles), self._store.path)
 

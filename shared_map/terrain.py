@@ -254,7 +254,9 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _META).unlink(missing_ok=True)
         for name, array in arrays.items():
-            np.save(folder / f"{name}.npy", np.ascontiguousarray(array), allow_pickle=False)
+            path = folder / f"{name}.npy"
+            path.unlink(missing_ok=True)  # whoever has the old one mapped keeps it
+            np.save(path, np.ascontiguousarray(array), allow_pickle=False)
         partial = folder / f"{_META}.part"
         partial.write_text(json.dumps(meta, indent=1), encoding="utf-8")
         partial.rename(folder / _META)

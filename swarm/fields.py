@@ -21,6 +21,8 @@ Natural = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 """A count, a time or a sequence number: leaves room to add to it in 64 bits."""
 Metres = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 """A place in the map frame: fits in a float32, and on any planet."""
+GridSide = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
+"""Rows or columns of a grid that a process could hold."""
 Cell = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 32)]
 """A cell, row or column as others name it. The message cannot know the grid: it may lie outside."""
 

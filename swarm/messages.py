@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import enum
 import math
+from typing import Annotated
 
 import msgspec
 import numpy as np
 
 from swarm.fields import (
     Cell,
+    GridSide,
     Metres,
     Natural,
     check_column,
@@ -23,7 +25,7 @@ from swarm.fields import (
 )
 from swarm.fields import column as column
 from swarm.fields import pack_column as pack_column
-from swarm.grid import TILE_CELLS
+from swarm.grid import TILE_CELLS, GridSpec
 from swarm.stats import TOP_BUCKET, ZERO_BUCKET
 
 WIRE_VERSION = 2
@@ -171,6 +173,57 @@ class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-requ
 
     authors: list[str] = []
     tiles: list[Natural] = []
+
+
+# --- the base map -------------------------------------------------------------------------------------------
+
+
+class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
+    """What a keeper has of the run's terrain, for those who lack its files.
+
+    digests  layer -> 8 bytes per region (256 x 256 cells): BLAKE2b of its bytes, in order of region
+    notes    sentences about where the terrain came from
+    """
+
+    keeper: str
+    terrain: str
+    rows: GridSide
+    cols: GridSide
+    resolution_m: Annotated[float, msgspec.Meta(ge=1e-6, le=1e9)]
+    west_m: Metres
+    north_m: Metres
+    crs: str
+    digests: dict[str, bytes]
+    notes: list[str] = []
+
+    def __post_init__(self) -> None:
+        check_id("keeper", self.keeper)
+        regions = self.grid.regions
+        for layer, digests in self.digests.items():
+            check_column(f"digests of {layer[:40]}", digests, BASE_DIGEST_BYTES, regions)
+
+    @property
+    def grid(self) -> GridSpec:
+        return GridSpec(self.rows, self.cols, self.resolution_m, self.west_m, self.north_m, self.crs)
+
+
+class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map-request")):
+    """Asks a keeper for these layers of these regions."""
+
+    layers: list[str] = []
+    regions: list[Natural] = []
+
+
+class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
+    """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
+    row, then the next, as like bytes beside each other pack better."""
+
+    layer: str
+    region: Natural
+    data: bytes
+
+
+BASE_DIGEST_BYTES = 8
 
 
 # --- vehicles -----------------------------------------------------------------------------------------------

@@ -10,6 +10,9 @@ from enum import Enum
 
 from swarm.codec import prime
 from swarm.messages import (
+    BaseMap,
+    BaseMapRequest,
+    BaseMapTile,
     Claims,
     CostReply,
     CostRequest,
@@ -129,6 +132,14 @@ DIGEST = Topic(
     "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",
     priority=Priority.BACKGROUND,
 )  # fmt: skip
+BASE_MAP = Topic(
+    "base-map", "base/{keeper}", BaseMap, "what a keeper has of the terrain, for those who lack its files",
+    "asked at a start", request=Nothing, published=False, priority=Priority.BACKGROUND,
+)  # fmt: skip
+BASE_TILES = Topic(
+    "base-tiles", "base/{keeper}/tiles", BaseMapTile, "the terrain itself, by layer and region",
+    "asked at a start", request=BaseMapRequest, published=False, priority=Priority.BACKGROUND,
+)  # fmt: skip
 FLEET = Topic(
     "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
 )  # fmt: skip
@@ -167,7 +178,7 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, FLEET, CLAIMS, FOLLOWED, PUSHED_ROUTE, POSE, ROUTE, COST, STATUS, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CLAIMS, FOLLOWED, PUSHED_ROUTE, POSE, ROUTE, COST, STATUS, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

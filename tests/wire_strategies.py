@@ -12,6 +12,9 @@ from swarm.messages import (
     DIGEST_ROW,
     NO_TARGET,
     TILE_AREA,
+    BaseMap,
+    BaseMapRequest,
+    BaseMapTile,
     Claims,
     CostReply,
     CostRequest,
@@ -137,6 +140,14 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     MarkSet: mark_sets(),
     Digest: digests(),
     MarksRequest: st.builds(MarksRequest, authors=st.lists(ids, max_size=3), tiles=st.lists(naturals, max_size=3)),
+    BaseMap: st.builds(
+        BaseMap, keeper=ids, terrain=texts, rows=st.integers(1, 256), cols=st.integers(1, 256),
+        resolution_m=st.floats(0.01, 1e6), west_m=metres, north_m=metres, crs=texts,
+        digests=st.dictionaries(texts, st.binary(min_size=8, max_size=8), max_size=4),
+        notes=st.lists(texts, max_size=3),
+    ),
+    BaseMapRequest: st.builds(BaseMapRequest, layers=st.lists(texts, max_size=3), regions=st.lists(naturals)),
+    BaseMapTile: st.builds(BaseMapTile, layer=texts, region=naturals, data=st.binary(max_size=50)),
     Fleet: fleets(),
     Claims: st.builds(
         Claims, agent=ids, incarnation=naturals, seq=naturals, clock=naturals,
@@ -194,6 +205,12 @@ EXAMPLES: tuple[Message, ...] = (
     ),
     Digest(author="a0.7", role="agent", held={"a0.7": np.array([(3, 7, 2)], DIGEST_ROW).tobytes()}),
     MarksRequest(authors=["a0.7"], tiles=[3]),
+    BaseMap(
+        keeper="0", terrain="0123456789abcdef", rows=300, cols=200, resolution_m=10.0, west_m=0.0, north_m=0.0,
+        crs="local", digests={"ground": bytes(range(16))}, notes=["from somewhere"],
+    ),
+    BaseMapRequest(layers=["ground"], regions=[0, 1]),
+    BaseMapTile(layer="ground", region=1, data=b"packed"),
     Fleet(
         author="a0.7", group="all", region=0, seq=9, stamp_ns=10, ids=["a0-00", "a0-01"], target_ids=["t0"],
         cells=pack_column([4, 5], "<u4"), east_m=pack_column([1.0, 2.0], "<f4"),

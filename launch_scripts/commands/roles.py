@@ -65,10 +65,16 @@ def keeper(
     rebuild: Annotated[
         bool, typer.Option(help="Move a damaged store aside and fill a new one from the swarm.")
     ] = False,
+    id: Annotated[str, typer.Option("--id", help="Its name, where several keepers keep the same map.")] = "0",
 ) -> None:
-    """Keep the shared map's marks in a store that survives every crash."""
+    """Keep the shared map's marks in a store that survives every crash.
+
+    Also gives the terrain to machines that lack its files. Several keepers agree with each other:
+
+    swarm keeper jacksboro --id east --store /var/lib/swarm/east.sqlite
+    """
     kept = {"store_path": store, "rebuild": rebuild}
-    _run("keeper", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key), more=kept)
+    _run("keeper", id, scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key), more=kept)
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -151,7 +157,9 @@ def _run(
     import msgspec
 
     from launch_scripts.launcher import options
+    from launch_scripts.launcher.bars import bars
     from launch_scripts.launcher.child import load_entry, log_to
+    from launch_scripts.launcher.ground import fetch_if_missing
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.processes import ENTRIES, processes_of
     from swarm.errors import ConfigError, StoreError
@@ -168,9 +176,12 @@ def _run(
         network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, connect))
         scenario = msgspec.structs.replace(scenario, network=network)
     ids = [spec.id for spec in processes_of(scenario, (role,))]
-    if id not in ids:
+    if role == "keeper":
+        _check_id(id)
+    elif id not in ids:
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
     log_to(None)
+    found: list[RunInfo] = []
     if role != "router":
         found = _found(scenario.network)
         check_vacant(found, role, id)
@@ -181,10 +192,24 @@ def _run(
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(f"cannot make {run_dir}: {error.strerror or error}") from error
+    if role != "router":
+        with bars() as progress:
+            # A keeper hands on what it fetched, the photo too.
+            fetch_if_missing(scenario, run_dir, found, looks=role in ("monitor", "keeper"), progress=progress)
     now_ns = time.time_ns()
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir.resolve())
     load_entry(ENTRIES[role])(setup, None, **(more or {}))
+
+
+def _check_id(id: str) -> None:
+    from swarm.errors import ConfigError
+    from swarm.fields import check_id
+
+    try:
+        check_id("--id", id)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 def _found(network: NetworkConfig) -> list[RunInfo]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,9 +11,9 @@ import msgspec
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from launch_scripts.launcher.bars import bars
 from shared_map.arrays import Bytes
 from shared_map.layers import TerrainClass, slope_deg
 from swarm.config import Scenario, TerrainConfig
@@ -45,29 +43,6 @@ Fill = Annotated[
     bool, typer.Option("--fill", help="Fill voids from their surroundings instead of forbidding them.")
 ]
 PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
-
-
-@contextlib.contextmanager
-def _bars() -> Iterator[Tell]:
-    """A progress bar for whatever takes longer than a second, on a terminal only."""
-    started = time.monotonic()
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        tasks: dict[str, TaskID] = {}
-
-        def tell(what: str, share: float) -> None:
-            if time.monotonic() - started < 1.0 and what not in tasks:
-                return
-            if what not in tasks:
-                tasks[what] = progress.add_task(what, total=1.0)
-            progress.update(tasks[what], completed=share)
-
-        yield tell
 
 
 def _scenario(name: str) -> Scenario:
@@ -100,7 +75,7 @@ def info(
             "nodata": nodata,
         }
         config = msgspec.convert(raw, TerrainConfig)
-    with _bars() as tell:
+    with bars() as tell:
         source = load_source(config, 1, tell)
     facts = _facts(source.grid, source.elevation_m)
     if source.factor is not None:
@@ -146,7 +121,7 @@ def cost(
     from shared_map.terrain import build_terrain
 
     loaded = _scenario(scenario)
-    with _bars() as tell:
+    with bars() as tell:
         started = time.perf_counter()
         terrain = build_terrain(loaded, tell)
         seconds = time.perf_counter() - started
@@ -235,7 +210,7 @@ def synth(
         rivers=rivers,
         roads=roads,
     )
-    with _bars() as tell:
+    with bars() as tell:
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
     if out.suffix == ".npz":
@@ -280,7 +255,7 @@ def classify(
         crs=crs,
         resolution_m=resolution_m,
     )
-    with _bars() as tell:
+    with bars() as tell:
         terrain = build_terrain(Scenario(terrain=terrain_config), tell)
     _print_shares(terrain.classes)
     if labels is not None:

@@ -11,7 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from launch_scripts.launcher.bars import bars
 from launch_scripts.launcher.child import log_to
+from launch_scripts.launcher.ground import fetch_if_missing, missing_files
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.launcher.options import check_ports, listening, make_run_dir, new_run_id
 from launch_scripts.launcher.screen import Screen
@@ -19,7 +21,8 @@ from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.processes import ROLES, ProcessSpec, processes_of
 from launch_scripts.report.record import Recorder
 from launch_scripts.report.write import write_report
-from shared_map.terrain import prepare
+from shared_map.arrays import Floats
+from shared_map.terrain import Terrain, load_terrain, load_truth, prepare
 from swarm.bus import Bus
 from swarm.clock import MonotonicClock
 from swarm.config import Scenario
@@ -117,7 +120,7 @@ class _Run:
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         warm_up = WarmUp(list(self._options.preload))
         warm_up.begin()
-        self._terrain, self._truth = prepare(self._run_dir, self._scenario)
+        self._terrain, self._truth = self._prepared()
         log.info("terrain is ready")
         self._wait("loading kernels; the first start on a machine compiles them, about a minute", warm_up.done)
         log.info("kernels are loaded")
@@ -151,6 +154,19 @@ class _Run:
         for failure in failures:
             self._screen.say(failure, "red")
         return 1 if failures else 0
+
+    def _prepared(self) -> tuple[Terrain, Floats]:
+        """Built of its files; where one is missing and there is a swarm to join, as its keeper has it."""
+        if self._options.joins and missing_files(self._scenario):
+            with open_bus(self._scenario.network) as bus:
+                found = ask_run(bus)
+            looks = bool({"monitor", "keeper"} & set(self._options.roles))
+            with bars() as progress:
+                fetch_if_missing(self._scenario, self._run_dir, found, looks=looks, progress=progress)
+            setup = self._setup_of(ProcessSpec("launcher", "0", ""))
+            terrain = load_terrain(setup)
+            return terrain, load_truth(setup, terrain)
+        return prepare(self._run_dir, self._scenario)
 
     def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
         return RoleSetup(
