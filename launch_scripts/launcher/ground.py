@@ -58,7 +58,8 @@ def fetch_if_missing(
         log.info("%s: asking the keepers of run %s for the base map", why, found[0].run_id)
         layers = (*NEEDED, "photo") if looks else NEEDED
         with open_bus(scenario.network) as bus:
-            wanted = Fetching(found[0].terrain, scenario.cost, layers)
+            within_s = 2 * scenario.network.connect_timeout_s  # so slow a link is one that a start may wait for
+            wanted = Fetching(found[0].terrain, scenario.cost, layers, within_s)
             terrain = fetch_base_map(bus, wanted, why, progress)
         save_prepared(run_dir, terrain, build_truth(scenario, terrain), key)
         log.info("%s; terrain %s is as in the run", terrain.notes[-1], terrain.digest)

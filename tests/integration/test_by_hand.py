@@ -28,11 +28,11 @@ class Hands:
         self.network = load_scenario(self.path).network
         self.started: list[subprocess.Popen[str]] = []
 
-    def start(self, *arguments: str) -> subprocess.Popen[str]:
+    def start(self, *arguments: str, runs: Path | None = None) -> subprocess.Popen[str]:
         name = "-".join(arguments[:3]).replace("/", "_")
         with (self.folder / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
-                [*SWARM, *arguments, "--runs", str(self.folder / "runs")], stdout=log, stderr=log, text=True
+                [*SWARM, *arguments, "--runs", str(runs or self.folder / "runs")], stdout=log, stderr=log, text=True
             )
         self.started.append(process)
         return process
