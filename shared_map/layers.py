@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.bands import in_bands
 from swarm.config import CostConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -165,8 +166,8 @@ def slope_factor(grade_: Floats, cost: CostConfig) -> Floats:
 def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
     """Pace relative to level ground when driving up a rise (metres per metre; negative is downhill).
 
-    Steeper than `max_slope_deg` is inf. Uphill is not downhill: tobler is fastest at 5 % downhill, energy never gains downhill, linear and quadratic
-    know only how steep it is.
+    Steeper than `max_slope_deg` is inf. Uphill is not downhill: tobler is fastest at 5 % downhill, energy gains
+    nothing downhill, linear and quadratic know only how steep it is.
     """
     steepness = np.abs(rise)
     match cost.slope_rule:
@@ -332,13 +333,15 @@ def spread(lethal: Bools, halves: Sequence[int]) -> Bools:
         return lethal.copy()
     rows, cols = lethal.shape
     wide = np.zeros_like(lethal)
-    counts = np.zeros((rows, cols + 1), np.int32)
-    np.cumsum(lethal, axis=1, out=counts[:, 1:])
-    column = np.arange(cols)
+    # Lethal cells west of each cell, and as far beyond both borders as anything spreads: slices, no look-ups.
+    reach = max(halves)
+    counts = np.zeros((rows, cols + 1 + 2 * reach), np.int32)
+    np.cumsum(lethal, axis=1, out=counts[:, reach + 1 : reach + 1 + cols])
+    counts[:, reach + 1 + cols :] = counts[:, reach + cols, None]
     for distance, half in enumerate(halves):
         if distance >= rows:
             break
-        near = counts[:, np.minimum(column + half + 1, cols)] > counts[:, np.maximum(column - half, 0)]
+        near = counts[:, reach + half + 1 :][:, :cols] > counts[:, reach - half :][:, :cols]
         if distance == 0:
             wide |= near
         else:
@@ -349,6 +352,15 @@ def spread(lethal: Bools, halves: Sequence[int]) -> Bools:
 
 def inflate(ground: Floats, halves: Sequence[int]) -> Floats:
     """Step 4 of the merge rule: the ground, lethal also where the vehicle would touch a lethal cell."""
+    pace = ground.copy()
     if not halves:
-        return ground.copy()
-    return np.where(spread(np.isinf(ground), halves), LETHAL, ground)
+        return pace
+    rows, reach = ground.shape[0], len(halves) - 1
+
+    def work(row0: int, row1: int) -> None:
+        above, below = max(row0 - reach, 0), min(row1 + reach, rows)
+        wide = spread(np.isinf(ground[above:below]), halves)
+        pace[row0:row1][wide[row0 - above : row1 - above]] = LETHAL
+
+    in_bands(rows, work)
+    return pace

@@ -178,13 +178,31 @@ def gap(
 
 
 @app.command()
+def directed(
+    sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048",
+    repeats: Annotated[int, typer.Option(min=1, help="Roots, the same for both.")] = 7,
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """A full tree where uphill is not downhill (cost.directional), beside one where it is."""
+    from launch_scripts.bench.directed import run
+
+    _show(run(_numbers(sizes, "sizes"), repeats, seed), as_json)
+
+
+@app.command()
 def terrain(
-    size: Annotated[int, typer.Option(min=64, help="Cells a side.")] = 4096, as_json: AsJson = False
+    size: Annotated[int, typer.Option(min=64, help="Cells a side.")] = 4096,
+    repeats: Annotated[int, typer.Option(min=1, help="Interleaved runs of each pass.")] = 3,
+    degrees: Annotated[bool, typer.Option("--degrees", help="Files in degrees, which have to be warped.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Elevation and photo to cost: seconds and memory, beside a plain pass."""
     from launch_scripts.bench.terrain import run
 
-    _show(run(size), as_json)
+    with _progress("terrain") as progress:
+        report = run(size, repeats, degrees=degrees, progress=progress)
+    _show(report, as_json)
 
 
 @app.command()
