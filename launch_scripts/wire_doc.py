@@ -72,7 +72,8 @@ def _how(topic: Topic) -> str:
     if topic.published:
         ways.append("put, newest counts" if topic.newest else f"put, {topic.buffer} kept")
     if topic.request is not None:
-        ways.append(f"get with {_link(topic.request)}")
+        several = f", {_link(topic.bulk)} where asked for" if topic.bulk is not None else ""
+        ways.append(f"get with {_link(topic.request)}{several}")
     return "; ".join(ways)
 
 

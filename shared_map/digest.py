@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.messages import DIGEST_ROW
+from swarm.messages import DIGEST_ROW, MarkSet
 
 Held = Mapping[str, bytes]
 """Author -> rows of DIGEST_ROW, as in the message `Digest`."""
@@ -26,6 +26,17 @@ class Ledger:
             rows = self._authors[author] = _Rows()
         rows.record(tile, epoch, seq)
 
+    def record_many(self, sets: Sequence[MarkSet]) -> None:
+        """As `record` of each; no two of one author and tile."""
+        of_author: dict[str, list[MarkSet]] = {}
+        for each in sets:
+            of_author.setdefault(each.author, []).append(each)
+        for author, theirs in of_author.items():
+            rows = self._authors.setdefault(author, _Rows())
+            rows.record_many(
+                [each.tile for each in theirs], [each.epoch for each in theirs], [each.seq for each in theirs]
+            )
+
     def forget(self, author: str) -> None:
         self._authors.pop(author, None)
 
@@ -37,6 +48,11 @@ class Ledger:
         """Rows in order of author and tile: equal holdings give equal bytes."""
         names = self.authors if authors is None else [name for name in authors if name in self._authors]
         return {name: self._authors[name].sorted().tobytes() for name in names}
+
+    def rows_of(self, author: str, tiles: Iterable[int]) -> bytes:
+        """Rows of these tiles of an author, as far as it has them."""
+        rows = self._authors.get(author)
+        return b"" if rows is None else rows.of(tiles).tobytes()
 
     def missing(self, theirs: Held) -> list[tuple[str, list[int]]]:
         """(author, tiles) of which they hold a newer set than we."""
@@ -80,6 +96,23 @@ class _Rows:
             self._place[tile] = place
             self._ordered = self._ordered and (place == 0 or int(self._rows["tile"][place - 1]) < tile)
         self._rows[place] = (tile, epoch, seq)
+
+    def record_many(self, tiles: list[int], epochs: list[int], seqs: list[int]) -> None:
+        """Tiles are all different."""
+        new = [tile for tile in tiles if tile not in self._place]
+        if new:
+            count = len(self._place)
+            self._place.update(zip(new, range(count, count + len(new)), strict=True))
+            if count + len(new) > len(self._rows):
+                self._rows = np.concatenate([self._rows, np.zeros(max(count, len(new)), DIGEST_ROW)])
+            self._ordered = False
+        place = self._place
+        at = [place[tile] for tile in tiles]
+        for name, values in (("tile", tiles), ("epoch", epochs), ("seq", seqs)):
+            self._rows[name][at] = values
+
+    def of(self, tiles: Iterable[int]) -> NDArray[np.void]:
+        return self._rows[[place for tile in sorted(tiles) if (place := self._place.get(tile)) is not None]]
 
     def sorted(self) -> NDArray[np.void]:
         if not self._ordered:

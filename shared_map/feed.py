@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
+from shared_map.bulk import packed, unpacked
 from shared_map.digest import Held
 from shared_map.quota import Quota
-from shared_map.replica import MapReplica, PublishSet
-from swarm.bus import Asked, AskEnded, Bus, Event, Heard, LinkChanged, Post, Replied
+from shared_map.replica import MapReplica, Merged, PublishSet
+from swarm.bus import Asked, AskEnded, Bus, Event, Heard, HeardMany, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config import MapConfig
-from swarm.messages import Digest, MarkSet, MarksRequest
+from swarm.messages import Digest, MarkSet, MarkSets, MarksRequest, Message
 from swarm.topics import DIGEST, MARKS
 
 log = logging.getLogger(__name__)
@@ -23,10 +24,21 @@ _JOIN_TIMEOUT_S = 5.0
 _JOIN_TRIES = 5
 _GRACE_NS = NS_PER_S // 10
 """A digest may overtake the sets that it tells of: only what is missing after this is asked for."""
-_RETRY_NS = NS_PER_S // 2
+_RETRY_NS = NS_PER_S // 4
+_TELL_CHANGES_NS = NS_PER_S // 5
+_RECENT_NS = NS_PER_S
+_JOIN_RETRY_NS = NS_PER_S // 2
 _NAME_AGAIN_NS = 60 * NS_PER_S
 _ASKS_AT_ONCE = 16
+_TRIES = 6
 _OFFERS_AT_ONCE = 256
+_QUANTUM = 16_384
+"""Marks of one author that are merged before its quota is looked at again."""
+_MANY = "-"
+"""In place of region and tile in the key of a reply that carries many sets of an author."""
+_MAX_NAMES = 4096
+_MAX_CLAIM_BYTES = 64 << 20
+"""What digests that wait to be compared may hold: more are dropped, and told again a second later."""
 
 
 @dataclass(slots=True)
@@ -36,6 +48,10 @@ class _Claim:
     digest: Digest
     due_ns: int
     tries: int = 0
+
+    @property
+    def size(self) -> int:
+        return 1000 + sum(map(len, self.digest.held.values())) + 100 * len(self.digest.held)
 
 
 class MapFeed:
@@ -76,7 +92,10 @@ class MapFeed:
         self._digest_due_ns = 0
         self._join_due_ns: int | None = None
         self._join_tries = 0
-        self._claims: dict[str, _Claim] = {}
+        self._claims: dict[tuple[str, bool], _Claim] = {}  # (sender, whether it is whole)
+        self._claim_bytes = 0
+        self._recent: dict[int, int | None] = {}  # own tile that was put -> until when that is told of
+        self._changes_due_ns = 0
         self._asking: dict[str, int] = {}  # author -> when asked for
         self._heard_ns: dict[str, int] = {}
         self._kept: Held | None = None
@@ -85,7 +104,7 @@ class MapFeed:
     def start(self, now_ns: int) -> None:
         """Subscribe, serve, and ask for all that was said before."""
         self._started_ns = now_ns
-        self._bus.subscribe(MARKS, self._post)
+        self._bus.subscribe(MARKS, self._post, together=True)
         self._bus.subscribe(DIGEST, self._post)
         if self._serves_all:
             self._bus.serve(MARKS, self._post)
@@ -96,15 +115,14 @@ class MapFeed:
     def handle(self, event: Event, now_ns: int) -> bool:
         """True if the event was about the map and nobody else's business."""
         match event:
-            case Heard(topic=topic, message=MarkSet() as heard) if topic is MARKS:
-                self._admit(heard, event.fields, now_ns)
+            case HeardMany(topic=topic, samples=samples) if topic is MARKS:
+                self._hear(samples, now_ns)
             case Heard(topic=topic, message=Digest() as digest) if topic is DIGEST:
                 self._hear_digest(digest, now_ns)
-            case Replied(tag=tag, message=MarkSet() as reply) if tag == _JOIN:
-                if self._in_its_place(reply, event.fields):
-                    self._merge(reply, measured=False)
-            case Replied(tag=tag, message=MarkSet() as reply) if tag.startswith(_RESYNC):
-                self._admit(reply, event.fields, now_ns)
+            case Replied(tag=tag, topic=topic) if topic is MARKS and tag == _JOIN:
+                self._merge(self._told(event), measured=False)
+            case Replied(tag=tag, topic=topic) if topic is MARKS and tag.startswith(_RESYNC):
+                self._admit(self._told(event), now_ns)
             case AskEnded(tag=tag) if tag == _JOIN:
                 self._join_ended(event, now_ns)
             case AskEnded(tag=tag) if tag.startswith(_RESYNC):
@@ -130,10 +148,7 @@ class MapFeed:
             claim = self._claims[sender]
             if now_ns >= claim.due_ns:
                 self._compare(sender, claim, now_ns)
-        if self._name is not None and now_ns >= self._digest_due_ns:
-            self._digest_due_ns = now_ns + self._digest_ns
-            digest = Digest(author=self._name, role=self._role, held=self._held())
-            self._bus.publish(DIGEST, digest, author=self._name)
+        self._tell_digest(now_ns)
 
     def publish(self, actions: Iterable[PublishSet]) -> None:
         """Perform what the replica decided; a keeper, too, hears of its own sets here."""
@@ -155,47 +170,95 @@ class MapFeed:
     # --- sets -----------------------------------------------------------------------------------------------
 
     def _put(self, mark_set: MarkSet) -> None:
+        if mark_set.author == self.replica.author:
+            self._recent.setdefault(mark_set.tile, None)
         region = self.replica.grid.region_of_tile(mark_set.tile)
         self._bus.publish(MARKS, mark_set, region=region, tile=mark_set.tile, author=mark_set.author)
 
-    def _admit(self, mark_set: MarkSet, key: Mapping[str, str], now_ns: int) -> None:
-        """Merge a set now, or later if its author says too much."""
-        if not self._in_its_place(mark_set, key):
-            return
-        if self._quota.admits(mark_set, now_ns):
-            self._quota.charge(mark_set.author, self._merge(mark_set, measured=True), now_ns)
-        elif now_ns - self._named_ns.get(mark_set.author, -_NAME_AGAIN_NS) >= _NAME_AGAIN_NS:
-            self._named_ns[mark_set.author] = now_ns
-            log.warning("author %s marks more than its share: it is heard with delay", mark_set.author)
+    def _hear(self, samples: Sequence[tuple[str, Message]], now_ns: int) -> None:
+        """Sets that were put: each under the key of its tile and author, as access is granted by key."""
+        sets = [
+            each for key, each in samples
+            if isinstance(each, MarkSet) and key.endswith(f"/{each.tile}/{each.author}")
+        ]  # fmt: skip
+        self.replica.counts["sets_refused"] += len(samples) - len(sets)
+        self._admit(sets, now_ns)
+
+    def _told(self, event: Replied) -> list[MarkSet]:
+        """The sets in a reply. Nobody speaks for another there either, whether of one tile or of many."""
+        match event.message:
+            case MarkSet() as one if event.fields.get("tile") == str(one.tile):
+                sets = [one]
+            case MarkSets() as many if event.fields.get("tile") == _MANY:
+                sets = unpacked(many)
+            case _:
+                sets = []
+        if sets and event.fields.get("author") == sets[0].author:
+            return sets
+        self.replica.counts["sets_refused"] += 1
+        return []
+
+    def _admit(self, sets: Sequence[MarkSet], now_ns: int) -> None:
+        """Merge sets now, or later if their author says too much."""
+        taken: list[MarkSet] = []
+        marks: dict[str, int] = {}  # author -> statements among those taken
+        for each in sets:
+            author = each.author
+            said = marks.get(author)
+            if said is not None and said > _QUANTUM:
+                self._merge_charged(taken, marks, now_ns)
+                taken, marks, said = [], {}, None
+            if said is None and not self._quota.admits(each, now_ns):
+                self._name_once(author, "marks more than its share: it is heard with delay", now_ns)
+                continue
+            taken.append(each)
+            marks[author] = (said or 0) + len(each.kinds)
+        self._merge_charged(taken, marks, now_ns)
+
+    def _merge_charged(self, sets: Sequence[MarkSet], authors: Iterable[str], now_ns: int) -> None:
+        costs = dict.fromkeys(authors, 0)
+        merged = self._merge(sets, measured=True)
+        for each, changed in zip(merged.sets, merged.changed, strict=True):
+            costs[each.author] += changed
+        for author, cost in costs.items():
+            self._quota.charge(author, cost, now_ns)
+        if self.replica.crowded_out is not None:
+            self._name_once(self.replica.crowded_out, "says more than there is room for: it is not heard", now_ns)
+            self.replica.crowded_out = None
 
     def _merge_waiting(self, now_ns: int) -> None:
         while (mark_set := self._quota.due(now_ns)) is not None:
-            self._quota.charge(mark_set.author, self._merge(mark_set, measured=False), now_ns)
+            merged = self._merge([mark_set], measured=False)
+            self._quota.charge(mark_set.author, sum(merged.changed), now_ns)
         self._quota.forget(now_ns)
 
-    def _in_its_place(self, mark_set: MarkSet, key: Mapping[str, str]) -> bool:
-        if key.get("author") == mark_set.author and key.get("tile") == str(mark_set.tile):
-            return True
-        self.replica.counts["sets_refused"] += 1  # access is granted by key: nobody speaks for another
-        return False
-
-    def _merge(self, mark_set: MarkSet, *, measured: bool) -> int:
-        """Returns how many cells changed."""
-        changed = self.replica.merge(mark_set, measured=measured)
-        if changed is None:
-            return 0
+    def _merge(self, sets: Sequence[MarkSet], *, measured: bool) -> Merged:
+        merged = self.replica.merge_many(sets, measured=measured)
         if self._on_accepted is not None:
-            self._on_accepted(mark_set)
-        return len(changed)
+            for each in merged.sets:
+                self._on_accepted(each)
+        return merged
+
+    def _name_once(self, author: str, what: str, now_ns: int) -> None:
+        if now_ns - self._named_ns.get(author, -_NAME_AGAIN_NS) >= _NAME_AGAIN_NS:
+            if len(self._named_ns) >= _MAX_NAMES:
+                self._named_ns.clear()
+            self._named_ns[author] = now_ns
+            log.warning("author %s %s", author, what)
 
     def _answer(self, asked: Asked, request: MarksRequest) -> None:
         named = asked.fields.get("author", "*")
         author = None if "*" in named else named
         if not self._serves_all:
             author = self.replica.author
-        for each in self.replica.answer(request, author):
-            region = self.replica.grid.region_of_tile(each.tile)
-            asked.answer(each, region=region, tile=each.tile, author=each.author)
+        sets = self.replica.answer(request, author)
+        if request.bulk:
+            for many in packed(sets):
+                asked.answer(many, region=_MANY, tile=_MANY, author=many.author)
+        else:
+            for each in sets:
+                region = self.replica.grid.region_of_tile(each.tile)
+                asked.answer(each, region=region, tile=each.tile, author=each.author)
         asked.end()
 
     # --- late join ------------------------------------------------------------------------------------------
@@ -203,28 +266,58 @@ class MapFeed:
     def _join(self) -> None:
         self._join_due_ns = None
         self._join_tries += 1
-        self._bus.ask(MARKS, MarksRequest(), self._post, tag=_JOIN, timeout_s=_JOIN_TIMEOUT_S)
+        self._bus.ask(MARKS, MarksRequest(bulk=True), self._post, tag=_JOIN, timeout_s=_JOIN_TIMEOUT_S)
 
     def _join_ended(self, event: AskEnded, now_ns: int) -> None:
         if (event.replies and event.failure is None) or self._join_tries >= _JOIN_TRIES:
             self.joined = True
             return
         # Nobody there, a link lost or simply nothing said yet: these look alike. Digests tell the rest later.
-        self._join_due_ns = now_ns + (_RETRY_NS << (self._join_tries - 1))
+        self._join_due_ns = now_ns + (_JOIN_RETRY_NS << (self._join_tries - 1))
 
     # --- digests --------------------------------------------------------------------------------------------
 
     def _hear_digest(self, digest: Digest, now_ns: int) -> None:
         if digest.author == self._name:
             return
-        self._heard_ns[digest.author] = now_ns
-        if digest.role == "keeper":
+        if digest.author in self._heard_ns or len(self._heard_ns) < _MAX_NAMES:
+            self._heard_ns[digest.author] = now_ns
+        if digest.role == "keeper" and digest.whole:
             self._kept = digest.held
-        waiting = self._claims.get(digest.author)
+        sender = (digest.author, digest.whole)
+        waiting = self._claims.pop(sender, None)
+        if waiting is not None:
+            self._claim_bytes -= waiting.size
         due_ns = now_ns + _GRACE_NS if waiting is None else min(waiting.due_ns, now_ns + _GRACE_NS)
-        self._claims[digest.author] = _Claim(digest, due_ns)
+        claim = _Claim(digest, due_ns)
+        if self._claim_bytes + claim.size <= _MAX_CLAIM_BYTES and len(self._claims) < _MAX_NAMES:
+            self._claims[sender] = claim
+            self._claim_bytes += claim.size
 
-    def _compare(self, sender: str, claim: _Claim, now_ns: int) -> None:
+    def _tell_digest(self, now_ns: int) -> None:
+        """All that we hold every `digest_s`; in between, what we changed lately: of a set that is lost on its way
+        that is how the others learn within a fraction of a second."""
+        if self._name is None:
+            return
+        if now_ns >= self._digest_due_ns:
+            self._digest_due_ns = now_ns + self._digest_ns
+            held, whole = self._held(), True
+        else:
+            author = self.replica.author
+            if author is None or not self._recent or now_ns < self._changes_due_ns:
+                return
+            held, whole = {author: self.replica.ledger.rows_of(author, self._recent)}, False
+        self._changes_due_ns = now_ns + _TELL_CHANGES_NS
+        for tile, until_ns in list(self._recent.items()):
+            if until_ns is None:
+                self._recent[tile] = now_ns + _RECENT_NS
+            elif now_ns >= until_ns:
+                del self._recent[tile]
+        self._bus.publish(
+            DIGEST, Digest(author=self._name, role=self._role, held=held, whole=whole), author=self._name
+        )
+
+    def _compare(self, sender: tuple[str, bool], claim: _Claim, now_ns: int) -> None:
         """Ask for what they hold and we miss; give a keeper what we hold and it misses of those who are gone."""
         missing = self.replica.compare(claim.digest.held)
         throttled = self.throttled
@@ -236,12 +329,13 @@ class MapFeed:
             again = asked_ns is not None and now_ns - asked_ns >= _RETRY_NS
             if again or (asked_ns is None and len(self._asking) < _ASKS_AT_ONCE):
                 self._asking[author] = now_ns
-                request = MarksRequest(authors=[author], tiles=tiles)
+                request = MarksRequest(authors=[author], tiles=tiles, bulk=True)
                 self._bus.ask(MARKS, request, self._post, tag=_RESYNC + author, author=author)
-        if claim.digest.role == "keeper" and not self._serves_all and claim.tries == 0:
+        if claim.digest.role == "keeper" and claim.digest.whole and not self._serves_all and claim.tries == 0:
             self._offer(claim.digest.held, now_ns)
         claim.tries += 1
-        if not missing or claim.tries > 3:
+        if not missing or claim.tries > _TRIES:
+            self._claim_bytes -= claim.size
             del self._claims[sender]  # the next digest tells again
         else:
             claim.due_ns = now_ns + _RETRY_NS

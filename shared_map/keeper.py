@@ -113,7 +113,9 @@ class KeeperStore:
         try:
             for row in self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM sets"):
                 fields = dict(zip(_FIELDS, row, strict=True))
-                yield MarkSet(**fields)
+                mark_set = MarkSet(**fields)
+                mark_set.check()
+                yield mark_set
         except (sqlite3.Error, ValueError, TypeError) as error:
             raise StoreError(_damaged(self.path, str(error))) from error
 

@@ -65,7 +65,8 @@ def first_end_ns(mark_set: MarkSet, after_ns: int) -> int | None:
 
 
 def mark_set(author: str, group: str, tile: int, epoch: int, seq: int, said: Statements) -> MarkSet:
-    return MarkSet(
+    """A set of these columns. Raises ValueError where they break a rule."""
+    made = MarkSet(
         author=author,
         group=group,
         tile=tile,
@@ -77,6 +78,8 @@ def mark_set(author: str, group: str, tile: int, epoch: int, seq: int, said: Sta
         stamps_ns=pack_column(said.stamps_ns, "<i8"),
         untils_ns=_packed_untils(said.untils_ns),
     )
+    made.check()
+    return made
 
 
 def _packed_untils(untils_ns: NDArray[np.int64] | None) -> bytes:

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from shared_map.batch import Arrival, cells_of, difference_of_many
 from shared_map.digest import Held, Ledger, fingerprint
 from shared_map.marks import (
     NO_STATEMENT,
@@ -30,16 +31,28 @@ from shared_map.marks import (
     supersedes,
     tile_cells,
 )
+from shared_map.room import Room
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
-from swarm.grid import GridSpec
-from swarm.messages import FOREVER, MarkKind, MarkSet, MarksRequest
+from swarm.grid import TILE_CELLS, GridSpec
+from swarm.messages import FOREVER, TILE_AREA, MarkKind, MarkSet, MarksRequest
 
 
 class CostSink(Protocol):
     """Where the winning statements go: the cost map."""
 
     def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> object: ...
+
+
+class Winners(Protocol):
+    """Columns of winning statements: `marks.Statements` of one tile, `batch.Said` of several."""
+
+    @property
+    def kinds(self) -> NDArray[np.uint8]: ...
+    @property
+    def paces(self) -> NDArray[np.float32]: ...
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +62,22 @@ class PublishSet:
     mark_set: MarkSet
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Merged:
+    """What a merge of many sets took in, and how many cells' winners each of them changed."""
+
+    sets: list[MarkSet]
+    changed: list[int]
+
+
 class MapReplica:
     """Holds the newest set of every (tile, author) and keeps a cost map at the winning statements.
 
     author      name under which `write` speaks; None for those who only listen
     publish_hz  each tile's set goes out at most this often
-    counts      sets_merged, sets_repeated, sets_refused, marks_merged (cells whose winner changed), marks_written
+    room        bounds of what it may hold of others
+    counts      sets_merged, sets_repeated, sets_refused, sets_without_room, marks_merged (cells whose winner
+                changed), marks_written
     """
 
     def __init__(
@@ -65,14 +88,17 @@ class MapReplica:
         author: str | None = None,
         group: str = "all",
         publish_hz: float = 10.0,
+        room: Room | None = None,
     ) -> None:
         self.grid = grid
         self.author = author
         self.group = group
-        self.counts = dict.fromkeys(
-            ("sets_merged", "sets_repeated", "sets_refused", "marks_merged", "marks_written"), 0
-        )
+        names = ("merged", "repeated", "refused", "without_room")
+        self.counts = dict.fromkeys([f"sets_{name}" for name in names] + ["marks_merged", "marks_written"], 0)
         self.ledger = Ledger()
+        self.room = room or Room()
+        self.crowded_out: str | None = None  # the author of the set that last had no room
+        self._ragged = bool(grid.rows % TILE_CELLS or grid.cols % TILE_CELLS)
         self._cost_map = cost_map
         self._tiles: dict[int, dict[str, MarkSet]] = {}
         self._clock = HybridClock()
@@ -91,17 +117,91 @@ class MapReplica:
 
         measured  counts for `take_newest_stamp_ns`; not so the sets of a late join, which are old already
         """
-        if fault(received, self.grid) is not None:
-            self.counts["sets_refused"] += 1
-            return None
         held = self._tiles.get(received.tile, {}).get(received.author)
-        if held is not None and not supersedes(received, held):
-            self.counts["sets_repeated"] += 1
+        if not self._admissible(received, held):
             return None
         if received.author == self.author:
             self._outbid(received, held)
             return None
         return self._accept(received, measured)
+
+    def merge_many(self, received: Sequence[MarkSet], *, measured: bool = True) -> Merged:
+        """As `merge` of each, in less than half the time: what is known, superseded or no part of this map is left
+        out of the result."""
+        merged = Merged([], [])
+        for sets in self._rounds(received):
+            if len(sets) < _WORTH_ARRAYS:
+                for each in sets:
+                    changed = self.merge(each, measured=measured)
+                    if changed is not None:
+                        merged.sets.append(each)
+                        merged.changed.append(len(changed))
+            else:
+                self._accept_many(sets, measured, merged)
+        return merged
+
+    def _rounds(self, received: Sequence[MarkSet]) -> list[list[MarkSet]]:
+        """The newest set of each tile and author, in groups in which no tile occurs twice."""
+        newest: dict[tuple[int, str], MarkSet] = {}
+        for each in received:
+            held = newest.setdefault((each.tile, each.author), each)
+            if held is not each:
+                self.counts["sets_repeated"] += 1
+                if supersedes(each, held):
+                    newest[each.tile, each.author] = each
+        rounds: list[list[MarkSet]] = []
+        times: dict[int, int] = {}
+        for each in newest.values():
+            nth = times.get(each.tile, 0)
+            times[each.tile] = nth + 1
+            if nth == len(rounds):
+                rounds.append([])
+            rounds[nth].append(each)
+        return rounds
+
+    def _accept_many(self, received: list[MarkSet], measured: bool, merged: Merged) -> None:
+        """Take in sets of different tiles."""
+        arrivals: list[Arrival] = []
+        for each in received:
+            sets = self._tiles.get(each.tile)
+            held = None if sets is None else sets.get(each.author)
+            if not self._admissible(each, held):
+                continue
+            if each.author == self.author:
+                self._outbid(each, held)
+                continue
+            others = () if sets is None else [other for name, other in sets.items() if name != each.author]
+            arrivals.append(Arrival(each, held, others))
+            if sets is None:
+                sets = self._tiles[each.tile] = {}
+            sets[each.author] = each
+            self.room.take(each, held)
+            if each.untils_ns:
+                self._note_end(each)
+        if not arrivals:
+            return
+        sets_taken = [arrival.new for arrival in arrivals]
+        self.ledger.record_many(sets_taken)
+        self.counts["sets_merged"] += len(arrivals)
+        changed = difference_of_many(arrivals, self._now_ns)
+        tiles = np.array([each.tile for each in sets_taken], np.int64)
+        self._perform(cells_of(self.grid, tiles, changed.places), changed, measured)
+        merged.sets.extend(sets_taken)
+        merged.changed.extend(np.bincount(changed.places // TILE_AREA, minlength=len(arrivals)).tolist())
+
+    def _admissible(self, received: MarkSet, held: MarkSet | None) -> bool:
+        """Whether a set is part of this map, news and within bounds; if not, why is counted."""
+        if received.tile >= self.grid.tiles or (self._ragged and fault(received, self.grid) is not None):
+            self.counts["sets_refused"] += 1
+            return False
+        if held is not None and not supersedes(received, held):
+            self.counts["sets_repeated"] += 1
+            return False
+        if not self.room.for_set(received, held):
+            self.counts["sets_without_room"] += 1
+            self.crowded_out = received.author
+            return False
+        return True
 
     def _outbid(self, received: MarkSet, held: MarkSet | None) -> None:
         """Somebody who took us for dead wrote under our name: say what we say again, under a higher epoch."""
@@ -123,20 +223,29 @@ class MapReplica:
             [sets[name] for name in sorted(sets) if name != received.author and sets[name].kinds],
             self._now_ns,
         )
+        self.room.take(received, sets.get(received.author))
         sets[received.author] = received
         self.ledger.record(received.author, tile, received.epoch, received.seq)
         self.counts["sets_merged"] += 1
-        end_ns = first_end_ns(received, self._now_ns)
-        if end_ns is not None:
-            heapq.heappush(self._ends, (end_ns, tile))
+        if received.untils_ns:
+            self._note_end(received)
         return self._apply(tile, changed, measured)
 
+    def _note_end(self, received: MarkSet) -> None:
+        end_ns = first_end_ns(received, self._now_ns)
+        if end_ns is not None:
+            heapq.heappush(self._ends, (end_ns, received.tile))
+
     def _apply(self, tile: int, changed: Statements, measured: bool) -> NDArray[np.uint32]:
-        count = len(changed.cells)
-        if not count:
+        if not len(changed.cells):
             return _NO_CELLS
-        self.counts["marks_merged"] += count
-        cells = grid_cells(self.grid, tile, changed.cells)
+        return self._perform(grid_cells(self.grid, tile, changed.cells), changed, measured)
+
+    def _perform(self, cells: NDArray[np.uint32], changed: Winners, measured: bool) -> NDArray[np.uint32]:
+        """Tell the cost map who wins now."""
+        if not len(cells):
+            return cells
+        self.counts["marks_merged"] += len(cells)
         if self._cost_map is not None:
             self._cost_map.apply(cells, changed.kinds, changed.paces)
         if measured:
@@ -275,8 +384,14 @@ class MapReplica:
     def compare(self, theirs: Held) -> list[tuple[str, list[int]]]:
         """(author, tiles) to ask for: what they hold newer than we."""
         missing = self.ledger.missing(theirs)
-        inside = ((author, [t for t in tiles if t < self.grid.tiles]) for author, tiles in missing)
+        inside = ((author, [t for t in tiles if self._wants(author, t)]) for author, tiles in missing)
         return [(author, tiles) for author, tiles in inside if tiles]
+
+    def _wants(self, author: str, tile: int) -> bool:
+        """Not what lies outside, nor what there would be no room for: it would be asked for again and again."""
+        if tile >= self.grid.tiles:
+            return False
+        return not self.room.full_for(author) or author in self._tiles.get(tile, {})
 
     def ahead_of(self, theirs: Held, authors: list[str]) -> list[MarkSet]:
         """The sets of these authors that we hold newer than they."""
@@ -312,4 +427,6 @@ class MapReplica:
         return [sets[name] for name in sorted(sets)]
 
 
+_WORTH_ARRAYS = 8
+"""Fewer sets are merged one by one: arrays cost more to set up than to look through."""
 _NO_CELLS: NDArray[np.uint32] = np.empty(0, np.uint32)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -19,6 +19,15 @@ class Heard:
     topic: Topic
     fields: Mapping[str, str]
     message: Message
+
+
+@dataclass(frozen=True, slots=True)
+class HeardMany:
+    """Samples that waited together on a topic subscribed to with `together`, in the order of their coming: (end of
+    the key from the topic's first field on, message)."""
+
+    topic: Topic
+    samples: Sequence[tuple[str, Message]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +100,7 @@ class WorkDone:
     took_ns: int
 
 
-Event = Heard | Asked | Replied | AskEnded | Appeared | Disappeared | LinkChanged | WorkDone
+Event = Heard | HeardMany | Asked | Replied | AskEnded | Appeared | Disappeared | LinkChanged | WorkDone
 Post = Callable[[Event], None]
 
 
@@ -116,8 +125,11 @@ class Bus(Protocol):
         """Put a message. Dropped, never waited for, where a link is congested."""
         ...
 
-    def subscribe(self, topic: Topic, post: Post, **fields: str | int) -> None:
-        """Post `Heard` for every sample; what does not parse is counted, logged and dropped."""
+    def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
+        """Post `Heard` for every sample; what does not parse is counted, logged and dropped.
+
+        together  post `HeardMany` of all samples that wait, for a topic of many small messages
+        """
         ...
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:

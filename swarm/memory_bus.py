@@ -17,6 +17,7 @@ from swarm.bus import (
     Disappeared,
     Event,
     Heard,
+    HeardMany,
     LinkChanged,
     Post,
 )
@@ -168,6 +169,17 @@ def _interest(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], pos
     return Interest(bus, {name: chunk for name, chunk in every.items() if chunk != "*"}, post)
 
 
+def _as_many(post: Post) -> Post:
+    """What arrives at one instant here arrives one by one: each sample by itself makes a `HeardMany`."""
+
+    def together(event: Event) -> None:
+        if isinstance(event, Heard):
+            event = HeardMany(event.topic, [(event.topic.key.format(**event.fields), event.message)])
+        post(event)
+
+    return together
+
+
 def _meet(narrow: Mapping[str, str], fields: Mapping[str, str]) -> bool:
     for name, chunk in narrow.items():
         other = fields[name]
@@ -205,8 +217,8 @@ class MemoryBus:
             for when_ns in network.arrivals_ns(self, interest.bus, topic.name):
                 network.scheduler.at(when_ns, _Arrival(self, interest, sample))
 
-    def subscribe(self, topic: Topic, post: Post, **fields: str | int) -> None:
-        interest = _interest(self, topic, fields, post)
+    def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
+        interest = _interest(self, topic, fields, _as_many(post) if together else post)
         index = self.network.subscriptions.setdefault((self.namespace, topic.name), _Index())
         index.add(interest, topic)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from swarm.bus import AskEnded, Post, Replied
-from swarm.codec import decode, encode
+from swarm.codec import decode_either, encode
 from swarm.messages import Message
 from swarm.topics import Topic
 
@@ -57,7 +57,8 @@ class MemoryAnswerer:
             return
         bus.counts["messages_out"] += 1
         payload = encode(message)
-        reply = Replied(asking.tag, asking.topic, named, decode(payload, asking.topic.message))
+        parsed = decode_either(payload, asking.topic.message, asking.topic.bulk)
+        reply = Replied(asking.tag, asking.topic, named, parsed)
 
         def arrive() -> None:
             if not asking.over:

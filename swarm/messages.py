@@ -25,15 +25,25 @@ from swarm.fields import (
 )
 from swarm.fields import column as column
 from swarm.fields import pack_column as pack_column
-from swarm.grid import TILE_CELLS, GridSpec
+from swarm.grid import GridSpec
+from swarm.statements import FOREVER as FOREVER
+from swarm.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
+from swarm.statements import TILE_AREA as TILE_AREA
+from swarm.statements import MarkKind as MarkKind
+from swarm.statements import check_lengths, check_statements, faulty_sets
 from swarm.stats import TOP_BUCKET, ZERO_BUCKET
 
 WIRE_VERSION = 2
-TILE_AREA = TILE_CELLS * TILE_CELLS
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema"):
     """Base of all messages. Unknown fields are ignored, so that a newer sender can be understood."""
+
+    def check(self) -> None:
+        """Raise ValueError where a decoded message breaks its rules: the door asks.
+
+        Most types are checked when they are made, by `__post_init__`; those that are made by the thousand, of what
+        was checked already, only at the door."""
 
 
 def schema_of(name: str) -> str:
@@ -66,23 +76,6 @@ class Nothing(Message, frozen=True, kw_only=True, tag=schema_of("nothing")):
 # --- the shared map -----------------------------------------------------------------------------------------
 
 
-STAMP_LIMIT_NS = 1 << 62
-"""Marks stamped from here on (year 2116) are refused by everybody alike, so that there is always a newer stamp."""
-
-
-FOREVER = (1 << 63) - 1
-"""The end of a mark that does not end by itself."""
-
-
-class MarkKind(enum.IntEnum):
-    PACE = 0
-    """The cell can be driven at this pace."""
-    LETHAL = 1
-    """The cell must not be entered."""
-    CLEAR = 2
-    """The cell is as the prior map says: undoes an older mark."""
-
-
 class MarkSet(Message, frozen=True, kw_only=True, tag=schema_of("marks")):
     """All that one author says about one tile. Replaces the author's set with a lower (epoch, seq).
 
@@ -104,58 +97,77 @@ class MarkSet(Message, frozen=True, kw_only=True, tag=schema_of("marks")):
     stamps_ns: bytes
     untils_ns: bytes = b""
 
-    def __post_init__(self) -> None:
-        check_id("author", self.author)
-        check_id("group", self.group)
-        count = len(self.kinds)
-        check_column("cells", self.cells, 2, count)
-        check_column("paces", self.paces, 4, count)
-        check_column("stamps_ns", self.stamps_ns, 8, count)
-        if self.untils_ns:
-            check_column("untils_ns", self.untils_ns, 8, count)
-        if count:
+    def check(self) -> None:
+        self.check_head()
+        if self.kinds:
             check_statements(self.cells, self.kinds, self.paces, self.stamps_ns)
 
-
-def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes) -> None:
-    """Columns of one length, one or more."""
-    if max(kinds) > MarkKind.CLEAR:
-        raise ValueError(f"kind {max(kinds)} is not in 0..{int(MarkKind.CLEAR)}")
-    if len(kinds) > _FEW:
-        array = column(cells, "<u2")
-        rising = bool((array[1:] > array[:-1]).all())
-        last = int(array[-1])
-        times = column(stamps_ns, "<i8")
-        oldest_ns, newest_ns = int(times.min()), int(times.max())
-        told = column(paces, "<f4")[column(kinds, "<u1") == MarkKind.PACE]
-        possible = bool(((told > 0) & (told < math.inf)).all())
-    else:
-        listed = memoryview(cells).cast("H").tolist()
-        rising = sorted(set(listed)) == listed
-        last = listed[-1]
-        stamps = memoryview(stamps_ns).cast("q").tolist()
-        oldest_ns, newest_ns = min(stamps), max(stamps)
-        said = zip(memoryview(paces).cast("f").tolist(), kinds, strict=True)
-        possible = all(kind != MarkKind.PACE or 0 < pace < math.inf for pace, kind in said)
-    if not rising or last >= TILE_AREA:
-        raise ValueError(f"cells must increase strictly below {TILE_AREA}")
-    if not possible:
-        raise ValueError("the pace of a PACE mark must be positive and finite")
-    if oldest_ns < 0 or newest_ns >= STAMP_LIMIT_NS:
-        raise ValueError("stamps_ns must not be negative, and below 2**62")
+    def check_head(self) -> None:
+        """All but the rules of the statements themselves, which are cheaper to check of many sets at once."""
+        check_id("author", self.author)
+        check_id("group", self.group)
+        check_lengths(len(self.kinds), self.cells, self.kinds, self.paces, self.stamps_ns, self.untils_ns)
 
 
-_FEW = 100
-"""Up to so many statements, as most sets have, lists are checked several times faster than arrays."""
+class MarkSets(Message, frozen=True, kw_only=True, tag=schema_of("mark-sets")):
+    """Many sets of one author and group, as one reply carries them: columns over the sets, then the statements of
+    all sets, one set after the other.
+
+    tiles      uint32  of each set; none twice
+    epochs     uint64
+    seqs       uint64
+    counts     uint16  statements of each set
+    ending     uint8   1 where a set has `untils_ns`
+    cells      uint16, kinds uint8, paces float32, stamps_ns int64: as in MarkSet
+    untils_ns  int64   of the statements of the sets that have them
+    """
+
+    author: str
+    group: str
+    tiles: bytes
+    epochs: bytes
+    seqs: bytes
+    counts: bytes
+    ending: bytes
+    cells: bytes
+    kinds: bytes
+    paces: bytes
+    stamps_ns: bytes
+    untils_ns: bytes = b""
+
+    def check(self) -> None:
+        check_id("author", self.author)
+        check_id("group", self.group)
+        sets = len(self.ending)
+        for name, width in (("tiles", 4), ("epochs", 8), ("seqs", 8), ("counts", 2)):
+            check_column(name, getattr(self, name), width, sets)
+        counts = column(self.counts, "<u2").astype(np.int64)
+        ending = column(self.ending, "<u1")
+        if (ending > 1).any():
+            raise ValueError(f"ending has a {int(ending.max())}, expected 0 or 1")
+        check_lengths(int(counts.sum()), self.cells, self.kinds, self.paces, self.stamps_ns)
+        check_column("untils_ns", self.untils_ns, 8, int(counts[ending == 1].sum()))
+        for name in ("epochs", "seqs"):
+            if (column(getattr(self, name), "<u8") >= 1 << 62).any():
+                raise ValueError(f"{name} must be below 2**62")
+        if len(np.unique(column(self.tiles, "<u4"))) < sets:
+            raise ValueError("tiles names a tile twice")
+        faulty = faulty_sets(counts, self.cells, self.kinds, self.paces, self.stamps_ns)
+        if len(faulty):
+            raise ValueError(f"set {int(faulty[0])} of {sets} breaks a rule of its statements")
 
 
 class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     """Which sets a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
-    rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed."""
+    rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
+
+    whole  false: only tiles that changed lately, told between the whole digests
+    """
 
     author: str
     role: str
     held: dict[str, bytes]
+    whole: bool = True
 
     def __post_init__(self) -> None:
         check_id("author", self.author)
@@ -169,10 +181,14 @@ DIGEST_ROW = np.dtype([("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8")])
 
 
 class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-request")):
-    """Asks authors and the keeper for sets: of these authors and tiles, or of all where a list is empty."""
+    """Asks authors and the keeper for sets: of these authors and tiles, or of all where a list is empty.
+
+    bulk  answers may be MarkSets, under a key with `-` for region and tile
+    """
 
     authors: list[str] = []
     tiles: list[Natural] = []
+    bulk: bool = False
 
 
 # --- the base map -------------------------------------------------------------------------------------------

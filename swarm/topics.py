@@ -21,6 +21,7 @@ from swarm.messages import (
     Followed,
     MarkSet,
     MarksRequest,
+    MarkSets,
     Message,
     Note,
     Nothing,
@@ -50,6 +51,7 @@ class Topic:
     message   what is put, or what a query is answered with
     request   for a queryable: what is asked; None for a topic that is only published
     newest    each value says all there is under its key, so a reader may skip to the newest
+    bulk      for a queryable: what may carry many values in one reply, to those who ask for it so
     buffer    samples that a slow reader keeps; the oldest are dropped first
     """
 
@@ -60,6 +62,7 @@ class Topic:
     rate: str
     request: type[Message] | None = None
     published: bool = True
+    bulk: type[Message] | None = None
     newest: bool = True
     priority: Priority = Priority.DATA
     buffer: int = 1024
@@ -69,7 +72,7 @@ class Topic:
     def __post_init__(self) -> None:
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.key))
         object.__setattr__(self, "_pattern", re.compile(pattern))
-        for message_type in (self.message, self.request):
+        for message_type in (self.message, self.request, self.bulk):
             if message_type is not None:
                 prime(message_type)  # before there are threads to meet it half described
         object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
@@ -126,7 +129,7 @@ RUN = Topic(
 MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", MarkSet,
     "an author's whole set for a tile; the author and the keeper answer for it",
-    "on change, at most 10 Hz a tile", request=MarksRequest, buffer=8192,
+    "on change, at most 10 Hz a tile", request=MarksRequest, bulk=MarkSets, buffer=8192,
 )  # fmt: skip
 DIGEST = Topic(
     "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",

@@ -16,8 +16,16 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Post, Replied
-from swarm.codec import MAX_PAYLOAD_BYTES, decode, decode_parameters, encode, encode_readable
+from swarm.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Post, Replied
+from swarm.codec import (
+    MAX_PAYLOAD_BYTES,
+    decode,
+    decode_either,
+    decode_many,
+    decode_parameters,
+    encode,
+    encode_readable,
+)
 from swarm.config import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
@@ -35,6 +43,8 @@ _LOG_AGAIN_S = 60.0
 _QUERY_BUFFER = 4096
 _TOKEN_BUFFER = 65_536
 _CLOSE_S = 3.0
+_TOGETHER = 1024
+"""At most so many samples in one event, so that a tick is not kept waiting for long."""
 
 
 def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
@@ -139,7 +149,7 @@ class ZenohBus:
             priority=_PRIORITIES[topic.priority],
         )
 
-    def subscribe(self, topic: Topic, post: Post, **fields: str | int) -> None:
+    def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
         def arrive(sample: zenoh.Sample) -> None:
             self._count("messages_in")
             key = str(sample.key_expr)
@@ -151,10 +161,26 @@ class ZenohBus:
                 return
             post(Heard(topic, named, message))
 
+        def arrive_together(samples: list[zenoh.Sample]) -> None:
+            self._count("messages_in", len(samples))
+            keys = [str(sample.key_expr) for sample in samples]
+            decoded = decode_many([sample.payload.to_bytes() for sample in samples], topic.message)
+            heard: list[tuple[str, Message]] = []
+            for key, message in zip(keys, decoded, strict=True):
+                if isinstance(message, ProtocolError):
+                    self._drop(key, message)
+                else:
+                    heard.append((key[len(self._namespace) + 1 :], message))
+            if heard:
+                post(HeardMany(topic, heard))
+
         expression = topic.expression(self._namespace, **fields)
         subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
         self._subscribers.setdefault(expression, []).append(subscriber)
-        self._read(subscriber, arrive, f"sub-{topic.name}")
+        if together:
+            self._read(subscriber, arrive_together, f"sub-{topic.name}", together=True)
+        else:
+            self._read(subscriber, arrive, f"sub-{topic.name}")
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         for subscriber in self._subscribers.pop(topic.expression(self._namespace, **fields), ()):
@@ -213,7 +239,7 @@ class ZenohBus:
                 return
             key = str(reply.ok.key_expr)
             try:
-                message = decode(reply.ok.payload.to_bytes(), topic.message)
+                message = decode_either(reply.ok.payload.to_bytes(), topic.message, topic.bulk)
                 named = self._fields(topic, key)
             except ProtocolError as error:
                 self._drop(key, error)
@@ -288,15 +314,18 @@ class ZenohBus:
             thread.join(timeout=2.0)
         self._session.close()  # type: ignore[no-untyped-call]
 
-    def _read(self, entity: Any, arrive: Callable[[Any], None], name: str) -> None:
-        """Read an entity's channel on a thread of its own until it is undeclared."""
+    def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, *, together: bool = False) -> None:
+        """Read an entity's channel on a thread of its own until it is undeclared.
+
+        together  hand over lists of all that waits, instead of one item at a time
+        """
         self._entities.append(entity)
         channel = entity.handler  # a thread waiting on the entity itself would keep it from being undeclared
 
         def run() -> None:
             try:
                 while True:
-                    arrive(channel.recv())
+                    arrive(_waiting(channel) if together else channel.recv())
             except zenoh.ZError:
                 if not self._closed and entity in self._entities:
                     log.exception("the %s channel ended by itself", name)
@@ -311,10 +340,10 @@ class ZenohBus:
             raise ProtocolError(f"{key} is not a key of topic {topic.name} ({topic.key})")
         return fields
 
-    def _count(self, name: str) -> None:
-        """Several of zenoh's threads count: adding one is not atomic."""
+    def _count(self, name: str, by: int = 1) -> None:
+        """Several of zenoh's threads count: adding is not atomic."""
         with self._counting:
-            self._counts[name] += 1
+            self._counts[name] += by
 
     def _drop(self, key: str, error: ProtocolError) -> None:
         self._count("payloads_dropped")
@@ -324,6 +353,15 @@ class ZenohBus:
                 self._logged_s.clear()
             self._logged_s[key] = now_s
             log.warning("dropped a payload on %s: %s", key, error)
+
+
+def _waiting(channel: Any) -> list[Any]:
+    """All that waits in a channel, one item at least. What is there already is taken without letting go of the
+    interpreter: a hand-over to another busy thread for each item would cost hundreds of times more."""
+    items = [channel.recv()]
+    while len(items) < _TOGETHER and (item := channel.try_recv()) is not None:
+        items.append(item)
+    return items
 
 
 def _peer(key: str) -> Peer:

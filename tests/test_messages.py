@@ -38,7 +38,7 @@ TYPES = tuple(BY_TYPE)
 
 
 def test_every_message_of_every_topic_has_an_example_and_a_strategy():
-    on_the_wire = {topic.message for topic in TOPICS} | {topic.request for topic in TOPICS if topic.request}
+    on_the_wire = {kind for topic in TOPICS for kind in (topic.message, topic.request, topic.bulk) if kind}
     assert on_the_wire <= set(TYPES)
     assert set(TYPES) == set(MESSAGES) == set(Message.__subclasses__())
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 from hypothesis import strategies as st
 
+from shared_map.bulk import packed
 from swarm.fields import pack_column
 from swarm.messages import (
     DIGEST_ROW,
@@ -23,6 +25,7 @@ from swarm.messages import (
     Followed,
     MarkKind,
     MarkSet,
+    MarkSets,
     MarksRequest,
     Message,
     Note,
@@ -83,6 +86,18 @@ def mark_sets(draw: st.DrawFn) -> MarkSet:
 
 
 @st.composite
+def bulks(draw: st.DrawFn) -> MarkSets:
+    sets = draw(st.lists(mark_sets(), max_size=3))
+    [message] = packed(
+        msgspec.structs.replace(each, author="a", group="g", tile=tile) for tile, each in enumerate([*sets, EMPTY])
+    )
+    return message
+
+
+EMPTY = MarkSet(author="a", group="g", tile=0, epoch=0, seq=0, cells=b"", kinds=b"", paces=b"", stamps_ns=b"")
+
+
+@st.composite
 def digests(draw: st.DrawFn) -> Digest:
     rows = st.lists(st.tuples(st.integers(0, (1 << 32) - 1), naturals, naturals), max_size=5)
     held = draw(st.dictionaries(ids, rows, max_size=3))
@@ -138,6 +153,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     ),
     Nothing: st.just(Nothing()),
     MarkSet: mark_sets(),
+    MarkSets: bulks(),
     Digest: digests(),
     MarksRequest: st.builds(MarksRequest, authors=st.lists(ids, max_size=3), tiles=st.lists(naturals, max_size=3)),
     BaseMap: st.builds(
@@ -202,6 +218,13 @@ EXAMPLES: tuple[Message, ...] = (
     MarkSet(
         author="a0.7", group="all", tile=3, epoch=7, seq=2, cells=pack_column([5, 1023], "<u2"),
         kinds=bytes([0, 1]), paces=pack_column([0.5, math.inf], "<f4"), stamps_ns=pack_column([10, 20], "<i8"),
+    ),
+    MarkSets(
+        author="a0.7", group="all", tiles=pack_column([3, 9], "<u4"), epochs=pack_column([7, 7], "<u8"),
+        seqs=pack_column([2, 0], "<u8"), counts=pack_column([2, 1], "<u2"), ending=bytes([0, 1]),
+        cells=pack_column([5, 1023, 0], "<u2"), kinds=bytes([0, 1, 1]),
+        paces=pack_column([0.5, math.inf, 0.0], "<f4"), stamps_ns=pack_column([10, 20, 30], "<i8"),
+        untils_ns=pack_column([40], "<i8"),
     ),
     Digest(author="a0.7", role="agent", held={"a0.7": np.array([(3, 7, 2)], DIGEST_ROW).tobytes()}),
     MarksRequest(authors=["a0.7"], tiles=[3]),
