@@ -7,6 +7,11 @@ from numba import njit
 
 from planner_service.kernels.rules import INF, NONE, RULE_OCTILE, SQRT2, SQRT2_EXACT
 
+_LANES = 4
+"""Routes that are walked side by side. A step waits for the one before it, but not for another route's."""
+_STRETCH = 32
+"""Steps between two looks at whether a lane's route has ended; a route that has stands still meanwhile."""
+
 
 @njit(cache=True, nogil=True)
 def step_offsets(stride):
@@ -38,6 +43,31 @@ def relabel(weight, parent, stride, rule, root, cost):
 
 
 @njit(cache=True, nogil=True)
+def _walk_on(weight, parent, offsets, lengths, cells, sums, trails, fill, steps):
+    """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
+    a, b, c, d = np.uint64(cells[0]), np.uint64(cells[1]), np.uint64(cells[2]), np.uint64(cells[3])
+    sum_a, sum_b, sum_c, sum_d = sums[0], sums[1], sums[2], sums[3]
+    trail_a, trail_b, trail_c, trail_d = trails[0], trails[1], trails[2], trails[3]
+    at_a, at_b, at_c, at_d = np.uint64(fill[0]), np.uint64(fill[1]), np.uint64(fill[2]), np.uint64(fill[3])
+    for i in range(np.uint64(steps)):
+        code_a, code_b, code_c, code_d = parent[a], parent[b], parent[c], parent[d]
+        trail_a[at_a + i] = code_a
+        trail_b[at_b + i] = code_b
+        trail_c[at_c + i] = code_c
+        trail_d[at_d + i] = code_d
+        a += offsets[code_a]
+        b += offsets[code_b]
+        c += offsets[code_c]
+        d += offsets[code_d]
+        sum_a += np.float64(weight[a]) * lengths[code_a]
+        sum_b += np.float64(weight[b]) * lengths[code_b]
+        sum_c += np.float64(weight[c]) * lengths[code_c]
+        sum_d += np.float64(weight[d]) * lengths[code_d]
+    cells[0], cells[1], cells[2], cells[3] = np.int64(a), np.int64(b), np.int64(c), np.int64(d)
+    sums[0], sums[1], sums[2], sums[3] = sum_a, sum_b, sum_c, sum_d
+
+
+@njit(cache=True, nogil=True)
 def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
     """The routes from `starts` (padded cells that have a way), at most `max_steps` long where that is positive.
 
@@ -46,43 +76,82 @@ def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
     (float64, s, recomputed along the cells), diagonals (int64, how many steps were diagonal), last (int64, the
     last cell). A cycle or a hole would be a bug: ends is -1 there.
     """
-    offsets = step_offsets(stride)
+    # Beyond the codes of directions, NONE: to stay, at no cost. Unsigned, as sums of a cell and a signed offset
+    # would be floating-point numbers; they wrap.
+    offsets = np.zeros(256, np.uint64)
+    lengths = np.zeros(256, np.float64)
+    near = step_offsets(stride)
+    for k in range(8):
+        offsets[k] = np.uint64(near[k])
+        lengths[k] = SQRT2_EXACT if rule == RULE_OCTILE and k & 1 else 1.0
     count = starts.size
-    capacity = 1024
-    directions = np.empty(capacity, np.uint8)
     ends = np.empty(count, np.int64)
     driven = np.empty(count, np.float64)
     diagonals = np.empty(count, np.int64)
     last = np.empty(count, np.int64)
-    n = 0
     most = limit if max_steps <= 0 else min(limit, max_steps)
-    for r in range(count):
-        v = starts[r]
-        straight_sum = 0.0
-        diagonal_sum = 0.0
-        slants = 0
+
+    # Each lane has a share of the routes, and its trail holds them in order.
+    capacity = 1024
+    trails = np.empty((_LANES, capacity), np.uint8)
+    route = np.empty(_LANES, np.int64)
+    until = np.empty(_LANES, np.int64)
+    begun = np.zeros(_LANES, np.int64)
+    fill = np.zeros(_LANES, np.int64)
+    cells = np.full(_LANES, root, np.int64)
+    sums = np.zeros(_LANES, np.float64)
+    for j in range(_LANES):
+        route[j] = count * j // _LANES
+        until[j] = count * (j + 1) // _LANES
+        if route[j] < until[j]:
+            cells[j] = starts[route[j]]
+    while True:
         steps = 0
-        while v != root and steps < most:
-            if n == capacity:
-                more = np.empty(2 * capacity, np.uint8)
-                more[:n] = directions
-                directions = more
-                capacity *= 2
-            k = parent[v]
-            if k == NONE:
-                break
-            directions[n] = k
-            n += 1
-            steps += 1
-            v += offsets[k]
-            w = np.float64(weight[v])
-            odd = k & 1
-            slants += odd
-            diagonal_sum += w if odd else 0.0
-            straight_sum += 0.0 if odd else w
-        broken = v != root and (steps == limit or parent[v] == NONE)
-        ends[r] = -1 if broken else n
-        driven[r] = straight_sum + diagonal_sum * (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
-        diagonals[r] = slants
-        last[r] = v
-    return directions[:n], ends, driven, diagonals, last
+        for j in range(_LANES):
+            if route[j] < until[j]:
+                left = min(_STRETCH, most - (fill[j] - begun[j]))
+                steps = left if steps == 0 else min(steps, left)
+        if steps == 0:
+            break
+        longest = max(max(fill[0], fill[1]), max(fill[2], fill[3]))
+        if longest + steps > capacity:
+            more = np.empty((_LANES, 2 * capacity), np.uint8)
+            more[:, :capacity] = trails
+            trails = more
+            capacity *= 2
+        _walk_on(weight, parent, offsets, lengths, cells, sums, trails, fill, steps)
+        for j in range(_LANES):
+            r = route[j]
+            if r == until[j]:
+                continue
+            end = fill[j] + steps
+            while end > begun[j] and trails[j, end - 1] == NONE:
+                end -= 1
+            fill[j] = end
+            v = cells[j]
+            if parent[v] != NONE and end - begun[j] < most:
+                continue
+            broken = v != root and (parent[v] == NONE or end - begun[j] == limit)
+            ends[r] = -1 if broken else end
+            driven[r] = sums[j]
+            last[r] = v
+            route[j] = r + 1
+            begun[j] = end
+            sums[j] = 0.0
+            cells[j] = starts[r + 1] if r + 1 < until[j] else root
+
+    directions = np.empty(fill.sum(), np.uint8)
+    n = 0
+    for j in range(_LANES):
+        directions[n : n + fill[j]] = trails[j, : fill[j]]
+        for r in range(count * j // _LANES, until[j]):
+            ends[r] += n if ends[r] >= 0 else 0
+        n += fill[j]
+    n = 0
+    for r in range(count):
+        odd = 0
+        for i in range(n, ends[r]):
+            odd += directions[i] & 1
+        diagonals[r] = odd
+        n = max(n, ends[r])
+    return directions, ends, driven, diagonals, last
