@@ -251,6 +251,11 @@ _mount(
 )
 _mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swarm terrain --help`.")
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
+_mount(
+    "deploy",
+    "launch_scripts.commands.deploy",
+    "Certificates and zenohd, for several machines. See `swarm deploy --help`.",
+)
 
 
 def main() -> int:

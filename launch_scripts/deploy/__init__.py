@@ -1,0 +1,1 @@
+"""What a swarm on several machines needs: certificates, and a configuration for zenohd."""

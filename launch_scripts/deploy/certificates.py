@@ -1,0 +1,148 @@
+"""A certificate authority of the swarm's own, and a certificate per machine or process, for mutual TLS."""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from swarm.errors import ConfigError, StoreError
+from swarm.fields import check_id
+
+CA = "ca"
+_CA_DAYS = 3650
+_CLOCKS_DIFFER = datetime.timedelta(hours=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+
+def authority(folder: Path) -> Authority:
+    """The authority whose `ca.pem` and `ca.key` lie in the folder; made there if there is none."""
+    path = folder / f"{CA}.pem"
+    if path.exists():
+        return _read_authority(folder)
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "swarm authority")])
+    usage = x509.KeyUsage(
+        digital_signature=False,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=True,
+        crl_sign=True,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    certificate = (
+        _begun(name, name, key.public_key(), _CA_DAYS)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(usage, critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    made = Authority(certificate, key)
+    _write(folder, CA, certificate, key)
+    return made
+
+
+def issue(folder: Path, name: str, hosts: Sequence[str], days: int, *, renew: bool = False) -> Path:
+    """Write `NAME.pem` and `NAME.key`, which nobody else may read. Returns the certificate's path.
+
+    name   what access control knows its bearer by (the common name): a machine, or an agent such as a0
+    hosts  names and addresses under which others connect to it; none for those that only connect
+    Raises ConfigError on a name that cannot be one, StoreError where files cannot be written or are there already.
+    """
+    try:
+        check_id("name", name)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    if name == CA:
+        raise ConfigError(f"the name {CA} is the authority's own")
+    path = folder / f"{name}.pem"
+    if path.exists() and not renew:
+        raise StoreError(f"{path} is there already; --renew replaces it")
+    signer = authority(folder)
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    usages = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
+    public_key = signer.key.public_key()
+    certificate = (
+        _begun(subject, signer.certificate.subject, key.public_key(), days)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(usages, critical=False)
+        .add_extension(
+            x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]]), critical=False
+        )
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(public_key), critical=False)
+        .sign(signer.key, hashes.SHA256())
+    )
+    _write(folder, name, certificate, key)
+    return path
+
+
+def _begun(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int
+) -> x509.CertificateBuilder:
+    now = datetime.datetime.now(datetime.UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - _CLOCKS_DIFFER)
+        .not_valid_after(now + datetime.timedelta(days=days))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        pass
+    try:
+        return x509.DNSName(host)
+    except ValueError as error:
+        raise ConfigError(f"host {host!r} is neither an address nor a name in ASCII") from error
+
+
+def _read_authority(folder: Path) -> Authority:
+    try:
+        certificate = x509.load_pem_x509_certificate((folder / f"{CA}.pem").read_bytes())
+        key = serialization.load_pem_private_key((folder / f"{CA}.key").read_bytes(), None)
+    except OSError as error:
+        raise StoreError(f"cannot read the authority in {folder}: {error.strerror or error}") from error
+    except (ValueError, TypeError) as error:
+        raise StoreError(f"the authority in {folder} is no certificate and key in PEM: {error}") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+        raise StoreError(f"{folder / CA}.key is not the key of {folder / CA}.pem")
+    return Authority(certificate, key)
+
+
+def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
+    """The key first, so that a certificate never lies there without one."""
+    secret = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        partial = folder / f"{name}.key.part"
+        with open(os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+            file.write(secret)
+        partial.rename(folder / f"{name}.key")
+        (folder / f"{name}.pem").write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    except OSError as error:
+        raise StoreError(f"cannot write to {folder}: {error.strerror or error}") from error

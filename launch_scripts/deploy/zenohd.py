@@ -1,0 +1,115 @@
+"""A configuration for zenohd: router of a swarm, its marks in zenohd's own storages, who may do what."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from swarm.codec import MAX_PAYLOAD_BYTES
+from swarm.config import NetworkConfig
+from swarm.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, MARKS, NOTE, STATS
+
+PUTS = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
+READS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
+
+
+def zenohd_config(
+    network: NetworkConfig,
+    *,
+    trusted: Sequence[str] = (),
+    agents: Sequence[str] = (),
+    plugins: str | None = None,
+    volume: str = "memory",
+) -> dict[str, Any]:
+    """What `zenohd -c FILE` reads, as JSON.
+
+    trusted  certificate names that may do everything in the namespace: keepers, planners, routers
+    agents   certificate names of agents, each named as its agent: may write only what is their own
+    plugins  folder of `libzenoh_plugin_storage_manager.so`; without one marks are passed on, not stored
+    volume   of the storage: "memory", or one whose backend is installed
+    With names given, whoever has another one, or none, may do nothing. Without, all that connect may do all.
+    """
+    config: dict[str, Any] = {
+        "mode": "router",
+        "listen": {"endpoints": list(network.listen), "exit_on_failure": True},
+        "connect": {"endpoints": list(network.peers), "exit_on_failure": False},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {
+            "unicast": {"max_sessions": 8192, "accept_pending": 2048},
+            "link": {
+                "tx": {"lease": int(network.lease_s * 1000), "keep_alive": 4},
+                "rx": {"max_message_size": MAX_PAYLOAD_BYTES + (1 << 16)},
+            },
+            "shared_memory": {"enabled": False},
+        },
+        # A storage keeps what has the newest stamp, so all values need one: the router gives it where a session
+        # does not. Which set is the newer is told by (epoch, seq) inside; the stamps need not agree with it.
+        "timestamping": {"enabled": {"router": True, "peer": False, "client": False}},
+    }
+    if network.tls is not None:
+        config["transport"]["link"]["tls"] = {
+            "root_ca_certificate": network.tls.ca,
+            "enable_mtls": True,
+            "listen_certificate": network.tls.certificate,
+            "listen_private_key": network.tls.key,
+            "connect_certificate": network.tls.certificate,
+            "connect_private_key": network.tls.key,
+        }
+    if plugins is not None:
+        config["plugins_loading"] = {"enabled": True, "search_dirs": [plugins]}
+        storage = {"key_expr": MARKS.expression(network.namespace), "volume": volume}
+        config["plugins"] = {"storage_manager": {"__required__": True, "storages": {"marks": storage}}}
+    if trusted or agents:
+        config["access_control"] = access_control(network.namespace, trusted, agents)
+    return config
+
+
+def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]) -> dict[str, Any]:
+    """Zenoh's rules, by the common name of the certificate at the other end of a link.
+
+    An agent hears everything and writes under its own name only: authors are called `ID.INCARNATION`.
+    """
+    whole = [f"{namespace}/**"]
+    rules = [_rule("all", (*PUTS, *READS), whole), _rule("hear", READS, whole)]
+    # What others said must reach those that may hear it: the way out to them is a matter of its own.
+    rules.append(_rule("told", PUTS, whole, flows=["egress"]))
+    rules.append(_rule("asked", READS, whole, flows=["egress"]))
+    policies = [{"rules": ["all"], "subjects": ["trusted"]}] if trusted else []
+    subjects = [{"id": "trusted", "cert_common_names": list(trusted)}] if trusted else []
+    for agent in agents:
+        rules.append(_rule(f"own-{agent}", PUTS, [f"{namespace}/{key}" for key in own_keys(agent)]))
+        subjects.append({"id": agent, "cert_common_names": [agent]})
+        policies.append({"rules": ["hear", "told", "asked", f"own-{agent}"], "subjects": [agent]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def own_keys(agent: str) -> list[str]:
+    """What an agent may write, below the namespace."""
+    author = f"{agent}.$*"
+    return [
+        MARKS.key.format(region="*", tile="*", author=author),
+        DIGEST.key.format(author=author),
+        FLEET.key.format(region="*", author=author),
+        CLAIMS.key.format(**dict.fromkeys(CLAIMS.fields, "*") | {"agent": agent}),
+        FOLLOWED.key.format(agent=agent, vehicle="*"),
+        STATS.key.format(role="agent", id=agent),
+        NOTE.key.format(role="agent", id=agent),
+        f"run/agent/{agent}",
+        ALIVE_KEY.format(role="agent", id=agent, incarnation="*"),
+    ]
+
+
+def _rule(id: str, messages: Sequence[str], keys: list[str], flows: Sequence[str] = ("ingress", "egress")) -> Any:
+    return {
+        "id": id,
+        "permission": "allow",
+        "flows": list(flows),
+        "messages": list(messages),
+        "key_exprs": keys,
+    }
