@@ -1,6 +1,6 @@
-"""Ever coarser levels of a terrain, each half as fine: for a monitor that looks from afar and for coarse planning.
+"""A terrain at half its resolution, and half of that again: to be looked at from afar.
 
-Thin walls survive: beside the cheapest pace of a block its costliest is kept, which is lethal if any cell in it is.
+Thin things survive: a wall or a road one cell wide is in every level, however small its share of the cell there.
 """
 
 from __future__ import annotations
@@ -11,43 +11,58 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.layers import TerrainClass
 from shared_map.terrain import Terrain
 from swarm.grid import GridSpec
-
-LEVEL_TILE = 256
-"""Side of a tile of a level, in cells."""
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A terrain at 1 / 2**level of its resolution; a block cut off at the border counts what is there.
+    """A terrain at 1 / `side` of its resolution; a block cut off at the border counts what is there.
 
-    cheapest, costliest  float32  least and greatest pace of the cells below; a lower and an upper bound
-    elevation_m          float32  mean height of those that have one
-    photo                uint8    mean colour
+    side          cells of the terrain along one cell of this level, a power of two
+    elevation_m   float32  mean of the heights that are known; NaN where none is
+    photo         uint8    mean colour
+    classes       uint8    the commonest class; road where there is any road
+    pace_s_per_m  float32  mean of the cells that can be driven; inf where none can
+    lethal_share  float32  0 to 1; of the cells below
     """
 
-    level: int
+    side: int
     grid: GridSpec
-    cheapest: Floats
-    costliest: Floats
     elevation_m: Floats
     photo: Bytes
-
-    def tile(self, row: int, col: int) -> tuple[slice, slice]:
-        """Where a tile lies in the arrays of this level."""
-        rows = slice(row * LEVEL_TILE, min((row + 1) * LEVEL_TILE, self.grid.rows))
-        return rows, slice(col * LEVEL_TILE, min((col + 1) * LEVEL_TILE, self.grid.cols))
+    classes: Bytes
+    pace_s_per_m: Floats
+    lethal_share: Floats
 
 
-def pyramid(terrain: Terrain, smallest: int = LEVEL_TILE) -> list[Level]:
-    """Levels from the terrain itself up to the first that is no larger than `smallest` cells on a side."""
-    grid = terrain.grid
-    levels = [Level(0, grid, terrain.pace_s_per_m, terrain.pace_s_per_m, terrain.elevation_m, terrain.photo)]
-    while max(levels[-1].grid.rows, levels[-1].grid.cols) > smallest:
-        levels.append(_coarser(levels[-1]))
-    return levels
+def level_of(terrain: Terrain, most_cells: int) -> Level:
+    """The finest level that has at most so many cells."""
+    lethal = np.isinf(terrain.pace_s_per_m)
+    level = Level(
+        1,
+        terrain.grid,
+        terrain.elevation_m,
+        terrain.photo,
+        terrain.classes,
+        terrain.pace_s_per_m,
+        lethal.astype(np.float32),
+    )
+    while level.grid.cells > most_cells:
+        level = _coarser(level)
+    return level
+
+
+def any_in_blocks(cells: Bools, side: int) -> Bools:
+    """Which blocks of `side` x `side` cells hold any: what marks on single cells look like from afar."""
+    if side == 1:
+        return cells
+    rows, cols = cells.shape
+    padded = np.pad(cells, ((0, -rows % side), (0, -cols % side)))
+    blocks = padded.reshape(-(-rows // side), side, -(-cols // side), side)
+    return np.asarray(blocks.any(axis=(1, 3)), np.bool_)
 
 
 def _coarser(fine: Level) -> Level:
@@ -55,20 +70,17 @@ def _coarser(fine: Level) -> Level:
     half = GridSpec(
         -(-grid.rows // 2), -(-grid.cols // 2), 2 * grid.resolution_m, grid.west_m, grid.north_m, grid.crs
     )
-    corners = _corners(fine.elevation_m)
-    known = sum((~np.isnan(corner)).astype(np.float32) for corner in corners)
-    total = sum(np.nan_to_num(corner) for corner in corners)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        height = np.asarray(total / known, np.float32)
-    colours = _corners(fine.photo)
-    mean = sum(corner.astype(np.uint16) for corner in colours)
+    shares = [np.float32(1) - corner for corner in _corners(fine.lethal_share)]
+    driven = np.asarray(sum(shares), np.float32)
+    colours = sum(corner.astype(np.uint16) for corner in _corners(fine.photo))
     return Level(
-        fine.level + 1,
+        2 * fine.side,
         half,
-        np.minimum.reduce(_corners(fine.cheapest)),
-        np.maximum.reduce(_corners(fine.costliest)),
-        height,
-        np.asarray((mean + 2) // 4, np.uint8),
+        _mean(_corners(fine.elevation_m), np.float32(np.nan)),
+        np.asarray((colours + 2) // 4, np.uint8),
+        _commonest(_corners(fine.classes)),
+        _mean(_corners(fine.pace_s_per_m), np.float32(np.inf), shares),
+        np.float32(1) - driven / np.float32(4),
     )
 
 
@@ -78,3 +90,25 @@ def _corners(values: NDArray[Any]) -> list[NDArray[Any]]:
     pads = [(0, rows % 2), (0, cols % 2)] + [(0, 0)] * (values.ndim - 2)
     even = np.pad(values, pads, mode="edge") if rows % 2 or cols % 2 else values
     return [even[0::2, 0::2], even[0::2, 1::2], even[1::2, 0::2], even[1::2, 1::2]]
+
+
+def _mean(corners: list[Floats], without: np.float32, weights: list[Floats] | None = None) -> Floats:
+    """Of the finite ones, weighted; `without` where there is none."""
+    total, weight = (np.zeros(corners[0].shape, np.float32) for _ in range(2))
+    for number, corner in enumerate(corners):
+        share = np.isfinite(corner).astype(np.float32)
+        if weights is not None:
+            share *= weights[number]
+        total += np.where(share > 0, corner, np.float32(0)) * share
+        weight += share
+    mean = np.full_like(total, without)
+    np.divide(total, weight, out=mean, where=weight > 0)
+    return mean
+
+
+def _commonest(corners: list[Bytes]) -> Bytes:
+    """Of four classes: one that occurs twice, else the first; road beats all."""
+    a, b, c, d = corners
+    common = np.where((b == c) | (b == d), b, np.where(c == d, c, a))
+    road = np.uint8(TerrainClass.ROAD)
+    return np.where((a == road) | (b == road) | (c == road) | (d == road), road, common)

@@ -65,12 +65,24 @@ def test_the_corners_of_the_ground_are_the_middles_of_the_corner_cells() -> None
 def test_a_huge_terrain_is_thinned_out_and_a_small_one_is_not() -> None:
     assert Ground(hill(100, 100)).texel == 1
     ground = Ground(hill(2100, 2100))
-    assert ground.texel == 3
+    assert ground.texel == 4
     assert sum(len(tile.vertices) for tile in ground.mesh_tiles()) < 150_000
     texture = ground.texture(
         ground.tile_window(0), np.ones((2100, 2100), np.float32), np.ones((2100, 2100), np.float32)
     )
     assert texture.shape[0] <= 70
+
+
+def test_a_mark_on_one_cell_shows_however_far_one_looks_from() -> None:
+    terrain = hill(2100, 2100)
+    ground, pace = Ground(terrain), np.array(terrain.pace_s_per_m)
+    pace[130, 70] = np.inf
+    (tile,) = ground.tiles_touching(Window(130, 70, 131, 71))
+    window = ground.tile_window(tile)
+    marked = ground.texture(window, pace, terrain.pace_s_per_m)
+    plain = ground.texture(window, terrain.pace_s_per_m, terrain.pace_s_per_m)
+    rows, cols = np.nonzero((marked != plain).any(axis=2))
+    assert (rows.tolist(), cols.tolist()) == ([(130 - window.row0) // 4], [(70 - window.col0) // 4])
 
 
 def test_things_stand_on_the_ground_between_cells_too() -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.report.observed import VehicleNow
 from launch_scripts.report.relief import hillshade
+from shared_map.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain import Terrain
 from swarm.grid import GridSpec, Window
 from swarm.messages import VehicleState
@@ -68,11 +69,17 @@ class Points:
 
 
 class Ground:
-    """The terrain as the view has it."""
+    """The terrain as the view has it: of a large one, the finest level of its pyramid with at most `_MOST_TEXELS`.
+
+    texel      cells of the terrain along one pixel of the photo
+    heights_m  float32, of that level, stretched; over the lowest
+    """
 
     def __init__(self, terrain: Terrain) -> None:
         self.grid = terrain.grid
-        heights = np.array(terrain.elevation_m, np.float32)
+        seen = level_of(terrain, _MOST_TEXELS)
+        self._seen, self.texel = seen.grid, seen.side
+        heights = np.array(seen.elevation_m, np.float32)
         voids = ~np.isfinite(heights)
         lowest = float(heights[~voids].min()) if not voids.all() else 0.0
         heights[voids] = lowest
@@ -83,9 +90,8 @@ class Ground:
         wanted = _RELIEF * max(self.width_m, self.depth_m) / relief_m if relief_m > 0 else 1.0
         self.stretch = min(max(wanted, 1.0), 8.0)
         self.heights_m = heights * np.float32(self.stretch)
-        self.photo = _lit_photo(terrain)
-        self.texel = max(1, math.ceil(math.sqrt(self.grid.cells / _MOST_TEXELS)))
-        self.step = self.texel * max(2, math.ceil(math.sqrt(self.grid.cells / self.texel**2 / _MOST_VERTICES)))
+        self.photo = _lit_photo(seen)
+        self.step = self.texel * max(2, math.ceil(math.sqrt(seen.grid.cells / _MOST_VERTICES)))
         self.tile_cells = max(MESH_TILE * self.texel // self.step, 1) * self.step
         self.tile_cols = -(-self.grid.cols // self.tile_cells)
         self.tile_rows = -(-self.grid.rows // self.tile_cells)
@@ -98,11 +104,11 @@ class Ground:
     def place(self, east_m: Floats, south_m: Floats, above_m: float = 0.0) -> Floats:
         """Points on the ground, lifted by some metres of the view."""
         east_m, south_m = np.asarray(east_m, np.float32), np.asarray(south_m, np.float32)
-        resolution_m = self.grid.resolution_m
-        rows = np.clip(south_m / resolution_m - 0.5, 0, self.grid.rows - 1)
-        cols = np.clip(east_m / resolution_m - 0.5, 0, self.grid.cols - 1)
+        seen = self._seen
+        rows = np.clip(south_m / seen.resolution_m - 0.5, 0, seen.rows - 1)
+        cols = np.clip(east_m / seen.resolution_m - 0.5, 0, seen.cols - 1)
         row0, col0 = rows.astype(np.intp), cols.astype(np.intp)
-        row1, col1 = np.minimum(row0 + 1, self.grid.rows - 1), np.minimum(col0 + 1, self.grid.cols - 1)
+        row1, col1 = np.minimum(row0 + 1, seen.rows - 1), np.minimum(col0 + 1, seen.cols - 1)
         down, right = rows - row0, cols - col0
         h = self.heights_m
         upper = h[row0, col0] * (1 - right) + h[row0, col1] * right
@@ -147,7 +153,9 @@ class Ground:
         cols = _stepped(window.col0, window.col1, self.step, self.tile_cells)
         grid_rows, grid_cols = np.meshgrid(rows, cols, indexing="ij")
         vertices = self.place_cells((grid_rows * self.grid.cols + grid_cols).reshape(-1))
-        height, width = window.row1 - window.row0, window.col1 - window.col0
+        height, width = (
+            -(-side // self.texel) * self.texel for side in (window.row1 - window.row0, window.col1 - window.col0)
+        )
         texcoords = np.stack(
             [(grid_cols - window.col0 + 0.5) / width, (grid_rows - window.row0 + 0.5) / height], axis=-1
         )
@@ -160,16 +168,22 @@ class Ground:
         )
 
     def texture(self, window: Window, pace: Floats, prior: Floats) -> Bytes:
-        """The photo of a window with what the map has learnt laid over: `pace` is believed now, `prior` was."""
+        """The photo of a window with what the map has learnt laid over: `pace` is believed now, `prior` was.
+
+        However many cells a texel shows, a mark on one of them is seen."""
         part = (slice(window.row0, window.row1), slice(window.col0, window.col1))
-        photo: Bytes = self.photo[part].copy()
+        photo: Bytes = self.photo[
+            window.row0 // self.texel : -(-window.row1 // self.texel),
+            window.col0 // self.texel : -(-window.col1 // self.texel),
+        ].copy()
         now, before = pace[part], prior[part]
         lethal = np.isinf(now) & ~np.isinf(before)
         slow, fast = np.isfinite(now) & (now > before), np.isfinite(now) & (now < before)
-        for where, colour, share in ((lethal, LETHAL_MARK, 0.85), (slow, SLOW_MARK, 0.75), (fast, FAST_MARK, 0.75)):
+        for cells, colour, share in ((fast, FAST_MARK, 0.75), (slow, SLOW_MARK, 0.75), (lethal, LETHAL_MARK, 0.85)):
+            where = any_in_blocks(cells, self.texel)
             blend = (1 - share) * photo[where] + share * np.array(colour)
             photo[where] = blend.astype(np.uint8)
-        return photo[:: self.texel, :: self.texel]
+        return photo
 
 
 def _stepped(first: int, end: int, step: int, tile_cells: int) -> NDArray[np.int64]:
@@ -188,9 +202,9 @@ def _triangles(rows: int, cols: int) -> NDArray[np.uint32]:
     return faces.astype(np.uint32)
 
 
-def _lit_photo(terrain: Terrain) -> Bytes:
-    shade = hillshade(terrain.elevation_m, terrain.grid.resolution_m)
-    photo = terrain.photo.astype(np.float32)
+def _lit_photo(seen: Level) -> Bytes:
+    shade = hillshade(seen.elevation_m, seen.grid.resolution_m)
+    photo = seen.photo.astype(np.float32)
     grey = photo.mean(axis=2, keepdims=True)  # on full colours green vehicles would drown
     lit: Floats = (0.42 * photo + 0.53 * grey) * (0.42 + 0.78 * shade[..., None])
     lit_bytes: Bytes = np.clip(lit, 0, 255).astype(np.uint8)
