@@ -20,7 +20,7 @@ from shared_map.climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec
-from swarm.messages import Route, RouteStatus
+from swarm.routes import RouteBatch
 from swarm.stats import Counters
 
 _EVERY_NS = NS_PER_S
@@ -45,17 +45,12 @@ class GapBooks:
         self._diagonal_m = grid.resolution_m * (math.sqrt(2) if config.edge == "octile" else 1.0)
         self._due_ns = 0
 
-    def certify(self, routes: Sequence[Route]) -> float:
+    def certify(self, routes: RouteBatch) -> float:
         """Book the proven gaps of served routes; returns the widest."""
-        widest = 1.0
-        for route in routes:
-            if route.status is RouteStatus.OK:
-                gap = route.gap
-                widest = max(widest, gap)
-                if math.isfinite(gap):
-                    self._counters.observe("certified_gap", gap)
-                    self._counters.observe("certified_gap_excess", gap - 1.0)
-        return widest
+        gaps = routes.gaps
+        self._counters.observe_all("certified_gap", gaps)
+        self._counters.observe_all("certified_gap_excess", gaps - 1.0)
+        return float(gaps.max(initial=1.0))
 
     def adopted(self, tree: TargetTree, followers: Followers, pace: NDArray[np.float32], now_ns: int) -> None:
         """A worker's tree has replaced the one that was offered until now, and has been compared with it."""
@@ -71,8 +66,8 @@ class GapBooks:
         some = _some(followers)
         cells = [follower.cell for follower in some]
         routes = tree.routes(pace, cells, 0)
-        driven = [route.cost_s + self._length_weight * route.length_m for route in routes]
-        self._offered(_ratios(np.array(driven), tree.cost_to_go_at(cells)))
+        driven = routes.cost_s + self._length_weight * routes.length_m
+        self._offered(_ratios(driven, tree.cost_to_go_at(cells)))
         self._held(tree, some, pace)
 
     def _offered(self, gaps: Gaps) -> None:
@@ -80,9 +75,8 @@ class GapBooks:
         if not len(gaps):
             return
         self.last = (float(gaps.mean()), float(np.quantile(gaps, 0.95)), float(gaps.max()))
-        for gap in gaps.tolist():
-            self._counters.observe("gap", gap)
-            self._counters.observe("gap_excess", max(gap - 1.0, 0.0))
+        self._counters.observe_all("gap", gaps)
+        self._counters.observe_all("gap_excess", gaps - 1.0)
 
     def _held(self, tree: TargetTree, followers: Sequence[Follower], pace: NDArray[np.float32]) -> None:
         rests = [(follower.cell, self._rest(follower, pace)) for follower in followers]
@@ -91,8 +85,7 @@ class GapBooks:
             return
         cells, driven, ends = (list(each) for each in zip(*known, strict=True))
         whole = np.array(driven, np.float64) + tree.cost_to_go_at(ends).astype(np.float64)
-        for gap in _ratios(whole, tree.cost_to_go_at(cells)).tolist():
-            self._counters.observe("held_gap_excess", max(gap - 1.0, 0.0))
+        self._counters.observe_all("held_gap_excess", _ratios(whole, tree.cost_to_go_at(cells)) - 1.0)
 
     def _rest(self, follower: Follower, pace: NDArray[np.float32]) -> tuple[float, int] | None:
         """(cost, last cell) of the rest of a follower's route; None if it has left the route or has none."""

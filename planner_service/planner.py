@@ -40,6 +40,7 @@ from swarm.messages import (
     TargetPose,
     pack_column,
 )
+from swarm.routes import RouteBatch
 from swarm.stats import Counters
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
@@ -256,8 +257,8 @@ class Planner:
         routes = self.tree.routes(self._cost_map.pace_s_per_m, cells, max_cells)
         self.counters.count("routes_served", len(routes))
         self._certify(routes, now_ns)
-        for vehicle, route in zip(request.vehicles, routes, strict=False):
-            self.followers.given(vehicle, route, request.max_cells, now_ns, now_ns + self._push_ns)
+        for index, vehicle in enumerate(request.vehicles):
+            self.followers.given(vehicle, routes[index], request.max_cells, now_ns, now_ns + self._push_ns)
         return RouteReply(
             target=self.target,
             incarnation=self._incarnation,
@@ -266,7 +267,7 @@ class Planner:
             tree_age_ms=self._age_ms(now_ns),
             rows=self._grid.rows,
             cols=self._grid.cols,
-            routes=routes,
+            routes=routes.columns(),
         )
 
     def _force(self, cells: list[int], now_ns: int) -> None:
@@ -282,7 +283,7 @@ class Planner:
         self._wants_full |= update.wants_full
         self._forced.update(fresh)
 
-    def _certify(self, routes: Sequence[Route], now_ns: int) -> None:
+    def _certify(self, routes: RouteBatch, now_ns: int) -> None:
         """Too wide a proven gap asks for a full growth, now and then; the paper's strategies know no such thing."""
         widest = self._gaps.certify(routes)
         forces = self._config.strategy in ("rotation", "auto")

@@ -34,7 +34,7 @@ from shared_map.arrays import Floats
 from shared_map.climb import Climb
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
-from swarm.messages import Route, RouteStatus
+from swarm.routes import NO_TARGET, RouteBatch
 
 Kind = Literal["none", "full", "window", "repair", "coarse", "forced"]
 EMPTY = Window(0, 0, 0, 0)
@@ -244,11 +244,11 @@ class TargetTree:
 
     # --- answers ------------------------------------------------------------------------------------------------
 
-    def routes(self, pace: Floats, cells: Any, max_cells: int = 0) -> list[Route]:
+    def routes(self, pace: Floats, cells: Any, max_cells: int = 0) -> RouteBatch:
         """A route from each cell, in order; statuses, no exceptions. 0 for `max_cells` is the whole route."""
         asked = np.asarray(cells, np.int64).reshape(-1)
         if not self.ready:
-            return [Route(status=RouteStatus.NO_TARGET, start=int(cell)) for cell in asked]
+            return RouteBatch.none(asked, NO_TARGET)
         return read_routes(self._tree, self._bounds, asked, max_cells)
 
     def cost_to_go_at(self, cells: Any) -> Floats:

@@ -17,7 +17,7 @@ import numpy as np
 from swarm.errors import ProtocolError
 from swarm.fields import column
 from swarm.grid import STEP_COL, STEP_ROW
-from swarm.messages import MarkSet, MarkSets, Message, schema_of
+from swarm.messages import MarkSet, MarkSets, Message, RouteReply, schema_of
 from swarm.statements import faulty_sets
 
 MAX_PAYLOAD_BYTES = 8 << 20
@@ -152,7 +152,10 @@ def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
 
 def encode_readable(message: Message) -> bytes:
     """A message as JSON for people: directions as compass points, float columns as lists, inf as null."""
-    return msgspec.json.encode(_readable(msgspec.to_builtins(message, builtin_types=(bytes,))))
+    fields = msgspec.to_builtins(message, builtin_types=(bytes,))
+    if isinstance(message, RouteReply):
+        fields["routes"] = [msgspec.to_builtins(route, builtin_types=(bytes,)) for route in message.routes]
+    return msgspec.json.encode(_readable(fields))
 
 
 _COLUMN_TYPES = {

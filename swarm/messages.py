@@ -7,7 +7,6 @@ holds what its docstring and checks say; whether a cell lies in the grid is for 
 from __future__ import annotations
 
 import enum
-import math
 from typing import Annotated
 
 import msgspec
@@ -26,6 +25,9 @@ from swarm.fields import (
 from swarm.fields import column as column
 from swarm.fields import pack_column as pack_column
 from swarm.grid import GridSpec
+from swarm.routes import Route as Route
+from swarm.routes import Routes as Routes
+from swarm.routes import RouteStatus as RouteStatus
 from swarm.statements import FOREVER as FOREVER
 from swarm.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
 from swarm.statements import TILE_AREA as TILE_AREA
@@ -380,15 +382,6 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
         check_id("target", self.target)
 
 
-class RouteStatus(enum.StrEnum):
-    OK = "ok"
-    UNREACHABLE = "unreachable"
-    OUTSIDE = "outside"
-    LETHAL_START = "lethal_start"
-    NO_TARGET = "no_target"
-    """The planner has not heard yet where the target is, or it stands on a lethal or outside cell."""
-
-
 class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-request")):
     """Asks for routes from cells to the planner's target. A person may give `row` and `col` instead of `cells`.
 
@@ -413,35 +406,6 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
             raise ValueError("give both row and col, or neither")
 
 
-class Route(msgspec.Struct, frozen=True, kw_only=True):
-    """One route. `directions` holds one code 0..7 a step, clockwise from north.
-
-    cost_s         travel time of the whole route, as driven along its cells
-    lower_bound_s  proven: no route from `start` can be quicker at this moment
-    length_m       of the part given; remaining_s is the cost-to-go after it, 0 at the target
-    """
-
-    status: RouteStatus
-    start: Cell
-    directions: bytes = b""
-    cost_s: float = math.inf
-    lower_bound_s: float = 0.0
-    length_m: float = 0.0
-    remaining_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_directions(self.directions)
-        if math.isnan(self.cost_s + self.lower_bound_s + self.length_m + self.remaining_s):
-            raise ValueError("a cost or length of a route is not a number")
-
-    @property
-    def gap(self) -> float:
-        """Cost over proven optimum, 1 where the route is proven optimal."""
-        if self.status is not RouteStatus.OK or self.lower_bound_s >= self.cost_s:
-            return 1.0
-        return self.cost_s / self.lower_bound_s if self.lower_bound_s > 0 else math.inf
-
-
 class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     """A planner's answer. `map_version` counts the changes of its replica, `tree_age_ms` is since the last
     exact growth, `incarnation` is the planner's."""
@@ -453,7 +417,7 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     tree_age_ms: float
     rows: Natural
     cols: Natural
-    routes: list[Route]
+    routes: Routes
 
 
 class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-route")):

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
+import numpy as np
+from numpy.typing import NDArray
+
 _BASE = 1.04
 _LOG_BASE = math.log(_BASE)
 ZERO_BUCKET = -20_000
@@ -29,6 +32,16 @@ class Histogram:
             return
         bucket = ZERO_BUCKET if value <= 0 else min(round(math.log(value) / _LOG_BASE), TOP_BUCKET)
         self.buckets[bucket] = self.buckets.get(bucket, 0) + times
+
+    def add_all(self, values: NDArray[np.float64]) -> None:
+        """As `add`, of many."""
+        values = values[np.isfinite(values)]
+        positive = values[values > 0]
+        found = np.minimum(np.rint(np.log(positive) / _LOG_BASE), TOP_BUCKET).astype(np.int64)
+        buckets, counts = np.unique(found, return_counts=True)
+        self.merge(dict(zip(buckets.tolist(), counts.tolist(), strict=True)))
+        if positive.size < values.size:
+            self.merge({ZERO_BUCKET: values.size - positive.size})
 
     def merge(self, buckets: Mapping[int, int]) -> None:
         for bucket, count in buckets.items():
@@ -91,3 +104,7 @@ class Counters:
 
     def observe(self, name: str, value: float) -> None:
         self.histograms.setdefault(name, Histogram()).add(value)
+
+    def observe_all(self, name: str, values: NDArray[np.float64]) -> None:
+        if values.size:
+            self.histograms.setdefault(name, Histogram()).add_all(values)

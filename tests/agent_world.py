@@ -33,6 +33,7 @@ from swarm.messages import (
     pack_column,
 )
 from swarm.role import RoleSetup
+from swarm.routes import RouteBatch
 from swarm.scheduler import Scheduler
 from swarm.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.service import AgentService
@@ -141,7 +142,7 @@ class FakePlanner:
             tree_age_ms=0.0,
             rows=grid.rows,
             cols=grid.cols,
-            routes=[self.route(cell, request.max_cells) for cell in request.cells],
+            routes=RouteBatch.of([self.route(cell, request.max_cells) for cell in request.cells]).columns(),
         )
 
     def _costs(self, request: CostRequest) -> CostReply:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from swarm.config import Scenario, parse_scenario, plan_agents
 from swarm.grid import GridSpec
 from swarm.messages import Claims, RouteReply, TargetPose, VehicleState, column
+from swarm.routes import RouteBatch
 from vehicle_agent.agent import Agent, AskCosts, AskRoutes, LocalMap
 from vehicle_agent.assignment import UNSETTLED, Choice, choose
 from vehicle_agent.avoidance import Resumption
@@ -99,7 +100,7 @@ def test_a_reply_too_short_for_its_request_makes_the_rest_ask_again(agent: Agent
         tree_age_ms=0.0,
         rows=12,
         cols=12,
-        routes=[],
+        routes=RouteBatch.of([]).columns(),
     )
     assert agent.routes_given(routes.request, empty, S // 5) == []
     assert len(agent.decide(S)) == 1

@@ -323,7 +323,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
                     tree_age_ms=0.0,
                     rows=grid.rows,
                     cols=grid.cols,
-                    routes=routes,
+                    routes=routes.columns(),
                 )
                 agent.routes_given(asked.request, reply, now_ns)
     raise AssertionError("the vehicle never arrived")

@@ -46,6 +46,7 @@ from swarm.messages import (
     column,
     pack_column,
 )
+from swarm.routes import RouteBatch
 from swarm.stats import Counters
 
 ROWS, COLS = 20, 30
@@ -93,8 +94,8 @@ class ScriptedTree(TargetTree):
         self.calls.append(("force", list(cells)))
         return Update("forced", GRID.window, len(cells))
 
-    def routes(self, pace: NDArray[np.float32], cells: Any, max_cells: int = 0) -> list[Route]:
-        return [self._route(int(cell), max_cells) for cell in cells]
+    def routes(self, pace: NDArray[np.float32], cells: Any, max_cells: int = 0) -> RouteBatch:
+        return RouteBatch.of([self._route(int(cell), max_cells) for cell in cells])
 
     def cost_to_go_at(self, cells: Any) -> NDArray[np.float32]:
         return np.array([cell if 0 <= cell < GRID.cells else math.inf for cell in cells], np.float32)

@@ -232,7 +232,7 @@ def test_before_any_pose_a_route_is_no_target() -> None:
     swarm = Swarm()
     swarm.world.run_ms(500)
     reply = swarm.ear.routes(7)
-    assert (reply.target_cell, reply.routes) == (None, [Route(status=RouteStatus.NO_TARGET, start=7)])
+    assert (reply.target_cell, list(reply.routes)) == (None, [Route(status=RouteStatus.NO_TARGET, start=7)])
 
 
 def test_half_a_second_after_the_first_pose_routes_are_the_best_there_are() -> None:

@@ -42,6 +42,7 @@ from swarm.messages import (
     VehicleState,
     Want,
 )
+from swarm.routes import RouteBatch
 from swarm.stats import TOP_BUCKET, ZERO_BUCKET
 
 naturals = st.integers(0, (1 << 62) - 1)
@@ -181,7 +182,8 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     RouteRequest: route_requests(),
     RouteReply: st.builds(
         RouteReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=naturals,
-        tree_age_ms=finite, rows=naturals, cols=naturals, routes=st.lists(routes, max_size=3),
+        tree_age_ms=finite, rows=naturals, cols=naturals,
+        routes=st.lists(routes, max_size=3).map(lambda some: RouteBatch.of(some).columns()),
     ),
     PushedRoute: st.builds(
         PushedRoute, vehicle=ids, target=ids, incarnation=naturals, target_cell=cells, map_version=naturals,
@@ -249,10 +251,10 @@ EXAMPLES: tuple[Message, ...] = (
     RouteRequest(cells=[4, 5], vehicles=["a0-00", "a0-01"], max_cells=50, force=True),
     RouteReply(
         target="t0", incarnation=7, target_cell=9, map_version=3, tree_age_ms=12.5, rows=10, cols=10,
-        routes=[
+        routes=RouteBatch.of([
             Route(status=RouteStatus.OK, start=11, directions=bytes([2, 3]), cost_s=3.0, lower_bound_s=2.5),
             Route(status=RouteStatus.UNREACHABLE, start=12),
-        ],
+        ]).columns(),
     ),
     PushedRoute(
         vehicle="a0-00", target="t0", incarnation=7, target_cell=9, map_version=3,

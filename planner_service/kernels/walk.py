@@ -7,6 +7,9 @@ from numba import njit
 
 from planner_service.kernels.rules import INF, NONE, RULE_OCTILE, SQRT2, SQRT2_EXACT
 
+OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
+"""What became of a route that was asked for."""
+
 _LANES = 4
 """Routes that are walked side by side. A step waits for the one before it, but not for another route's."""
 _STRETCH = 32
@@ -155,3 +158,58 @@ def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
         diagonals[r] = odd
         n = max(n, ends[r])
     return directions, ends, driven, diagonals, last
+
+
+@njit(cache=True, nogil=True)
+def find_starts(weight, cost, stride, root, asked, starts, status):
+    """Where routes from `asked` cells (int64, of the grid) start, padded, and whether there is one.
+
+    Written: starts (int64; the root where there is no route, so that none is walked), status (uint8).
+    """
+    cols = stride - 2
+    cells = (weight.size // stride - 2) * cols
+    for i in range(asked.size):
+        cell = asked[i]
+        starts[i] = root
+        if cell < 0 or cell >= cells:
+            status[i] = OUTSIDE
+            continue
+        v = (cell // cols + 1) * stride + cell % cols + 1
+        if not weight[v] < INF:
+            status[i] = LETHAL_START
+        elif not cost[v] < INF:
+            status[i] = UNREACHABLE
+        else:
+            status[i] = OK
+            starts[i] = v
+
+
+@njit(cache=True, nogil=True)
+def price_routes(cost, offset, root, resolution, diagonal, length_weight, walks, status, prices):
+    """What walked routes cost and how long they are.
+
+    walks   (ends, driven, diagonals, last) as `walk_routes` returns them
+    prices  float64 (4, routes): in, the proven bounds as its second row; out, cost_s, lower_bound_s, length_m and
+            remaining_s, where there is a route; inf, 0, 0, 0 elsewhere
+    Returns False if a route does not end where it should.
+    """
+    ends, driven, diagonals, last = walks
+    begin = 0
+    for i in range(status.size):
+        if status[i] != OK:
+            prices[0, i] = np.inf
+            prices[1:, i] = 0.0
+            continue
+        if ends[i] < 0:
+            return False
+        length = (np.float64(ends[i] - begin) + np.float64(diagonals[i]) * (diagonal - 1.0)) * resolution
+        begin = ends[i]
+        remaining = 0.0
+        if last[i] != root:
+            remaining = max(np.float64(cost[last[i]]) + offset, 0.0)
+        whole = driven[i] - length * length_weight + remaining
+        prices[0, i] = whole
+        prices[1, i] = min(prices[1, i], whole)
+        prices[2, i] = length
+        prices[3, i] = remaining
+    return True
