@@ -128,7 +128,7 @@ def cost(
         if out is not None:
             _write_cost(terrain, out, tell)
     if picture is not None:
-        _draw(terrain, picture, f"{loaded.name}: {loaded.terrain.source}")
+        _draw(terrain, picture, loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem)
     finite = terrain.pace_s_per_m[np.isfinite(terrain.pace_s_per_m)]
     console.print(
         f"{terrain.grid.rows} x {terrain.grid.cols} cells of {terrain.grid.resolution_m:g} m in {seconds:.1f} s,"
