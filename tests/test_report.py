@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from launch_scripts.report import picture
 from launch_scripts.report.record import Recorder
 from launch_scripts.report.relief import hillshade
+from launch_scripts.report.style import STYLE
 from launch_scripts.report.write import write_report
 from shared_map.terrain import Terrain, terrain_of_pace
 from swarm.config import Scenario, parse_scenario
@@ -123,7 +124,7 @@ def test_no_label_is_cut_off_or_laid_over_another_in_the_head(
         terrain = terrain_of_pace(np.ones(shape, np.float32))
         recorder = Recorder(scenario, terrain.grid)
     report: dict[str, Any] = recorder.report(run_id="20261121-120000-abcd", startup_s=7.7)
-    with mpl.rc_context(picture._STYLE):
+    with mpl.rc_context(STYLE):
         figure = picture.draw(recorder, report, terrain, None)
         canvas: Any = FigureCanvasAgg(figure)
         canvas.draw()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from launch_scripts.bench.tables import on_machine
 from swarm.config import Strategy
 from swarm.errors import ConfigError
 
@@ -29,7 +30,13 @@ app = typer.Typer(
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of fields, roots and walks.")]
 Frames = Annotated[int, typer.Option(min=1, help="Frames; each target moves one cell a frame.")]
+FieldOption = Annotated[
+    str, typer.Option(help="terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces in s/m.")
+]
+Strategies = Annotated[str, typer.Option(help="Strategies, several with commas.")]
+Picture = Annotated[Path | None, typer.Option(help="Write a plot (.png) too.")]
 _ALLOWED = typing.get_args(Strategy)
+_ALL = ",".join(_ALLOWED)
 
 
 @contextmanager
@@ -39,11 +46,26 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _show(report: dict[str, Any], as_json: bool) -> None:
+def _show(
+    report: dict[str, Any],
+    as_json: bool,
+    tables: Callable[[dict[str, Any]], Iterable[Table | str]] | None = None,
+) -> None:
+    """As one JSON object; or as its tables and sentences, and where it was measured."""
     if as_json:
-        typer.echo(json.dumps(report))
+        typer.echo(json.dumps(report, allow_nan=False))
         return
-    console = Console()
+    console = Console(soft_wrap=False, highlight=False)
+    if tables is None:
+        tables = _plain_tables
+    for part in tables(report):
+        console.print(part)
+    if "load" in report:
+        console.print(on_machine(report))
+
+
+def _plain_tables(report: dict[str, Any]) -> Iterator[Table | str]:
+    """Every list of rows as a table, then what is left as lines."""
     plain = {}
     for name, value in report.items():
         rows = value if isinstance(value, list) and value and isinstance(value[0], dict) else None
@@ -54,9 +76,9 @@ def _show(report: dict[str, Any], as_json: bool) -> None:
         table = Table(*columns, title=name)
         for row in rows:
             table.add_row(*(_cell(row.get(key)) for key in columns))
-        console.print(table)
+        yield table
     for name, value in plain.items():
-        console.print(f"{name}: {_cell(value)}")
+        yield f"{name}: {_cell(value)}"
 
 
 def _cell(value: Any) -> str:
@@ -67,114 +89,207 @@ def _cell(value: Any) -> str:
 
 def _strategies(names: str) -> tuple[Any, ...]:
     chosen = tuple(name.strip() for name in names.split(",") if name.strip())
+    if not chosen:
+        raise ConfigError(f"--strategies is {names!r}, expected some of {', '.join(_ALLOWED)}")
     for name in chosen:
         if name not in _ALLOWED:
             raise ConfigError(f"strategy {name!r} is not one of {', '.join(_ALLOWED)}")
     return chosen
 
 
-def _numbers(text: str, name: str) -> tuple[int, ...]:
+def _numbers(text: str, name: str, least: int = 1) -> tuple[int, ...]:
     try:
         found = tuple(int(part) for part in text.split(","))
     except ValueError:
         found = ()
-    if not found or min(found) < 1:
-        raise ConfigError(f"--{name} is {text!r}, expected positive numbers such as 512,1024")
+    if not found or min(found) < least:
+        raise ConfigError(f"--{name} is {text!r}, expected numbers of at least {least} such as 512,1024")
     return found
+
+
+def _check_picture(picture: Path | None) -> None:
+    """Before minutes are spent on what could not be written."""
+    if picture is None:
+        return
+    if picture.suffix.lower() != ".png":
+        raise ConfigError(f"--picture is {picture}, expected a name that ends in .png")
+    if not picture.absolute().parent.is_dir():
+        raise ConfigError(f"--picture is {picture}: there is no folder {picture.absolute().parent}")
 
 
 @app.command()
 def peers(
-    size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side.")] = 512,
-    field: Annotated[str, typer.Option(help="terrain, uniform, maze, or a file.")] = "terrain",
+    size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side; a file has its own.")] = 512,
+    field: FieldOption = "terrain",
     repeats: Annotated[int, typer.Option(min=1, help="Interleaved runs, each from another root.")] = 7,
     edge: Annotated[str, typer.Option(help="paper (the rule all share) or octile.")] = "paper",
+    memory: Annotated[bool, typer.Option(help="Measure peak memory too, a process for each.")] = True,
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """A full tree: ours, dijkstra3d, tcod, scipy, scikit-image and a plain breadth-first search."""
-    from launch_scripts.bench.peers import run
+    """A full tree: ours, dijkstra3d, tcod, scipy, scikit-image and a plain breadth-first search.
 
-    if edge not in ("paper", "octile"):
+    \b
+    swarm bench peers --size 512 --field maze
+    swarm bench peers --field ridge.tif --json
+
+    CPU time of one thread, peak memory from the bare field to the grown tree, and the largest relative difference
+    of any cell's cost to ours. Memory says little on fields much smaller than 512 x 512.
+    """
+    from launch_scripts.bench.peers import missing_sentence, run, tables
+    from launch_scripts.bench.rivals import missing_packages
+
+    if edge != "paper" and edge != "octile":
         raise ConfigError(f"--edge is {edge!r}, expected paper or octile")
+    if as_json:
+        for package in missing_packages():
+            typer.echo(missing_sentence(package), err=True)
     with _progress("peers") as progress:
-        report = run(size, field, repeats, seed, edge, progress)
-    _show(report, as_json)
+        report = run(size, field, repeats, seed, edge, memory, progress)  # type: ignore[arg-type]
+    _show(report, as_json, tables)
+
+
+@app.command()
+def start(
+    size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side of the first tree.")] = 512,
+    runs: Annotated[int, typer.Option(min=1, help="Processes with a warm cache.")] = 7,
+    cold_runs: Annotated[int, typer.Option(min=1, help="Processes that compile everything.")] = 1,
+    kernels: Annotated[bool, typer.Option(help="Measure all kernels of a planner too.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Seconds from the start of a fresh process to its first tree, with numba's cache cold and warm.
+
+    \b
+    swarm bench start --no-kernels
+
+    The cache is a temporary folder: that of this installation is left alone.
+    """
+    from launch_scripts.bench.start import run_start, tables
+
+    with _progress("start") as progress:
+        report = run_start(size, cold_runs, runs, kernels, progress)
+    _show(report, as_json, tables)
 
 
 @app.command()
 def paper(
-    size: Annotated[int, typer.Option(min=16, help="Cells a side.")] = 512,
-    field: Annotated[str, typer.Option(help="terrain, uniform, maze, or a file.")] = "terrain",
+    size: Annotated[int, typer.Option(min=16, max=8192, help="Cells a side; a file has its own.")] = 512,
+    field: FieldOption = "terrain",
     frames: Frames = 300,
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """The paper's Tables 1 and 2, each strategy with its gap to the exact tree."""
-    from launch_scripts.bench.strategies import run_paper
+    """The paper's Tables 1 and 2, each strategy with its gap to the exact tree. Some four minutes.
+
+    \b
+    swarm bench paper
+    swarm bench paper --frames 60      a first impression in one
+    """
+    from launch_scripts.bench.paper import run_paper, tables
 
     with _progress("paper") as progress:
         report = run_paper(size, field, frames, seed, progress)
-    _show(report, as_json)
+    _show(report, as_json, tables)
 
 
 @app.command()
 def scale(
-    sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048",
-    targets: Annotated[str, typer.Option(help="Numbers of targets.")] = "1,10",
-    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles.")] = "100,1000",
-    strategies: Annotated[str, typer.Option(help="Strategies.")] = "full,rotation,auto",
-    frames: Frames = 30,
+    sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048,4096",
+    targets: Annotated[str, typer.Option(help="Numbers of targets.")] = "1,10,100",
+    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles.")] = "10,100,1000,10000",
+    strategies: Strategies = _ALL,
+    full: Annotated[bool, typer.Option("--full", help="Every combination: takes hours.")] = False,
+    field: Annotated[str, typer.Option(help="terrain, uniform or maze.")] = "terrain",
+    frames: Frames = 40,
+    seconds: Annotated[float, typer.Option(min=0.01, help="CPU time a strategy gets at each point.")] = 6.0,
     max_cells: Annotated[int, typer.Option(min=0, help="Steps given to a vehicle; 0 is the whole route.")] = 256,
-    plot: Annotated[Path | None, typer.Option(help="Write a plot (PNG).")] = None,
+    picture: Picture = None,
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Milliseconds a frame and gap per strategy, from small to large."""
-    from launch_scripts.bench.strategies import run_scale
+    """Milliseconds a frame and gap per strategy, from small to large.
 
+    \b
+    swarm bench scale --picture scale.png
+    swarm bench scale --sizes 4096 --targets 10 --vehicles 1000 --strategies auto --frames 120 --seconds 60
+
+    Varies one thing at a time, from the smallest size and the middle numbers of targets and vehicles; --full takes
+    every combination. Trees that do not fit into half of the free memory are run in groups.
+    """
+    from launch_scripts.bench.fields import FIELDS
+    from launch_scripts.bench.scale import base_of, points_of, run_scale, tables
+
+    if field not in FIELDS:
+        raise ConfigError(f"--field is {field!r}, expected {', '.join(FIELDS)}: a file has only one size")
+    axes = (_numbers(sizes, "sizes", 16), _numbers(targets, "targets"), _numbers(vehicles, "vehicles"))
+    chosen = _strategies(strategies)
+    _check_picture(picture)
     with _progress("scale") as progress:
         report = run_scale(
-            _numbers(sizes, "sizes"),
-            _numbers(targets, "targets"),
-            _numbers(vehicles, "vehicles"),
-            _strategies(strategies),
+            points_of(*axes, full),
+            base_of(*axes),
+            chosen,
+            field,
             frames,
+            seconds,
             max_cells,
             seed,
-            plot,
+            picture,
             progress,
         )
-    _show(report, as_json)
+    _show(report, as_json, tables)
 
 
 @app.command()
 def gap(
     dem: Annotated[str, typer.Option(help="An elevation file, or terrain, uniform, maze.")] = "terrain",
-    frames: Frames = 300,
-    vehicles: Annotated[int, typer.Option(min=1, help="Vehicles spread over the terrain.")] = 200,
-    strategies: Annotated[str, typer.Option(help="Strategies, several with commas.")] = ",".join(_ALLOWED),
+    walk: Annotated[str, typer.Option(help="random, waypoints, evade; several with commas.")] = "random",
+    frames: Frames = 120,
+    runs: Annotated[int, typer.Option(min=1, help="Runs from different roots, taken together.")] = 3,
+    vehicles: Annotated[int, typer.Option(min=1, help="Routes judged in each frame.")] = 200,
+    speed: Annotated[
+        int | None,
+        typer.Option(min=0, max=64, help="Cells a vehicle drives a frame; 0 stands. After an evader 1, else 0."),
+    ] = None,
+    strategies: Strategies = _ALL,
     k_min: Annotated[int, typer.Option(min=0, max=12, help="Smallest block exponent of windows.")] = 3,
     full_every: Annotated[int, typer.Option(min=1, help="rotation: a full growth every so many moves.")] = 10,
+    cpu_budget: Annotated[float, typer.Option(min=1e-4, max=1, help="auto: share of a core it may use.")] = 0.1,
+    picture: Picture = None,
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Driven cost over optimum for a moving target, and what the certificates prove of it."""
-    from launch_scripts.bench.strategies import run_gap
+    """Driven cost over optimum for a moving target, and what the certificates prove of it.
 
+    \b
+    swarm bench gap --dem ridge.tif --walk random,waypoints,evade --picture gap.png
+    swarm bench gap --dem ridge.tif --strategies rotation --full-every 5
+    """
+    from launch_scripts.bench.gap import WALKS, run_gap, tables
+
+    walks = tuple(name.strip() for name in walk.split(","))
+    for name in walks:
+        if name not in WALKS:
+            raise ConfigError(f"--walk {name!r} is not one of {', '.join(WALKS)}")
+    chosen = _strategies(strategies)
+    _check_picture(picture)
     with _progress("gap") as progress:
         report = run_gap(
             dem,
             frames,
             vehicles,
-            _strategies(strategies),
+            chosen,
+            walks,  # type: ignore[arg-type]
+            runs,
+            speed,
             seed,
+            picture,
             progress,
             k_min=k_min,
             full_every=full_every,
-            cpu_budget=0.01,
+            cpu_budget=cpu_budget,
         )
-    _show(report, as_json)
+    _show(report, as_json, tables)
 
 
 @app.command()

@@ -1,22 +1,24 @@
-"""The paces that planners are measured on: synthetic fields, files, and walks of targets on them."""
+"""The paces that planners are measured on: synthetic fields and files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
-from swarm.errors import ConfigError
+from launch_scripts.world.walks import Ground
+from swarm.errors import ConfigError, TerrainError
+from swarm.grid import GridSpec
 
 Pace = NDArray[np.float32]
 FIELDS = ("terrain", "uniform", "maze")
 
 
 def make_field(name: str, size: int, seed: int = 1) -> Pace:
-    """A field by name, or the pace of an elevation or MovingAI file. Raises ConfigError on neither."""
+    """A field by name, `size` cells a side, or the pace of a file as it is. Raises ConfigError on neither."""
     rng = np.random.default_rng(seed)
     if name == "terrain":
         return rough_terrain(size, rng)
@@ -87,43 +89,58 @@ def maze(size: int, rng: np.random.Generator, corridor: int = 3) -> Pace:
 
 
 def from_file(path: Path) -> Pace:
-    """The pace that `swarm` itself makes of a terrain file."""
-    if path.suffix == ".map":
-        lines = path.read_text(encoding="utf-8").splitlines()
-        rows = lines[lines.index("map") + 1 :]
-        passable = np.array([[char in ".GS" for char in row] for row in rows if row])
-        return np.where(passable, np.float32(1.0), np.float32(np.inf)).astype(np.float32)
-    from shared_map.terrain import build_terrain
-    from swarm.config import Scenario, TerrainConfig
+    """The pace of a file: .npy holds paces as they are (s/m, inf is lethal), a MovingAI .map costs 1 where it can
+    be driven, and of everything else `swarm` makes what it would drive on. Raises TerrainError."""
+    match path.suffix.lower():
+        case ".npy":
+            pace = _read_npy(path)
+        case ".map":
+            from shared_map.plain_files import read_map
 
-    terrain = build_terrain(Scenario(terrain=TerrainConfig(source=str(path))))
-    return np.ascontiguousarray(terrain.pace_s_per_m, np.float32)
+            factor = read_map(path).factor
+            assert factor is not None, "a .map has no heights"
+            pace = factor
+        case _:
+            from shared_map.terrain import build_terrain
+            from swarm.config import Scenario, TerrainConfig
 
-
-def largest_area(pace: Pace) -> NDArray[np.int64]:
-    """The cells of the largest connected passable area, from which roots and vehicles are drawn."""
-    from scipy.ndimage import label
-
-    areas, _ = label(np.isfinite(pace))
-    sizes = np.bincount(areas.reshape(-1))
-    sizes[0] = 0
-    found: NDArray[np.int64] = np.flatnonzero(areas.reshape(-1) == sizes.argmax())
-    return found
+            pace = build_terrain(Scenario(terrain=TerrainConfig(source=str(path)))).pace_s_per_m
+    return np.ascontiguousarray(pace, np.float32)
 
 
-def random_walk(pace: Pace, start: int, rng: np.random.Generator) -> Iterator[int]:
-    """One-cell moves of a target: it keeps its heading for a while and turns where it cannot go on."""
-    rows, cols = pace.shape
-    row, col = divmod(start, cols)
-    dr, dc = 0, 1
-    while True:
-        for _ in range(32):
-            if rng.random() < 0.1 or not (0 <= row + dr < rows and 0 <= col + dc < cols):
-                dr, dc = int(rng.integers(-1, 2)), int(rng.integers(-1, 2))
-            r, c = row + dr, col + dc
-            inside = 0 <= r < rows and 0 <= c < cols
-            if (dr or dc) and inside and np.isfinite([pace[r, c], pace[row, c], pace[r, col]]).all():
-                row, col = r, c
-                break
-            dr, dc = int(rng.integers(-1, 2)), int(rng.integers(-1, 2))
-        yield row * cols + col
+def _read_npy(path: Path) -> NDArray[np.floating[Any]]:
+    try:
+        pace = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise TerrainError(f"field {path} is no .npy array: {error}") from error
+    if pace.ndim != 2 or not pace.size or pace.dtype.kind not in "fiu":
+        raise TerrainError(
+            f"field {path} has shape {pace.shape} of {pace.dtype}; expected rows x cols of paces in s/m"
+        )
+    wrong = np.argwhere(~(pace > 0))
+    if len(wrong):
+        row, col = wrong[0]
+        raise TerrainError(
+            f"field {path}, row {row}, column {col}: a pace of {pace[row, col]}; expected more than 0, or inf"
+        )
+    return pace  # type: ignore[no-any-return]
+
+
+class Field:
+    """A pace and where one can be on it.
+
+    pace    (rows, cols) float32, s/m, inf is lethal; cells are taken as a metre wide, which scales all costs alike
+    ground  for walks; its `home` is the largest connected passable area, from which roots and vehicles are drawn
+
+    Raises TerrainError if every cell is lethal.
+    """
+
+    def __init__(self, pace: Pace) -> None:
+        self.pace = pace
+        self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
+        self.ground = Ground(self.grid, pace)
+
+    def draw(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """So many cells of the largest area, none twice where there are enough."""
+        home = self.ground.home
+        return rng.choice(home, count, replace=count > len(home))

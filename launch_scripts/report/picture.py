@@ -32,34 +32,12 @@ from launch_scripts.report.palette import (
 from launch_scripts.report.plots import draw_plots, duration, halo
 from launch_scripts.report.record import Recorder
 from launch_scripts.report.relief import hillshade
+from launch_scripts.report.style import STYLE
 from shared_map.terrain import Terrain
 from swarm.messages import MarkKind
 
 WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
 
-_STYLE: Any = {
-    "font.family": "DejaVu Sans",
-    "font.size": 10,
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlepad": 5,
-    "axes.edgecolor": "#9aa3ad",
-    "axes.linewidth": 0.8,
-    "axes.labelcolor": FAINT,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e6e9ec",
-    "grid.linewidth": 0.8,
-    "xtick.color": FAINT,
-    "ytick.color": FAINT,
-    "xtick.labelsize": 9,
-    "ytick.labelsize": 9,
-    "text.color": INK,
-    "axes.titlecolor": INK,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-}
 _SHOWN_LABELS = 30
 
 
@@ -67,7 +45,7 @@ def save_picture(
     path: Path, recorder: Recorder, report: dict[str, Any], terrain: Terrain, truth: NDArray[np.float32] | None
 ) -> None:
     """Draw the run and write it as PNG."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = draw(recorder, report, terrain, truth)
         canvas = FigureCanvasAgg(figure)
         with path.open("wb") as file:

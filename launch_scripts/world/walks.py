@@ -156,7 +156,7 @@ class Walker:
             return
         for _ in range(_STEPS_PER_TICK):
             if self.towards is None:
-                self.towards = self._choose(ground, vehicles, budget)
+                self.towards = self.choose(ground, vehicles, budget)
                 if self.towards is None:
                     return
             step_s = self._step_s(ground)
@@ -180,7 +180,8 @@ class Walker:
         pace = float(ground.pace_s_per_m.flat[self.towards])
         return ground.length_m(self.cell, self.towards) * pace * self.slowness
 
-    def _choose(self, ground: Ground, vehicles: NDArray[np.int64], budget: Budget) -> int | None:
+    def choose(self, ground: Ground, vehicles: NDArray[np.int64], budget: Budget) -> int | None:
+        """The cell of its next step; None if it stays, as one does that stands still or waits for the budget."""
         match self.walk:
             case "random":
                 return self._wander(ground)

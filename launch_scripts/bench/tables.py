@@ -1,0 +1,63 @@
+"""Tables of figures that fit into 80 columns, and how a figure is written in them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from swarm.config import Strategy
+
+LABELS: dict[Strategy, str] = {
+    "full": "full",
+    "auto": "auto",
+    "rotation": "rotation",
+    "variable_range": "variable range",
+    "multi_resolution": "multi-resolution",
+    "variable_range+multi_resolution": "both, the paper's",
+}
+"""Strategies by the paper's words where it has any."""
+NARROW: dict[Strategy, str] = {
+    **LABELS,
+    "variable_range": "variable\nrange",
+    "multi_resolution": "multi-\nresol.",
+    "variable_range+multi_resolution": "both",
+}
+
+
+def table(title: str, *columns: str, tight: bool = False) -> Table:
+    """Columns of numbers; a name that begins with < is one of words. A tight one saves a space between columns."""
+    padding = (0, 0) if tight else (0, 1, 0, 0)
+    found = Table(
+        title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=padding, pad_edge=False
+    )
+    for name in columns:
+        words = name.startswith("<")
+        found.add_column(name.removeprefix("<"), justify="left" if words else "right", no_wrap=True)
+    return found
+
+
+def number(value: float | None) -> str:
+    """Three digits that count."""
+    if value is None:
+        return "-"
+    decimals = 0 if value >= 99.95 else 1 if value >= 9.995 else 2 if value >= 0.995 else 3
+    return f"{value:,.{decimals}f}"
+
+
+def times(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f} x"
+
+
+def percent(gap: float | None) -> str:
+    """What a gap, cost over optimum, is above 1."""
+    if gap is None:
+        return "-"
+    above = 100 * (gap - 1)
+    return f"{above:.2f}" if above < 9.995 else f"{above:,.0f}"
+
+
+def on_machine(report: dict[str, Any]) -> str:
+    """One sentence on where the figures come from."""
+    return f"{report['cores']} x {report['machine']}, Python {report['python']}, load {report['load']}."
