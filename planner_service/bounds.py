@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.ground import Changes, Ground
+from planner_service.kernels import bounds as kernels
 from planner_service.kernels.repair import lower
-from planner_service.tree import CostToGoTree
+from planner_service.tree import NOWHERE, CostToGoTree
 from shared_map.arrays import Floats
 
 LOWER_SHARE = 16
 """A potential is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""
-ROUNDING = 2.0**-23
-"""Relative error of one float32 step, doubled for the sum over a route's steps."""
 
 
 class LowerBounds:
@@ -55,52 +52,30 @@ class LowerBounds:
     def at(self, tree: CostToGoTree, starts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Proven lower bounds on the time from padded cells to the target now."""
         ground = self._ground
+        low, most = ground.low, ground.grid.cells
+        bound = np.zeros(starts.size)
         if tree.exact:
-            own = tree.cost[starts].astype(np.float64)
-            bound = own * (1.0 - self._rounding(own))
+            kernels.by_exact(tree.cost, starts, low, most, bound)
         else:
-            bound = self._shifted(tree, starts)
+            near = NOWHERE if tree.near is None else tree.near
+            potential = _NONE if self._potential is None else self._potential
+            kernels.by_potential(
+                potential,
+                ground.pad(tree.root),
+                near.cost,
+                near.box,
+                ground.stride,
+                near.rim,
+                near.rim_cost,
+                starts,
+                low,
+                most,
+                bound,
+            )
         if ground.length_weight_s:
             # Of the key's optimum only the share that is travel time counts, at least 1 - lambda / smallest weight.
-            bound = bound * (1.0 - ground.length_weight_s / ground.low)
-        return np.maximum(bound, 0.0)
+            bound *= 1.0 - ground.length_weight_s / ground.low
+        return bound
 
-    def _shifted(self, tree: CostToGoTree, starts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """No way to the target is cheaper than the potential falls along it; and it either stays in the window
-        around the target, or comes in over its rim for the last time and costs from there what the window says."""
-        ground = self._ground
-        potential = self._potential
-        own = np.zeros(starts.size)
-        at_target = math.inf
-        if potential is not None:
-            own = potential[starts].astype(np.float64)
-            own[~np.isfinite(own)] = 0.0
-            own = own * (1.0 - self._rounding(own))
-            at_target = float(potential[ground.pad(tree.root)])
-            at_target *= 1.0 + float(self._rounding(np.asarray(at_target)))
-        bound = np.maximum(own - at_target, 0.0)
-        near = tree.near
-        if near is None:
-            return bound
-        rim_cost = near.rim_cost * (1.0 - self._rounding(near.rim_cost))
-        outside = np.full(starts.size, rim_cost.min(initial=math.inf))
-        if potential is not None and near.rim.size:
-            at_rim = potential[near.rim].astype(np.float64)
-            at_rim = at_rim * (1.0 + self._rounding(at_rim))
-            outside = np.maximum(outside, own - (at_rim - rim_cost).max())
-        rows, cols = np.divmod(starts, ground.stride)
-        rows, cols = rows - 1 - near.window.row0, cols - 1 - near.window.col0
-        height, width = near.cost.shape
-        within = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
-        inside = np.full(starts.size, math.inf)
-        own_way = near.cost[rows[within], cols[within]].astype(np.float64)
-        known = np.where(np.isfinite(own_way), own_way, 0.0)
-        inside[within] = own_way * (1.0 - self._rounding(known))
-        found = np.minimum(inside, outside)
-        # A route was found, so that no bound is infinite; a rim that leads nowhere would be.
-        return np.maximum(bound, np.where(np.isfinite(found), found, 0.0))
 
-    def _rounding(self, costs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far float32 may have put these costs off, relatively: no optimal route has more steps than this."""
-        steps = np.minimum(costs / self._ground.low, self._ground.grid.cells) + 4.0
-        return np.minimum(np.asarray(steps * ROUNDING), 1.0)
+_NONE: Floats = np.empty(0, np.float32)

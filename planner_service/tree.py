@@ -20,7 +20,7 @@ from planner_service.ground import Cells, Changes, Ground
 from planner_service.growth import FINE, flood
 from planner_service.kernels import coarse, walk
 from planner_service.kernels.flood import point_to_parents
-from planner_service.kernels.ground import cut_window, merge_window, weight_range
+from planner_service.kernels.ground import cut_window, find_rim, merge_window
 from planner_service.kernels.repair import repair
 from planner_service.kernels.rules import NONE
 from planner_service.skeleton import Skeleton
@@ -32,14 +32,18 @@ from swarm.grid import Window
 class Surrounding:
     """What a window around the root cost on its own: a lower bound on every way that stays inside.
 
-    cost   (rows, cols) of the window, s; exact inside it
-    rim    padded cells of the window from which a step leads out of it
+    cost      float32  s, of the window as a padded grid of its own; exact inside it
+    box       (row0, col0, row1, col1) of the window
+    rim       int64    padded cells of the window from which a step leads out of it; rim_cost: float64, s
     """
 
-    window: Window
     cost: Floats
+    box: tuple[int, int, int, int]
     rim: Cells
     rim_cost: NDArray[np.float64]
+
+
+NOWHERE = Surrounding(np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
 
 
 class CostToGoTree:
@@ -114,61 +118,34 @@ class CostToGoTree:
         window.
         """
         ground = self.ground
-        row, col = ground.grid.row_col(root)
-        old_row, old_col = ground.grid.row_col(self.root)
-        box = (window.row0, window.col0, window.row1, window.col1)
-        stride = window.col1 - window.col0 + 2
-        part = np.empty((window.row1 - window.row0 + 2) * stride, np.float32)
-        cut_window(ground.weight, ground.stride, box, part)
+        row0, col0, row1, col1 = box = (window.row0, window.col0, window.row1, window.col1)
+        width = col1 - col0 + 2
+        part = np.empty((row1 - row0 + 2) * width, np.float32)
+        low, high = cut_window(ground.weight, ground.stride, box, part)
         cost = np.empty_like(part)
-        low, high = weight_range(part)
-        flood(
-            part,
-            float(low),
-            float(high),
-            stride,
-            (row - window.row0 + 1) * stride + col - window.col0 + 1,
-            ground.rule,
-            ground.corners,
-            cost,
-            None,
-        )
-        way = float(cost[(old_row - window.row0 + 1) * stride + old_col - window.col0 + 1])
+        row, col = ground.grid.row_col(root)
+        start = (row - row0 + 1) * width + col - col0 + 1
+        flood(part, float(low), float(high), width, start, ground.rule, ground.corners, cost, None)
+        row, col = ground.grid.row_col(self.root)
+        way = float(cost[(row - row0 + 1) * width + col - col0 + 1])
         if not way < math.inf:
             return 0
         self.offset += way
         merge_window(cost, box, np.float32(self.offset), ground.pad(self.root), self.cost, ground.stride)
-        grown = Window(
-            max(window.row0 - 1, 0),
-            max(window.col0 - 1, 0),
-            min(window.row1 + 1, ground.grid.rows),
-            min(window.col1 + 1, ground.grid.cols),
-        )
+        rows, cols = ground.grid.rows, ground.grid.cols
+        # A neighbour of a cell that got cheaper may lead there now.
+        grown = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
+        new_root = ground.pad(root)
         point_to_parents(
-            ground.weight,
-            self.cost,
-            ground.stride,
-            ground.rule,
-            ground.corners,
-            ground.pad(root),
-            (grown.row0, grown.col0, grown.row1, grown.col1),
-            self.parent,
+            ground.weight, self.cost, ground.stride, ground.rule, ground.corners, new_root, grown, self.parent
         )
         self.exact = self.exact and root == self.root
         self.root = root
-        self.near = self._surrounding(window, cost.reshape(-1, stride)[1:-1, 1:-1])
+        rim = np.empty(2 * (row1 - row0 + col1 - col0), np.int64)
+        rim_cost = np.empty(rim.size, np.float64)
+        many = find_rim(cost, box, rows, ground.stride, rim, rim_cost)
+        self.near = Surrounding(cost, box, rim[:many], rim_cost[:many])
         return window.cells
-
-    def _surrounding(self, window: Window, cost: Floats) -> Surrounding:
-        grid = self.ground.grid
-        on_rim = np.zeros(cost.shape, bool)
-        on_rim[0] |= window.row0 > 0
-        on_rim[-1] |= window.row1 < grid.rows
-        on_rim[:, 0] |= window.col0 > 0
-        on_rim[:, -1] |= window.col1 < grid.cols
-        rows, cols = np.nonzero(on_rim & (cost < np.inf))
-        rim = (rows + window.row0 + 1) * self.ground.stride + cols + window.col0 + 1
-        return Surrounding(window, cost, rim, cost[rows, cols].astype(np.float64))
 
     def repair(self, changes: Changes, limit: int) -> int:
         """Bring the tree up to date after the ground changed. Returns cells visited, or -1 if more than `limit` are

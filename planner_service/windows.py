@@ -11,11 +11,8 @@ def block_window(grid: GridSpec, old: int, new: int, k_min: int) -> Window:
     shut around both cells."""
     row, col = grid.row_col(new)
     old_row, old_col = grid.row_col(old)
-    k = k_min
-    top = max(grid.rows, grid.cols)
-    for exponent in range(k_min, top.bit_length() + 1):
-        if row >> exponent != old_row >> exponent or col >> exponent != old_col >> exponent:
-            k = exponent
+    # Of numbers that differ, the highest bit in which they do is the largest block that has changed.
+    k = max(k_min, ((row ^ old_row) | (col ^ old_col)).bit_length() - 1)
     return grid.around(new, max(2 << k, 2 * grid.distance_cells(old, new)))
 
 

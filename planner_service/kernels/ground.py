@@ -66,16 +66,24 @@ def weight_range(weight):
 
 @njit(cache=True, nogil=True)
 def cut_window(weight, stride, box, part):
-    """The weights of a window as a padded grid of its own."""
+    """The weights of a window as a padded grid of its own. Returns their range, as `weight_range` does."""
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
-    for i in range(part.size):
-        part[i] = INF
+    low = INF
+    high = np.float32(0.0)
+    part[:width] = INF
+    part[part.size - width :] = INF
     for row in range(row0, row1):
-        a = (row + 1) * stride + 1 + col0
-        b = (row - row0 + 1) * width + 1
-        for col in range(col1 - col0):
-            part[b + col] = weight[a + col]
+        a = np.uint64((row + 1) * stride + 1 + col0)
+        b = np.uint64((row - row0 + 1) * width + 1)
+        part[b - np.uint64(1)] = INF
+        for col in range(np.uint64(col1 - col0)):
+            w = weight[a + col]
+            part[b + col] = w
+            low = min(low, w)
+            high = max(high, w if w < INF else np.float32(0.0))
+        part[b + np.uint64(col1 - col0)] = INF
+    return low, high
 
 
 @njit(cache=True, nogil=True)
@@ -83,17 +91,36 @@ def merge_window(part, box, offset, old_root, cost, stride):
     """Costs of a window grown around a new root improve a tree whose costs are stored less `offset`.
 
     Only what gets cheaper is rewritten, and the old root, so that costs stay upper bounds of what is driven and
-    grow strictly along every way. Returns cells rewritten.
+    grow strictly along every way.
     """
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
-    rewritten = 0
     for row in range(row0, row1):
-        a = (row + 1) * stride + 1 + col0
-        b = (row - row0 + 1) * width + 1
-        for col in range(col1 - col0):
-            new = part[b + col] - offset
-            if new < cost[a + col] or a + col == old_root:
-                cost[a + col] = new
-                rewritten += 1
-    return rewritten
+        a = np.uint64((row + 1) * stride + 1 + col0)
+        b = np.uint64((row - row0 + 1) * width + 1)
+        for col in range(np.uint64(col1 - col0)):
+            cost[a + col] = min(cost[a + col], part[b + col] - offset)
+    row = old_root // stride - 1
+    col = old_root % stride - 1
+    cost[old_root] = part[(row - row0 + 1) * width + col - col0 + 1] - offset
+
+
+@njit(cache=True, nogil=True)
+def find_rim(part, box, rows, stride, rim, rim_cost):
+    """The cells with a cost from which a step leads out of a window, padded in the whole grid of `rows` rows, and
+    their costs. rim, rim_cost have room for all of the window's border. Returns how many there are."""
+    row0, col0, row1, col1 = box
+    width = col1 - col0 + 2
+    count = 0
+    for row in range(row0, row1):
+        across = (row == row0 and row0 > 0) or (row == row1 - 1 and row1 < rows)
+        step = 1 if across or col1 - col0 == 1 else col1 - col0 - 1
+        for col in range(col0, col1, step):
+            if not across and not (col == col0 and col0 > 0) and not (col == col1 - 1 and col1 < stride - 2):
+                continue
+            c = part[(row - row0 + 1) * width + col - col0 + 1]
+            if c < INF:
+                rim[count] = (row + 1) * stride + col + 1
+                rim_cost[count] = c
+                count += 1
+    return count
