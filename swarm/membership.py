@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from swarm.bus import Asked, AskEnded, Bus, Event, LinkChanged, Post, Replied
+from swarm.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
@@ -10,14 +10,16 @@ from swarm.messages import Note, Nothing, RunInfo, Stats
 from swarm.stats import Counters
 from swarm.topics import NOTE, RUN, STATS
 
+ROUTER = "router"
 _TAG = "run-check"
 
 
 class Member:
     """One process's membership in a run.
 
-    A process asks everybody which run they belong to when it starts and whenever a link comes back, and ends with
-    RunMismatchError if anybody's run or terrain differs from its own.
+    A process asks everybody which run they belong to when it starts, whenever a link comes back and whenever a
+    router appears, as behind it there may be others; it ends with RunMismatchError if anybody's run or terrain
+    differs from its own.
     """
 
     def __init__(self, info: RunInfo, bus: Bus, post: Post) -> None:
@@ -35,6 +37,7 @@ class Member:
         """Serve our run, then ask for the others': of two that start at once, at least one notices."""
         self._bus.serve(RUN, self._post, role=self.info.role, id=self.info.id)
         self._bus.watch_links(self._post)
+        self._bus.watch_alive(self._post, role=ROUTER)
         self._bus.declare_alive(self.peer)
         self._ask()
 
@@ -49,6 +52,12 @@ class Member:
                 check_same_run(self.info, other)
                 return True
             case AskEnded(tag=tag) if tag == _TAG:
+                return True
+            case Appeared(peer=Peer(role=role)) if role == ROUTER:
+                self._ask()
+                self._post(LinkChanged(up=True))  # of a link between routers only they are told
+                return True
+            case Disappeared(peer=Peer(role=role)) if role == ROUTER:
                 return True
             case LinkChanged(up=True):
                 self._ask()

@@ -3,8 +3,8 @@
 python -m launch_scripts.bench.partition --rounds 20 --seconds 30 --json
 
 Needs root and `ip` (iproute2). Two namespaces stand for two machines, a pair of veth for the cable between them. On
-each side run, as processes of their own, a router, a keeper with its store on disk, two authors that put a set of
-eight marks every 20 ms, and a listener; the sides meet over tls/ with certificates made for the purpose. A round
+each side run, as processes of their own, a router, a keeper with its store on disk, two authors that say
+something about eight cells every 50 ms, and a listener; the sides meet over tls/ with certificates made for the purpose. A round
 takes the cable down, lets both sides write, stops writing, puts the cable up, and measures until every replica of
 both sides tells the same digest and none has changed for a second.
 """
@@ -52,6 +52,7 @@ LOCAL = "tcp/127.0.0.1:7447"
 PORT = 7448
 SIDE_CELLS = 512
 TICK_HZ = 50.0
+WRITE_NS = 50_000_000
 SETTLED_S = 1.0
 GIVE_UP_S = 30.0
 _SETTLE_START_S = 60.0
@@ -70,6 +71,8 @@ class MapService:
         self.replica = MapReplica(terrain.grid, author=author)
         self._feed = MapFeed(self.replica, bus, post, setup.scenario.map, setup.role)
         self._chance = np.random.default_rng(setup.incarnation % (1 << 32))
+        self._at = self._chance.integers(SIDE_CELLS, size=2)
+        self._write_due_ns = 0
         self.writing = False
 
     def start(self, now_ns: int) -> None:
@@ -81,7 +84,8 @@ class MapService:
             self._feed.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        if self.writing:
+        if self.writing and now_ns >= self._write_due_ns:
+            self._write_due_ns = now_ns + WRITE_NS
             self._scribble(now_ns)
         self._feed.tick(now_ns)
         self._member.tick(now_ns)
@@ -90,8 +94,9 @@ class MapService:
         self._member.publish_stats(now_ns)
 
     def _scribble(self, now_ns: int) -> None:
-        """Eight marks in a row, as a vehicle makes them."""
-        start = int(self._chance.integers(self.replica.grid.cells - 8))
+        """Eight marks in a row, a few cells from the last, as by a vehicle on its way."""
+        self._at = (self._at + self._chance.integers(-8, 9, size=2)) % (SIDE_CELLS - 8)
+        start = self.replica.grid.cell(*self._at.tolist())
         kind = self._chance.choice([MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR])
         self._feed.publish(self.replica.write(np.arange(start, start + 8), kind, 2.0, now_ns))
 
