@@ -59,12 +59,15 @@ def save_scale(report: dict[str, Any], path: Path) -> None:
             last = column == len(shown) - 1
             _lines(above, found, name, "frame_ms_mean", last)
             _lines(below, found, name, "gap_p95", last)
-            above.set_title(f"over {words}: {fixed}", color=FAINT, fontweight="normal", fontsize=9.5)
+            above.set_title(fixed)
             below.set_xlabel(words)
         grid[0][0].set_ylabel("CPU ms a frame, all targets")
         grid[1][0].set_ylabel("% above the optimum that 95 % of routes keep")
         for each in grid[0]:
-            each.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            low, high = each.get_ylim()
+            steps = (1.0, 2.0, 5.0) if high / low < 100 else (1.0,)
+            each.yaxis.set_major_locator(LogLocator(subs=steps, numticks=12))
+            each.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
         for each in grid[1]:
             _gap_axis(each.yaxis)
             each.set_ylim(bottom=EXACT_PERCENT * 0.8)
@@ -85,8 +88,10 @@ def save_gap(report: dict[str, Any], tallies: Mapping[Any, Mapping[Strategy, Tal
         for (left, right), (walk, found) in zip(grid, tallies.items(), strict=True):
             _shares(left, found)
             _over_time(right, found, report["frames"])
-            left.set_title(f"Target: {walk}. Routes that are worse than so much above the optimum")
-            right.set_title("95 % of a frame's routes keep")
+            left.set_title(f"Target: {walk}")
+            left.set_xlabel("above the optimum")
+            left.set_ylabel("of routes are worse")
+            right.set_title("Above the optimum: what 95 % of a frame's routes keep")
         _head(
             figure,
             f"How far from optimal: {report['dem']}",
@@ -139,7 +144,7 @@ def _shares(axes: Axes, tallies: Mapping[Strategy, Tally]) -> None:
     _plain(axes)
     axes.legend(
         handles=[Line2D([], [], color=COLOURS[name], linewidth=2, label=LABELS[name]) for name in tallies],
-        loc="upper right",
+        loc="lower left",
         handlelength=1.2,
     )
 
