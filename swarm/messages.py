@@ -78,8 +78,16 @@ class Nothing(Message, frozen=True, kw_only=True, tag=schema_of("nothing")):
 # --- the shared map -----------------------------------------------------------------------------------------
 
 
-class MarkSet(Message, frozen=True, kw_only=True, tag=schema_of("marks")):
+FOLDS = 1 << 16
+"""An author's own numbers are multiples of this."""
+
+
+class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks")):
     """All that one author says about one tile. Replaces the author's set with a lower (epoch, seq).
+
+    An author counts `seq` in steps of 65536. The numbers between are for keepers, which fold what the dead have left
+    behind: drop from it what others overrule. Such a set without statements is a burial: readers forget the tile of
+    that author.
 
     cells      uint16  index inside the tile, row-major over 32 x 32, strictly increasing
     kinds      uint8   MarkKind
@@ -111,7 +119,7 @@ class MarkSet(Message, frozen=True, kw_only=True, tag=schema_of("marks")):
         check_lengths(len(self.kinds), self.cells, self.kinds, self.paces, self.stamps_ns, self.untils_ns)
 
 
-class MarkSets(Message, frozen=True, kw_only=True, tag=schema_of("mark-sets")):
+class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark-sets")):
     """Many sets of one author and group, as one reply carries them: columns over the sets, then the statements of
     all sets, one set after the other.
 
@@ -342,6 +350,27 @@ class Claims(Message, frozen=True, kw_only=True, tag=schema_of("claims")):
             check_id("vehicle", vehicle)
         if any(not cells for cells in self.holds.values()):
             raise ValueError("a vehicle holds at least the cell that it stands on")
+
+
+class Grounds(Message, frozen=True, kw_only=True, tag=schema_of("grounds")):
+    """The regions in which an agent's vehicles may claim cells: in a question to all agents, and in each answer.
+
+    seq     grows with each change within an incarnation; 0 while the agent has not put its vehicles anywhere
+    silent  asked: dead agents whose last words are wanted
+    words   answered: the newest claims that were heard of those
+    """
+
+    agent: str
+    incarnation: Natural
+    seq: Natural
+    regions: list[Natural]
+    silent: list[str] = []
+    words: list[Claims] = []
+
+    def __post_init__(self) -> None:
+        check_id("agent", self.agent)
+        for agent in self.silent:
+            check_id("silent", agent)
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):

@@ -19,9 +19,10 @@ from swarm.messages import (
     Digest,
     Fleet,
     Followed,
+    Grounds,
     MarkSet,
-    MarksRequest,
     MarkSets,
+    MarksRequest,
     Message,
     Note,
     Nothing,
@@ -50,8 +51,8 @@ class Topic:
     key       template below the namespace; `{name}` stands for one chunk
     message   what is put, or what a query is answered with
     request   for a queryable: what is asked; None for a topic that is only published
-    newest    each value says all there is under its key, so a reader may skip to the newest
     bulk      for a queryable: what may carry many values in one reply, to those who ask for it so
+    newest    each value says all there is under its key, so a reader may skip to the newest
     buffer    samples that a slow reader keeps; the oldest are dropped first
     """
 
@@ -61,8 +62,8 @@ class Topic:
     what: str
     rate: str
     request: type[Message] | None = None
-    published: bool = True
     bulk: type[Message] | None = None
+    published: bool = True
     newest: bool = True
     priority: Priority = Priority.DATA
     buffer: int = 1024
@@ -148,8 +149,13 @@ FLEET = Topic(
 )  # fmt: skip
 CLAIMS = Topic(
     "claims", "claims/{agent}", Claims,
-    "which cells vehicles hold and want; anybody who heard an agent answers with its last", "every tick, on change",
-    request=Nothing, priority=Priority.INTERACTIVE,
+    "which cells vehicles hold and want, for neighbours and witnesses; who heard an agent answers with its last",
+    "every tick, on change", request=Nothing, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+GROUNDS = Topic(
+    "grounds", "grounds/{agent}", Grounds,
+    "in which regions agents claim cells: asked of all before a region is entered", "on change", request=Grounds,
+    published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
@@ -181,7 +187,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CLAIMS, FOLLOWED, PUSHED_ROUTE, POSE, ROUTE, COST, STATUS, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CLAIMS, GROUNDS, FOLLOWED, PUSHED_ROUTE, POSE, ROUTE, COST,
+    STATUS, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

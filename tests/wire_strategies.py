@@ -23,6 +23,7 @@ from swarm.messages import (
     Digest,
     Fleet,
     Followed,
+    Grounds,
     MarkKind,
     MarkSet,
     MarkSets,
@@ -147,6 +148,13 @@ def route_requests(draw: st.DrawFn) -> RouteRequest:
     )
 
 
+claims = st.builds(
+    Claims, agent=ids, incarnation=naturals, seq=naturals, clock=naturals,
+    holds=st.dictionaries(ids, st.lists(cells, min_size=1, max_size=4), max_size=3),
+    wants=st.lists(st.builds(Want, vehicle=ids, cell=cells, ticket=naturals), max_size=3),
+    seen=st.dictionaries(ids, st.tuples(naturals, naturals), max_size=3),
+)  # fmt: skip
+
 MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     RunInfo: st.builds(
         RunInfo, run_id=texts, role=ids, id=ids, incarnation=naturals, scenario=texts, terrain=texts, rows=naturals,
@@ -166,11 +174,10 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     BaseMapRequest: st.builds(BaseMapRequest, layers=st.lists(texts, max_size=3), regions=st.lists(naturals)),
     BaseMapTile: st.builds(BaseMapTile, layer=texts, region=naturals, data=st.binary(max_size=50)),
     Fleet: fleets(),
-    Claims: st.builds(
-        Claims, agent=ids, incarnation=naturals, seq=naturals, clock=naturals,
-        holds=st.dictionaries(ids, st.lists(cells, min_size=1, max_size=4), max_size=3),
-        wants=st.lists(st.builds(Want, vehicle=ids, cell=cells, ticket=naturals), max_size=3),
-        seen=st.dictionaries(ids, st.tuples(naturals, naturals), max_size=3),
+    Claims: claims,
+    Grounds: st.builds(
+        Grounds, agent=ids, incarnation=naturals, seq=naturals, regions=st.lists(naturals, max_size=3),
+        silent=st.lists(ids, max_size=2), words=st.lists(claims, max_size=2),
     ),
     Followed: st.builds(
         Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite, lower_bound_s=finite
@@ -245,6 +252,10 @@ EXAMPLES: tuple[Message, ...] = (
     Claims(
         agent="a0", incarnation=7, seq=3, clock=4, holds={"a0-00": [4, 5]},
         wants=[Want(vehicle="a0-00", cell=6, ticket=3)], seen={"a1": (7, 2)},
+    ),
+    Grounds(
+        agent="a0", incarnation=7, seq=2, regions=[0, 3], silent=["a1"],
+        words=[Claims(agent="a1", incarnation=7, seq=2, clock=1, holds={"a1-00": [9]}, wants=[], seen={})],
     ),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),

@@ -19,6 +19,7 @@ from swarm.messages import Claims, PushedRoute, Route, RouteReply, RouteStatus, 
 from vehicle_agent.assignment import choose
 from vehicle_agent.avoidance import Resumption, RightOfWay
 from vehicle_agent.follower import route_cells
+from vehicle_agent.grounds import SharedGround
 from vehicle_agent.placement import nearest_free
 from vehicle_agent.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic import Traffic
@@ -101,11 +102,12 @@ class Agent:
         sensor: Sensor,
         spawns: Mapping[str, Mapping[str, int]],
         incarnation: int,
+        shared_ground: SharedGround | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
         self.targets = list(plan.group.targets) or scenario.target_ids
-        self.rights = RightOfWay(plan.id, incarnation, spawns)
+        self.rights = RightOfWay(plan.id, incarnation, spawns, shared_ground)
         self.blocked_ticks = 0
         self._spawns = spawns[plan.id]
         self._config = scenario.vehicles
@@ -171,6 +173,12 @@ class Agent:
 
     def _is_free(self, cell: int) -> bool:
         return not self._traffic.closed(cell) and self.rights.holder(cell) is None
+
+    @property
+    def places(self) -> list[int]:
+        """The cells on which we claim something or mean to: our ground has to cover them."""
+        claimed = [cell for id in self.vehicles for cell in (*self.rights.holds(id), *self.rights.wants(id))]
+        return [*claimed, *self._homeless.values()]
 
     # --- driving --------------------------------------------------------------------------------------------
 

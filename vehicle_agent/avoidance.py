@@ -3,7 +3,8 @@
 The rule is Ricart and Agrawala's (1981) on messages that each carry their sender's whole state, so that loss,
 repetition and reordering do no harm. A vehicle may enter a cell when every other live agent has echoed the message
 in which the want first stood, and in nobody's newest claims the cell is held, or wanted with a lower
-(ticket, agent, vehicle).
+(ticket, agent, vehicle). With `SharedGround` only those neighbours and witnesses are waited for and heard whom it
+names, and a cell is wanted only in a region that it calls settled.
 
 Why no two get the same cell: A goes by a message of B that echoes A's want, B by one of A that echoes B's. Had B
 got the cell before it sent that message, the message would say so. So B got it later, when it knew A's want, and
@@ -18,10 +19,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 from swarm.messages import Claims, Want
+from vehicle_agent.grounds import SharedGround
 
 _CLOCK_LIMIT = 1 << 61
+_NOBODY: Mapping[str, _Other] = MappingProxyType({})
 
 Rank = tuple[int, str, str]
 """(ticket, agent, vehicle): the lower goes first."""
@@ -60,6 +64,7 @@ class _Other:
             rank = (want.ticket, claims.agent, want.vehicle)
             if want.cell not in self.wanted or rank < self.wanted[want.cell]:
                 self.wanted[want.cell] = rank
+        self.cells = self.held.keys() | self.wanted.keys()
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +80,16 @@ class RightOfWay:
 
     spawns  agent -> vehicle -> cell where each agent of the run puts its vehicles when it first starts: held for
             those that have not spoken yet
+    ground  who shares ground with us; None where everybody does
     """
 
-    def __init__(self, agent: str, incarnation: int, spawns: Mapping[str, Mapping[str, int]]) -> None:
+    def __init__(
+        self,
+        agent: str,
+        incarnation: int,
+        spawns: Mapping[str, Mapping[str, int]],
+        ground: SharedGround | None = None,
+    ) -> None:
         self.agent = agent
         self.incarnation = incarnation
         self._seq = 0
@@ -85,14 +97,16 @@ class RightOfWay:
         self._mine: dict[str, _Mine] = {}
         self._held_by: dict[int, str] = {}
         self._wanting: dict[int, list[str]] | None = None
+        self._ground = ground
         self._others: dict[str, _Other] = {}
+        self._by_cell: dict[int, dict[str, _Other]] = {}  # who of the others holds or wants a cell
         self._alive: dict[str, int] = {}
         self._changed = True
         for other, vehicles in spawns.items():
             if other != agent:
                 holds = {vehicle: [cell] for vehicle, cell in vehicles.items()}
                 claims = Claims(agent=other, incarnation=0, seq=0, clock=0, holds=holds, wants=[], seen={})
-                self._others[other] = _Other(claims)
+                self._take(other, _Other(claims))
 
     # --- what the others say --------------------------------------------------------------------------------
 
@@ -107,7 +121,9 @@ class RightOfWay:
         known = self._others.get(claims.agent)
         if known is not None and (claims.incarnation, claims.seq) <= _stamp(known.claims):
             return
-        self._others[claims.agent] = _Other(claims)
+        if self._ground is not None and self._ground.is_far(claims.agent):
+            return  # it was a neighbour when it said this
+        self._take(claims.agent, _Other(claims))
         if claims.clock < _CLOCK_LIMIT:  # an honest one never gets there; ours must stay within what fits the wire
             self._clock = max(self._clock, claims.clock)
         self._changed = self._changed or bool(claims.wants)
@@ -115,6 +131,31 @@ class RightOfWay:
     def set_alive(self, agents: Mapping[str, int]) -> None:
         """Which agents live, and in which incarnation. A dead one is not waited for; its claims stand."""
         self._alive = {agent: incarnation for agent, incarnation in agents.items() if agent != self.agent}
+
+    def forget_the_far(self) -> None:
+        """Drop the claims of those who live and share no ground with us any more: we hear no newer ones."""
+        if self._ground is not None:
+            for agent in [agent for agent in self._others if self._ground.is_far(agent)]:
+                self._take(agent, None)
+
+    def _take(self, agent: str, other: _Other | None) -> None:
+        """Put another agent's claims in the place of its earlier ones."""
+        known = self._others.pop(agent, None)
+        if known is not None:
+            for cell in known.cells:
+                there = self._by_cell[cell]
+                del there[agent]
+                if not there:
+                    del self._by_cell[cell]
+        if other is not None:
+            self._others[agent] = other
+            for cell in other.cells:
+                self._by_cell.setdefault(cell, {})[agent] = other
+
+    def words_of(self, agents: Sequence[str]) -> list[Claims]:
+        """The newest claims that we have heard of these agents."""
+        heard = (self._others.get(agent) for agent in agents)
+        return [other.claims for other in heard if other is not None and other.claims.seq]
 
     # --- what our vehicles do -------------------------------------------------------------------------------
 
@@ -129,6 +170,7 @@ class RightOfWay:
     def ask(self, vehicle: str, ahead: Sequence[int]) -> None:
         """Want exactly these cells, in this order; what was held or wanted besides is given up at once."""
         mine = self._mine.setdefault(vehicle, _Mine())
+        ahead = self._settled_part(mine, ahead)
         base = 1 if mine.holds else 0
         kept = 0
         while kept < len(ahead) and base + kept < len(mine.holds) and mine.holds[base + kept] == ahead[kept]:
@@ -147,6 +189,27 @@ class RightOfWay:
         self._wanting = None
         mine.wants = [old.get(cell) or _Wanted(cell, self._clock, self._seq + 1) for cell in wanted]
         self._changed = True
+
+    def _settled_part(self, mine: _Mine, ahead: Sequence[int]) -> Sequence[int]:
+        """The cells up to the first in a region that not everybody knows to be ours."""
+        if self._ground is not None:
+            for index, cell in enumerate(ahead):
+                if cell not in mine.holds and not self._is_settled(cell):
+                    return ahead[:index]
+        return ahead
+
+    def _is_settled(self, cell: int) -> bool:
+        ground = self._ground
+        if ground is None:
+            return True
+        region = ground.region_of(cell)
+        if not ground.settled(region):
+            return False
+        for agent, incarnation in ground.dead_in(region):
+            other = self._others.get(agent)
+            if other is None or other.claims.incarnation < incarnation:
+                return False  # nobody who lives can tell where its vehicles stand
+        return True
 
     def moved(self, vehicle: str, cell: int) -> None:
         """The vehicle stands on a cell that it holds: those before it are free."""
@@ -173,7 +236,7 @@ class RightOfWay:
                 rank = (want.ticket, self.agent, vehicle)
                 if want.seq > echoed or want.cell in self._held_by or firsts[want.cell] < rank:
                     break
-                if self._others_forbid(want.cell, rank):
+                if not self._is_settled(want.cell) or self._others_forbid(want.cell, rank):
                     break
                 mine.holds.append(want.cell)
                 self._held_by[want.cell] = vehicle
@@ -220,7 +283,7 @@ class RightOfWay:
         """Who holds a cell, as far as we know; of a dead agent also who wanted it."""
         if cell in self._held_by:
             return self._held_by[cell]
-        for agent, other in self._others.items():
+        for agent, other in self._by_cell.get(cell, _NOBODY).items():
             if cell in other.held:
                 return other.held[cell]
             if cell in other.wanted and self._dead(agent, other):
@@ -239,7 +302,7 @@ class RightOfWay:
             if vehicle != besides:
                 holds = self._mine[vehicle].holds
                 found.append(Wanter(vehicle, holds[0] if holds else None))
-        for agent, other in self._others.items():
+        for agent, other in self._by_cell.get(cell, _NOBODY).items():
             if cell in other.wanting and not self._dead(agent, other):
                 for vehicle in other.wanting[cell]:
                     stands = other.claims.holds.get(vehicle)
@@ -263,6 +326,8 @@ class RightOfWay:
         """The newest sequence number of ours that every live agent has seen."""
         echoed = self._seq
         for agent, incarnation in self._alive.items():
+            if self._ground is not None and agent not in self._ground.echoed_by:
+                continue
             other = self._others.get(agent)
             if other is None or other.claims.incarnation != incarnation:
                 return -1
@@ -273,7 +338,7 @@ class RightOfWay:
         return echoed
 
     def _others_forbid(self, cell: int, rank: Rank) -> bool:
-        for agent, other in self._others.items():
+        for agent, other in self._by_cell.get(cell, _NOBODY).items():
             if cell in other.held:
                 return True
             wanted = other.wanted.get(cell)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.cost_map import CostMap
 from shared_map.feed import MapFeed
+from shared_map.interest import Interest
 from shared_map.replica import MapReplica
 from shared_map.terrain import Terrain
 from swarm.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
@@ -22,6 +24,7 @@ from swarm.messages import (
     CostReply,
     CostRequest,
     Followed,
+    Grounds,
     Nothing,
     PushedRoute,
     RouteReply,
@@ -31,10 +34,11 @@ from swarm.messages import (
     column,
 )
 from swarm.role import RoleSetup
-from swarm.topics import CLAIMS, COST, FLEET, FOLLOWED, POSE, PUSHED_ROUTE, ROUTE
+from swarm.topics import CLAIMS, COST, FLEET, FOLLOWED, GROUNDS, POSE, PUSHED_ROUTE, ROUTE
 from vehicle_agent.agent import Agent, AgentAction, AskCosts, AskRoutes, LocalMap
 from vehicle_agent.avoidance import Resumption
 from vehicle_agent.fleet import FleetReport, directions_of
+from vehicle_agent.grounds import SharedGround
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensor import TruthSensor
 from vehicle_agent.vehicle import Follow, VehicleAction
@@ -48,6 +52,9 @@ _RESUME_TIMEOUT_S = 2.0
 _ASK_AGAIN_NS = NS_PER_S // 10
 _MOURN_NS = NS_PER_S // 2
 """An agent whose token fell is waited for a little longer: if our own link is cut, word of that may come later."""
+_GROUND_LEAD_CELLS = 24
+"""A region is asked for so far ahead of its first claim: the answers are there before a vehicle is."""
+_GROUNDS_TIMEOUT_S = 1.0
 _CLAIMS_IDLE_NS = NS_PER_S // 2
 _FIRST_START_NS = 5 * NS_PER_S
 _ALONE_NS = 30 * NS_PER_S
@@ -83,7 +90,11 @@ class AgentService:
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
-        self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation)
+        agents = [each.id for each in plan_agents(scenario)]
+        self._ground = SharedGround(plan.id, setup.incarnation, grid, agents)
+        self._near = Interest(grid, scenario.vehicles.claim_cells + _GROUND_LEAD_CELLS)
+        self._listens_to: frozenset[str] = frozenset()
+        self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation, self._ground)
         self._fleet = FleetReport(grid, setup.author, plan.group.name)
         self._resumption: Resumption | None = Resumption(plan.id)
         self._resume_due_ns: int | None = None
@@ -103,8 +114,8 @@ class AgentService:
         return self._agent
 
     def start(self, now_ns: int) -> None:
-        self._bus.subscribe(CLAIMS, self._post)
         self._bus.serve(CLAIMS, self._post)
+        self._bus.serve(GROUNDS, self._post, agent=self._setup.id)
         self._bus.watch_alive(self._post, role="agent")
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
@@ -120,8 +131,6 @@ class AgentService:
         agent = self._agent
         match event:
             case Heard(message=Claims() as claims):
-                if self._resumption is not None:
-                    self._resumption.heard(claims)
                 agent.hear_claims(claims)
             case Heard(message=TargetPose() as pose):
                 agent.hear_pose(pose, now_ns)
@@ -137,6 +146,10 @@ class AgentService:
             case Replied(message=Claims() as claims):
                 if self._resumption is not None:
                     self._resumption.answered(claims)
+            case Replied(tag=tag, message=Grounds() as grounds):
+                for claims in grounds.words:
+                    agent.hear_claims(claims)
+                self._ground.answered(grounds, _number(tag))
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
                 self._asked_ns.pop(tag, None)
                 agent.routes_ended(_number(tag), now_ns)
@@ -146,6 +159,11 @@ class AgentService:
                 self._place_if_known(now_ns)
             case Asked(topic=topic) if topic is CLAIMS:
                 self._answer(event)
+            case Asked(topic=topic, request=Grounds() as grounds) if topic is GROUNDS:
+                self._ground.told(grounds)
+                words = agent.rights.words_of(grounds.silent)
+                event.answer(msgspec.structs.replace(self._ground.answer(), words=words))
+                event.end()
             case Appeared(peer):
                 self._roster.appeared(peer)
                 self._mourned_ns.pop(peer.id if peer.role == "agent" else "", None)
@@ -159,6 +177,7 @@ class AgentService:
                 # Cut off, we hear no wants: nobody enters anything new before the others are heard of again.
                 self._link_up = up
                 self._trust_roster_ns = now_ns + self._lease_ns
+                self._ground.ask_anew()
             case _:
                 pass
 
@@ -176,6 +195,7 @@ class AgentService:
         if any(due_ns <= now_ns for due_ns in self._mourned_ns.values()):
             self._mourned_ns = {id: due_ns for id, due_ns in self._mourned_ns.items() if due_ns > now_ns}
             self._roster_changed(now_ns)
+        self._come_to_terms(now_ns)
         may_enter = self._link_up and now_ns >= self._trust_roster_ns
         if may_enter:
             agent.rights.grant()
@@ -210,6 +230,7 @@ class AgentService:
             self._resume_due_ns = now_ns + _ASK_AGAIN_NS
             return
         self._resumption = None
+        self._ground.set_alive(agents)
         self._agent.rights.set_alive(agents)
         self._agent.placed_by(known)
         self._agent.set_planners(self._roster.alive("planner"), now_ns)
@@ -220,6 +241,24 @@ class AgentService:
             log.info("%d vehicles go on where they last stood", count)
             text = f"agent {self._setup.id} is back: {count} vehicles go on where they last stood"
             self._member.note(now_ns, "resumed", text)
+
+    def _come_to_terms(self, now_ns: int) -> None:
+        """Tell everybody in which regions we claim cells, and listen to whom that concerns."""
+        ground = self._ground
+        ground.wish(self._near.update(self._agent.places))
+        question = ground.question(now_ns)
+        if question is not None:
+            self._bus.ask(
+                GROUNDS, question, self._post, tag=f"grounds-{question.seq}", timeout_s=_GROUNDS_TIMEOUT_S
+            )
+        self._agent.rights.forget_the_far()
+        if ground.heard_from == self._listens_to:
+            return
+        for agent in sorted(ground.heard_from - self._listens_to):
+            self._bus.subscribe(CLAIMS, self._post, agent=agent)
+        for agent in sorted(self._listens_to - ground.heard_from):
+            self._bus.unsubscribe(CLAIMS, agent=agent)
+        self._listens_to = ground.heard_from
 
     def _answer(self, asked: Asked) -> None:
         if self._resumption is not None:
@@ -244,6 +283,7 @@ class AgentService:
         agents = self._roster.alive("agent")
         for id in self._mourned_ns:
             agents.setdefault(id, 0)
+        self._ground.set_alive(agents)
         self._agent.rights.set_alive(agents)
         self._agent.set_planners(self._roster.alive("planner"), now_ns)
 
