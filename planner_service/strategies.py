@@ -29,7 +29,7 @@ from planner_service.kernels.rules import NONE
 from planner_service.routes import read_routes
 from planner_service.skeleton import Skeleton, find_skeleton
 from planner_service.tree import CostToGoTree
-from planner_service.windows import block_window
+from planner_service.windows import AHEAD, Rungs, block_half
 from shared_map.arrays import Floats
 from shared_map.climb import Climb
 from swarm.config import PlannerConfig
@@ -122,6 +122,8 @@ class TargetTree:
         # Of the coarse strategies. It holds for the map on which it was found, so that a change unmakes it.
         self._skeleton: Skeleton | None = None
         self._full_ns = self.measured_model_ns()
+        self._rungs = Rungs(grid, 4 << config.k_min)
+        self._full_root = 0
         self._bounds = LowerBounds(self._ground)
 
     # --- keeping up ---------------------------------------------------------------------------------------------
@@ -200,10 +202,10 @@ class TargetTree:
             return Update("none")
         since = self._ground.difference(grown.weight, [self._grid.window] if fresh else dirty)
         tree = self._tree
-        self._moves = 0
         if grown.cost[self._ground.pad(grown.target_cell)] != 0.0:
             return self._grow_full(target_cell)
         tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
+        self._full_at(grown.target_cell)
         self._bounds.take(grown.cost.copy())
         self._stale = False
         self._skeleton = None if since.cells.size else grown.skeleton
@@ -283,13 +285,8 @@ class TargetTree:
         return self._config.cpu_budget * 1e9 / self._config.tick_hz
 
     @property
-    def _full_every(self) -> int:
-        """Moves from one full growth to the next; 0 for never."""
-        if self._config.strategy == "rotation":
-            return self._config.full_every
-        if self._config.strategy == "auto":
-            return max(2, math.ceil(self._full_ns / self._budget_ns))
-        return 0
+    def _rotates(self) -> bool:
+        return self._config.strategy in ("rotation", "auto")
 
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
         """Take the map's changes. None the first time: everything is new."""
@@ -320,10 +317,16 @@ class TargetTree:
     def _grow_full(self, target_cell: int) -> Update:
         self._tree.grow(target_cell)
         self._stale = False
-        self._moves = 0
+        self._full_at(target_cell)
         if self._windows:
             self._bounds.take(self._tree.cost.copy())
         return Update("full", self._grid.window, self._grid.cells)
+
+    def _full_at(self, root: int) -> None:
+        """The whole tree was grown around this cell."""
+        self._moves = 0
+        self._full_root = root
+        self._rungs.grown(root, max(self._grid.rows, self._grid.cols))
 
     def _mend(self, changes: Changes | None) -> Update | None:
         """Repair the tree; None if it must be grown instead."""
@@ -348,9 +351,8 @@ class TargetTree:
             return self._grow_full(target_cell)
         if not tree.precise:
             tree.relabel()
-        # Between full growths a window twice as wide costs little and keeps routes nearer to the optimum.
-        k_min = self._config.k_min + (1 if self._full_every else 0)
-        window = block_window(self._grid, tree.root, target_cell, k_min)
+        half = self._half(target_cell)
+        window = self._grid.around(target_cell, half)
         cells = 0
         wide = self._config.strategy == "multi_resolution" or window.cells * WIDE_SHARE > self._grid.cells
         if self._skeleton is not None and wide:
@@ -361,18 +363,35 @@ class TargetTree:
         while window.cells * 2 < self._grid.cells:
             grown = tree.move(target_cell, window)
             if grown:
+                self._rungs.grown(target_cell, half)
                 return Update("window", window, cells + grown)
             cells += window.cells
-            height, width = window.row1 - window.row0, window.col1 - window.col0
-            window = self._grid.around(target_cell, max(height, width))
+            half *= 2
+            window = self._grid.around(target_cell, half)
         return self._grow_full(target_cell)
 
+    def _half(self, target_cell: int) -> int:
+        """How far to every side of the target the tree is grown now."""
+        old = self._tree.root
+        if not self._rotates:
+            return block_half(self._grid, old, target_cell, self._config.k_min)
+        share = INLINE_NS / 2 / self._full_ns
+        widest = math.isqrt(int(share * self._grid.cells)) // 2
+        return max(self._rungs.half(target_cell, widest), 2 * self._grid.distance_cells(old, target_cell))
+
     def _with_wish(self, update: Update) -> Update:
-        due = self._full_every
-        wants = bool(due) and self._moves >= due and update.kind != "full"
-        if self._coarse and self._skeleton is None:
+        """Ask for a full growth where one is due and none is under way."""
+        wants = False
+        if self._coarse:
+            wants = self._skeleton is None and self._moves >= self._config.full_every
+        elif self._config.strategy == "rotation":
             wants = self._moves >= self._config.full_every
-        wants = wants and not self._job_out
+        elif self._config.strategy == "auto":
+            # As often as the budget allows, but no sooner than the whole map were due as a window.
+            come = self._grid.distance_cells(self._full_root, self._tree.root)
+            far = 2 * AHEAD * come >= max(self._grid.rows, self._grid.cols)
+            wants = far and self._moves * self._budget_ns >= self._full_ns
+        wants = wants and update.kind != "full" and not self._job_out
         return Update(update.kind, update.window, update.cells, wants)
 
     def _inside(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:

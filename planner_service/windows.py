@@ -1,19 +1,61 @@
-"""How wide a window a move asks for: the paper's variable range, mended and as printed."""
+"""How wide a window a move asks for: rungs of doubling width; the paper's variable range, mended and as printed."""
 
 from __future__ import annotations
 
 from swarm.grid import GridSpec, Window
 
+AHEAD = 16
+"""A window reaches so many times as far as the target has come since one so wide was grown last."""
 
-def block_window(grid: GridSpec, old: int, new: int, k_min: int) -> Window:
+
+class Rungs:
+    """Windows of doubling width, each grown anew once the target has come a share of that width.
+
+    Routes are as old as the widest window that they begin in. What the target has moved since matters in proportion
+    to how far away it is: a window that reaches `AHEAD` times as far keeps that small at every distance, and costs
+    64 cells of growth per cell of its width and move.
+
+    half  of the narrowest window, cells to every side; one that narrow is grown with every move
+    """
+
+    def __init__(self, grid: GridSpec, half: int) -> None:
+        self._grid = grid
+        self._half = half
+        self._centres = [-1] * (max(grid.rows, grid.cols) // half).bit_length()
+
+    def half(self, cell: int, widest: int) -> int:
+        """How far the window around a target that came to `cell` should reach, at most `widest` unless one rung is
+        wider. No window is ever narrower than the way since one so wide, so that windows overlap."""
+        found = self._half
+        for rung, centre in enumerate(self._centres):
+            half = self._half << rung
+            if half > max(widest, self._half):
+                break
+            if AHEAD * self._grid.distance_cells(centre, cell) >= half:
+                found = half
+        return found
+
+    def grown(self, cell: int, half: int) -> None:
+        """The tree was grown around `cell`, so far to every side."""
+        for rung in range(len(self._centres)):
+            if self._half << rung <= half:
+                self._centres[rung] = cell
+
+
+def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
     """The paper's variable range: the largest k >= k_min whose block index of 2**k cells changed between two cells
-    gives a window 2**(k+2)+1 wide; if none did, the one of k_min. At least as far out as the move was long, and
-    shut around both cells."""
+    gives a window that reaches 2**(k+1) cells to every side; if none did, the one of k_min. At least twice as far as
+    the move was long, so that the window holds both cells and some room around them."""
     row, col = grid.row_col(new)
     old_row, old_col = grid.row_col(old)
     # Of numbers that differ, the highest bit in which they do is the largest block that has changed.
     k = max(k_min, ((row ^ old_row) | (col ^ old_col)).bit_length() - 1)
-    return grid.around(new, max(2 << k, 2 * grid.distance_cells(old, new)))
+    return max(2 << k, 2 * grid.distance_cells(old, new))
+
+
+def block_window(grid: GridSpec, old: int, new: int, k_min: int) -> Window:
+    """The window of `block_half` around the new cell."""
+    return grid.around(new, block_half(grid, old, new, k_min))
 
 
 def literal_window(grid: GridSpec, old: int, new: int) -> Window:
