@@ -34,7 +34,7 @@ TREE_BYTES_PER_CELL = 40
 """Of one target's tree with all that a strategy keeps beside it, and a job's snapshot; measured, rounded up."""
 RUN_IN = 10
 """Frames before the measured ones, in which the trees of a strategy get out of step with each other."""
-FEWEST = 3
+FEWEST = 4
 """Frames that every strategy is measured for, whatever it takes."""
 
 

@@ -119,7 +119,7 @@ def _check_picture(picture: Path | None) -> None:
 
 @app.command()
 def peers(
-    size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side; a file has its own.")] = 512,
+    size: Annotated[int, typer.Option(min=16, max=8192, help="Cells a side; a file has its own.")] = 512,
     field: FieldOption = "terrain",
     repeats: Annotated[int, typer.Option(min=1, help="Interleaved runs, each from another root.")] = 7,
     edge: Annotated[str, typer.Option(help="paper (the rule all share) or octile.")] = "paper",
@@ -211,7 +211,7 @@ def scale(
 
     \b
     swarm bench scale --picture scale.png
-    swarm bench scale --sizes 4096 --targets 10 --vehicles 1000 --strategies auto --frames 120 --seconds 60
+    swarm bench scale --sizes 4096 --targets 10 --vehicles 1000 --frames 120
 
     Varies one thing at a time, from the smallest size and the middle numbers of targets and vehicles; --full takes
     every combination. Trees that do not fit into half of the free memory are run in groups.
@@ -262,7 +262,7 @@ def gap(
     """Driven cost over optimum for a moving target, and what the certificates prove of it.
 
     \b
-    swarm bench gap --dem ridge.tif --walk random,waypoints,evade --picture gap.png
+    swarm bench gap --dem ridge.tif --walk random,evade --picture gap.png
     swarm bench gap --dem ridge.tif --strategies rotation --full-every 5
     """
     from launch_scripts.bench.gap import WALKS, run_gap, tables

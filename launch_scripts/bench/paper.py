@@ -40,7 +40,7 @@ def run_paper(
     table_2: list[dict[str, Any]] = []
     for done, (targets, vehicles) in enumerate(TABLE_1):
         last = done == len(TABLE_1) - 1
-        plan = Plan(targets=targets, vehicles=vehicles, frames=frames, judge_every=5, seed=seed)
+        plan = Plan(targets=targets, vehicles=vehicles, frames=frames, judge_every=min(5, frames), seed=seed)
         entrants = {name: PlannerConfig(strategy=name, edge="paper") for name in (TABLE_2 if last else COMPARED)}
 
         def tell(frame: int, of: int, done: int = done) -> None:

@@ -64,7 +64,7 @@ def run_scale(
             vehicles=vehicles,
             frames=frames,
             max_cells=max_cells,
-            judge_every=4,
+            judge_every=min(2, frames),
             seconds=seconds,
             seed=seed,
         )
