@@ -23,6 +23,11 @@ MAX_WINDOWS = 32
 """Dirty windows are merged into fewer beyond this."""
 
 
+_FEW = 16
+"""Up to so many cells are looked at one by one."""
+_MANY_BOXES = 8 * MAX_WINDOWS
+
+
 class CostSnapshot(NamedTuple):
     """A copy that another thread may keep."""
 
@@ -54,7 +59,8 @@ class CostMap:
         """Make these the current statements about these cells (flat indices). Of a repeated cell the last counts.
 
         PACE sets the pace, also where the prior is lethal; LETHAL forbids; CLEAR gives back the prior."""
-        if len(cells) == 0:
+        if len(cells) <= _FEW:
+            self._apply_few(cells, kinds, paces)
             return
         where = np.asarray(cells, np.int64)
         if int(where.min()) < 0 or int(where.max()) >= self.grid.cells:
@@ -73,6 +79,35 @@ class CostMap:
             return
         self._compose(where, where[lethality])
 
+    def _apply_few(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
+        """As `apply` of the handful of cells that a set changes as a rule: an array of one cell costs as much as
+        one of a thousand, and somebody waits."""
+        places: list[int] = cells.tolist()
+        if places and not 0 <= min(places) <= max(places) < self.grid.cells:
+            raise OutsideGridError(f"a mark is on cell {max(places)} of {self.grid.rows} x {self.grid.cols}")
+        ground = self.ground_s_per_m.reshape(-1)
+        before: dict[int, float] = {}
+        for cell, kind, pace in zip(places, kinds.tolist(), paces.tolist(), strict=True):
+            value = pace if kind == MarkKind.PACE else LETHAL if kind == MarkKind.LETHAL else self._prior[cell]
+            was = ground.item(cell)
+            if was != value:
+                before.setdefault(cell, was)
+                ground[cell] = value
+        changed = [cell for cell, was in before.items() if ground.item(cell) != was]
+        if not changed:
+            return
+        self.version += 1
+        if self._halves:
+            flipped = [cell for cell in changed if (before[cell] == LETHAL) != (ground.item(cell) == LETHAL)]
+            self._compose(np.array(changed, np.int64), np.array(flipped, np.int64))
+            return
+        boxes: dict[tuple[int, int], Window] = {}
+        for row, col in (divmod(cell, self.grid.cols) for cell in changed):
+            tile = (row // TILE_CELLS, col // TILE_CELLS)
+            box = Window(row, col, row + 1, col + 1)
+            boxes[tile] = boxes[tile].union(box) if tile in boxes else box
+        self._dirty = merged([*self._dirty, *boxes.values()])
+
     def take_dirty(self) -> list[Window]:
         """Windows that cover every cell whose pace changed since the last call; they do not touch each other."""
         windows, self._dirty = self._dirty, []
@@ -88,8 +123,9 @@ class CostMap:
         clear = kinds == MarkKind.CLEAR
         values[clear] = self._prior[where[clear]]
         if len(where) > 1:
-            unique, first_from_behind = np.unique(where[::-1], return_index=True)
-            if len(unique) < len(where):
+            ordered = np.sort(where)
+            if (ordered[1:] == ordered[:-1]).any():
+                unique, first_from_behind = np.unique(where[::-1], return_index=True)
                 return unique, values[::-1][first_from_behind]
         return where, values
 
@@ -127,13 +163,16 @@ class CostMap:
 
 
 def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
-    """Few windows that cover all cells: the bounding box per tile, boxes that touch merged."""
+    """Few windows that cover all cells: the bounding box per tile, boxes that touch merged; one box around all of
+    very many."""
     if len(cells) == 0:
         return []
     rows, columns = np.divmod(cells, cols)
     tiles = (rows // TILE_CELLS) * (cols // TILE_CELLS + 1) + columns // TILE_CELLS
     order = np.argsort(tiles, kind="stable")
     starts = np.flatnonzero(np.diff(tiles[order], prepend=-1))
+    if len(starts) > _MANY_BOXES:  # a late join: to look which of thousands touch would take longer than to join
+        return [Window(int(rows.min()), int(columns.min()), int(rows.max()) + 1, int(columns.max()) + 1)]
     rows, columns = rows[order], columns[order]
     tops, bottoms = np.minimum.reduceat(rows, starts), np.maximum.reduceat(rows, starts)
     lefts, rights = np.minimum.reduceat(columns, starts), np.maximum.reduceat(columns, starts)

@@ -321,8 +321,42 @@ def terrain(
 
 
 @app.command()
-def wire(as_json: AsJson = False) -> None:
-    """Marks over real Zenoh: latency, throughput, late join, beside raw zenoh."""
-    from launch_scripts.bench.wire import run
+def wire(
+    parts: Annotated[
+        str, typer.Option(help="latency, flood, join, route, positions, replica; several with commas.")
+    ] = "latency,flood,join,route,positions,replica",
+    marks: Annotated[int, typer.Option(min=10, help="latency: marks, and as many raw puts.")] = 400,
+    sets: Annotated[int, typer.Option(min=100, help="flood: sets in a round.")] = 20_000,
+    rounds: Annotated[int, typer.Option(min=1, help="flood: rounds of ours and raw, in turn.")] = 3,
+    joins: Annotated[int, typer.Option(min=1, help="join: newcomers, one after the other.")] = 7,
+    queries: Annotated[int, typer.Option(min=10, help="route: queries, and as many raw ones.")] = 300,
+    seconds: Annotated[float, typer.Option(min=1, help="positions: how long, ours and raw each.")] = 5.0,
+    as_json: AsJson = False,
+) -> None:
+    """The shared map, route queries and positions over real Zenoh, beside raw Zenoh. Half a minute.
 
-    _show(run(), as_json)
+    \b
+    swarm bench wire
+    swarm bench wire --parts latency,flood --marks 2000 --json
+
+    A router and the processes that receive and answer are started on free ports of this machine and ended. Ours and
+    raw take turns, with the same bytes under keys of the same form: on a busy machine look at the ratios.
+    """
+    from launch_scripts.bench.wire import PARTS, run, tables
+
+    chosen = tuple(name.strip() for name in parts.split(","))
+    for name in chosen:
+        if name not in PARTS:
+            raise ConfigError(f"--parts: {name!r} is not one of {', '.join(PARTS)}")
+    with _progress("wire") as progress:
+        report = run(
+            chosen,
+            marks=marks,
+            sets=sets,
+            rounds=rounds,
+            joins=joins,
+            queries=queries,
+            seconds=seconds,
+            progress=progress,
+        )
+    _show(report, as_json, tables)

@@ -1,172 +1,130 @@
-"""The shared map beside raw Zenoh: the same run, the same router process, the same bytes.
+"""The shared map, path queries and positions beside raw Zenoh: the same run, the same router process, the same
+bytes under keys of the same form, the same way of receiving (a channel and a thread). Ours and raw take turns.
 
-A second process receives (`wire_far`); this one sends and asks. Latencies are taken between the two by the
-machine's monotonic clock, which all its processes share.
+Times between processes are taken by the machine's monotonic clock, which all its processes share.
 """
 
 from __future__ import annotations
 
 import json
-import multiprocessing
-import socket
 import sys
-import time
-from collections.abc import Callable
-from multiprocessing.connection import Connection
-from queue import Empty, SimpleQueue
-from statistics import median
+from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
-import zenoh
+from rich.table import Table
 
-from launch_scripts.bench import wire_far
-from launch_scripts.bench.wire_far import JOIN_SETS, NAMESPACE, RAW_KEY, some_set
-from shared_map.feed import MapFeed
-from shared_map.replica import MapReplica
-from swarm.bus import Event
-from swarm.clock import NS_PER_S
-from swarm.codec import encode
-from swarm.config import MapConfig, NetworkConfig
-from swarm.messages import MarkKind
-from swarm.topics import MARKS
-from swarm.zenoh_bus import ZenohBus, open_bus
+from launch_scripts.bench import wire_asks, wire_far, wire_marks
+from launch_scripts.bench.machine import machine
+from launch_scripts.bench.tables import number, table
+from launch_scripts.bench.wire_far import Far
 
-GRID = wire_far.GRID
+Progress = Callable[[int, int], None]
+
+PARTS = ("latency", "flood", "join", "route", "positions", "replica")
+WANTED = {"latency p50": 1.5, "latency p99": 2.0, "flood": 0.3, "late join": 1.5, "digest_ms": 50, "memory": 40}
+"""What the project set out to reach: ratios to raw Zenoh, milliseconds, bytes a mark."""
 
 
-def run(marks: int = 400, sets: int = 20_000, joins: int = 5) -> dict[str, Any]:
-    """Measure. Returns figures and ratios by name; what cannot be measured here is not in it."""
-    spawning = multiprocessing.get_context("spawn")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    network = NetworkConfig(namespace=NAMESPACE, listen=(endpoint,), connect=(endpoint,))
-    near, far = spawning.Pipe()
-    stop, stopped = spawning.Pipe()
-    router = spawning.Process(target=wire_far.router, args=(network, stopped), daemon=True)
-    receiver = spawning.Process(target=wire_far.receiver, args=(network, far), daemon=True)
-    router.start()
-    try:
-        assert stop.recv() == "ready"
-        receiver.start()
-        assert near.recv() == "ready"
-        with open_bus(network) as bus:
-            found = {
-                "mark_latency_us": _latency(bus, near, marks),
-                "sets_per_s": _flood(bus, near, sets),
-                "late_join_ms": _late_join(network, near, joins),
-            }
-    finally:
-        for pipe, process in ((near, receiver), (stop, router)):
-            pipe.send("end")
-            process.join(5)
-            if process.is_alive():
-                process.kill()
-    measure = spawning.Process(target=wire_far.replica_cost, args=(far,), daemon=True)
-    measure.start()
-    found["replica_of_1m_marks"] = near.recv()
-    measure.join()
+def run(
+    parts: tuple[str, ...] = PARTS,
+    *,
+    marks: int = 400,
+    sets: int = 20_000,
+    rounds: int = 3,
+    joins: int = 7,
+    queries: int = 300,
+    seconds: float = 5.0,
+    progress: Progress = lambda done, total: None,
+) -> dict[str, Any]:
+    """Measure. Returns what was measured, by part, and `rows` that sum it up."""
+    measure: dict[str, Callable[[Far], dict[str, Any]]] = {
+        "latency": lambda far: wire_marks.latency(far, marks),
+        "flood": lambda far: wire_marks.flood(far, sets, rounds),
+        "join": lambda far: wire_marks.late_join(far, 4000, 40, joins),
+        "route": lambda far: wire_asks.route_queries(far, queries),
+        "positions": lambda far: wire_asks.positions(far, 40, 25, seconds),
+        "replica": _replica,
+    }
+    report: dict[str, Any] = machine()
+    with Far() as far:
+        for n, part in enumerate(parts):
+            progress(n, len(parts))
+            report[part] = measure[part](far)
+    progress(len(parts), len(parts))
+    report["rows"] = [row for part in parts for row in _ROWS[part](report[part])]
+    return report
+
+
+def tables(report: dict[str, Any]) -> Iterator[Table | str]:
+    """The rows as one table, and what has to be known to read it."""
+    found = table("The wire beside raw Zenoh", "<", "ours", "raw", "ours / raw", "wanted")
+    for row in report["rows"]:
+        ratio, wanted = row["ratio"], row["wanted"]
+        found.add_row(
+            f"{row['what']}, {row['unit']}",
+            number(row["ours"]),
+            number(row["raw"]),
+            "" if ratio is None else f"{ratio:.2f}",
+            "" if wanted is None else f"{number(wanted)}",
+        )
+    yield found
+    yield (
+        "Raw is Zenoh with a FIFO and a thread that does nothing with what it receives. For figures per second more"
+        " is better, for all others less. --json gives medians, tails and what was lost."
+    )
+
+
+def _replica(far: Far) -> dict[str, Any]:
+    pipe = far.start(wire_far.replica_cost)
+    found: dict[str, Any] = wire_far.asked(pipe, "figures")
+    far.end()
     return found
 
 
-def _latency(bus: ZenohBus, far: Connection, marks: int) -> dict[str, float]:
-    """A mark written here until it is applied there, and a raw put until it is received there, in turn."""
-    replica = MapReplica(GRID, author="near.1", publish_hz=1000.0)
-    raw = bus.session.declare_publisher(RAW_KEY)
-    padding = encode(some_set(0, 0, 1))[8:]
-    for n in range(marks):
-        cell = GRID.tile_window(n % 64)
-        began_ns = time.monotonic_ns()
-        for action in replica.write([cell.row0 * GRID.cols + cell.col0 + n // 64], MarkKind.LETHAL, 0.0, began_ns):
-            out = action.mark_set
-            bus.publish(MARKS, out, region=0, tile=out.tile, author="near.1")
-        time.sleep(0.0025)
-        raw.put(time.monotonic_ns().to_bytes(8, "little") + padding)
-        time.sleep(0.0025)
-    ours_ns, raw_ns = _asked(far, "latencies")
-    figures = {
-        "ours_p50": np.percentile(ours_ns, 50) / 1e3,
-        "ours_p99": np.percentile(ours_ns, 99) / 1e3,
-        "raw_p50": np.percentile(raw_ns, 50) / 1e3,
-        "raw_p99": np.percentile(raw_ns, 99) / 1e3,
-        "lost": float(marks - len(ours_ns)),
-    }
-    figures["ratio_p50"] = figures["ours_p50"] / figures["raw_p50"]
-    figures["ratio_p99"] = figures["ours_p99"] / figures["raw_p99"]
-    return _rounded(figures)
+def _row(
+    what: str,
+    unit: str,
+    ours: float,
+    raw: float | None = None,
+    ratio: float | None = None,
+    wanted: float | None = None,
+) -> dict[str, Any]:
+    return {"what": what, "unit": unit, "ours": ours, "raw": raw, "ratio": ratio, "wanted": wanted}
 
 
-def _flood(bus: ZenohBus, far: Connection, sets: int) -> dict[str, float]:
-    """Sets of some 200 bytes as fast as they go: received raw through a FIFO, and applied to a replica."""
-    tiles = GRID.tiles
-    payloads = [encode(some_set(n % tiles, n // tiles, 8, "flood.1")) for n in range(sets)]
-    figures: dict[str, float] = {"bytes": float(len(payloads[0]))}
-    put_on = {
-        "raw": [f"{RAW_KEY}/flood"] * sets,
-        "ours": [
-            MARKS.keyed(NAMESPACE, region=GRID.region_of_tile(n % tiles), tile=n % tiles, author="flood.1")
-            for n in range(sets)
-        ],
-    }
-    for name, keys in put_on.items():
-        for n, payload in enumerate(payloads):
-            bus.session.put(keys[n], payload, congestion_control=zenoh.CongestionControl.BLOCK)
-        rate, count = _asked(far, f"flood {name} {sets}")
-        figures[f"{name}_per_s"] = rate
-        figures[f"{name}_count"] = count
-    figures["ratio"] = figures["ours_per_s"] / figures["raw_per_s"]
-    return _rounded(figures)
+def _pair(what: str, unit: str, of: dict[str, Any], name: str, wanted: float | None = None) -> dict[str, Any]:
+    return _row(what, unit, of[f"ours_{name}"], of[f"raw_{name}"], of[f"ratio_{name}"], wanted)
 
 
-def _late_join(network: NetworkConfig, far: Connection, joins: int) -> dict[str, float]:
-    """All sets of the far process fetched by a newcomer, and the same bytes by one raw get."""
-    raw_ms, ours_ms = [], []
-    count = 0
-    for _ in range(joins):
-        with open_bus(network) as bus:
-            began_ns = time.monotonic_ns()
-            replies = bus.session.get(
-                f"{RAW_KEY}/all",
-                zenoh.handlers.FifoChannel(JOIN_SETS + 1),
-                consolidation=zenoh.ConsolidationMode.NONE,
-            )
-            count = sum(len(reply.ok.payload.to_bytes()) > 0 for reply in replies if reply.ok is not None)
-            raw_ms.append((time.monotonic_ns() - began_ns) / 1e6)
-            assert count == JOIN_SETS, f"{count} raw replies of {JOIN_SETS}"
-        with open_bus(network) as bus:
-            events: SimpleQueue[Event] = SimpleQueue()
-            replica = MapReplica(GRID)
-            feed = MapFeed(replica, bus, events.put, MapConfig(), "bench")
-            began_ns = time.monotonic_ns()
-            feed.start(began_ns)
-            _handle_until(feed, events, lambda feed=feed: feed.joined)  # type: ignore[misc]
-            ours_ms.append((time.monotonic_ns() - began_ns) / 1e6)
-            known = len(replica.tiles)
-            assert known >= JOIN_SETS, f"{known} sets of {JOIN_SETS}"
-    figures = {"sets": float(count), "raw_p50": median(raw_ms), "ours_p50": median(ours_ms)}
-    figures["ratio"] = figures["ours_p50"] / figures["raw_p50"]
-    return _rounded(figures)
-
-
-def _handle_until(feed: MapFeed, events: SimpleQueue[Event], done: Callable[[], bool]) -> None:
-    deadline_ns = time.monotonic_ns() + 20 * NS_PER_S
-    while not done() and time.monotonic_ns() < deadline_ns:
-        try:
-            feed.handle(events.get(timeout=0.1), time.monotonic_ns())
-        except Empty:
-            feed.tick(time.monotonic_ns())
-
-
-def _asked(far: Connection, what: str) -> Any:
-    far.send(what)
-    return far.recv()
-
-
-def _rounded(figures: dict[str, float]) -> dict[str, float]:
-    return {name: round(float(value), 2) for name, value in figures.items()}
+_ROWS: dict[str, Callable[[dict[str, Any]], list[dict[str, Any]]]] = {
+    "latency": lambda of: [
+        _pair("mark put -> applied elsewhere, p50", "us", of, "p50", WANTED["latency p50"]),
+        _pair("mark put -> applied elsewhere, p99", "us", of, "p99", WANTED["latency p99"]),
+    ],
+    "flood": lambda of: [
+        _row("sets applied", "1/s", of["ours_per_s"], of["raw_per_s"], of["ratio"], WANTED["flood"]),
+    ],
+    "join": lambda of: [_pair("late join of 4,000 sets", "ms", of, "p50", WANTED["late join"])],
+    "route": lambda of: [
+        _pair("route query, p50", "us", of, "p50"),
+        _pair("route query, p99", "us", of, "p99"),
+    ],
+    "positions": lambda of: [
+        _row(
+            "CPU to know 1,000 vehicles at 10 Hz",
+            "ms/s",
+            of["ours_cpu_ms_per_s"],
+            of["raw_cpu_ms_per_s"],
+            of["ratio_cpu"],
+        ),
+    ],
+    "replica": lambda of: [
+        _row("memory of 1 M marks", "B a mark", of["bytes_per_mark"], wanted=WANTED["memory"]),
+        _row("digest of 1 M marks", "ms", of["digest_ms"], wanted=WANTED["digest_ms"]),
+    ],
+}
 
 
 if __name__ == "__main__":
-    json.dump(run(), sys.stdout, indent=2)
+    json.dump(run(tuple(sys.argv[1:]) or PARTS), sys.stdout, indent=2)
     sys.stdout.write("\n")

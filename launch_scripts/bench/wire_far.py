@@ -1,174 +1,265 @@
-"""The other processes of `bench.wire`: the router, the receiver, and one that holds a million marks."""
+"""The processes of `bench.wire` beside the measuring one: a router, and peers that receive, hold and answer."""
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
 import os
+import socket
 import threading
 import time
+from collections.abc import Callable
 from multiprocessing.connection import Connection
-from queue import Empty, SimpleQueue
+from multiprocessing.process import BaseProcess
+from typing import Any
 
 import numpy as np
 import zenoh
 
+from shared_map.bulk import packed
+from shared_map.cost_map import CostMap
 from shared_map.feed import MapFeed
-from shared_map.marks import Statements, mark_set, statements
+from shared_map.marks import Statements, mark_set
 from shared_map.replica import MapReplica
+from shared_map.terrain import terrain_of_pace
 from swarm.bus import Event
+from swarm.clock import MonotonicClock
 from swarm.codec import encode
 from swarm.config import MapConfig, NetworkConfig
+from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 from swarm.messages import MarkKind, MarkSet
+from swarm.process import Inbox, Process
+from swarm.stats import Counters
 from swarm.zenoh_bus import ZenohBus, open_bus
 
 NAMESPACE = "bench"
-RAW_KEY = "raw/bench"
+RAW = "raw/bench"
+"""Keys of the raw measurements: as long and as many as ours, where none of us listens."""
 GRID = GridSpec(2048, 2048, 10.0)
-JOIN_SETS = 4000
+_READY_S = 60.0
+_END_S = 5.0
 
 
 def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
+    """A set of so many marks, spread over its tile."""
     cells = np.arange(marks, dtype=np.uint16) * (1024 // max(marks, 16))
     kinds = (np.arange(marks) % 2).astype(np.uint8)
     paces = np.where(kinds == MarkKind.PACE, np.float32(0.25), np.float32(0))
     return mark_set(author, "all", tile, 1, seq, Statements(cells, kinds, paces, np.full(marks, seq + 1, np.int64)))
 
 
-def router(network: NetworkConfig, pipe: Connection) -> None:
+def map_key(tile: int, author: str) -> str:
+    """What follows the namespace in the key of a set."""
+    return f"marks/{GRID.region_of_tile(tile)}/{tile}/{author}"
+
+
+class Far:
+    """Processes beside this one, on one router. Left, they are ended, however the measurement went."""
+
+    def __init__(self) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.network = NetworkConfig(namespace=NAMESPACE, listen=(endpoint,), connect=(endpoint,))
+        self._spawning = multiprocessing.get_context("spawn")
+        self._running: list[tuple[BaseProcess, Connection]] = []
+
+    def __enter__(self) -> Far:
+        self.start(_router)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while self._running:
+            self.end()
+
+    def start(self, run: Callable[..., None], *given: Any) -> Connection:
+        """Run `run(network, pipe, *given)` in a process; returns once it has said "ready"."""
+        here, there = self._spawning.Pipe()
+        process = self._spawning.Process(target=run, args=(self.network, there, *given), daemon=True)
+        process.start()
+        self._running.append((process, here))
+        if not here.poll(_READY_S) or here.recv() != "ready":
+            raise SwarmError(f"the process {run.__name__} was not ready within {_READY_S:.0f} s")
+        return here
+
+    def end(self) -> None:
+        """End the process that was started last."""
+        process, pipe = self._running.pop()
+        with contextlib.suppress(OSError):  # it may have ended already
+            pipe.send("end")
+        process.join(_END_S)
+        if process.is_alive():
+            process.kill()
+            process.join(_END_S)
+
+
+def asked(far: Connection, *question: Any, within_s: float = 60.0) -> Any:
+    """What a process answers to a question."""
+    far.send(question)
+    if not far.poll(within_s):
+        raise SwarmError(f"no answer to {question[0]} within {within_s:.0f} s")
+    return far.recv()
+
+
+def _router(network: NetworkConfig, pipe: Connection) -> None:
     with open_bus(network, mode="router"):
         pipe.send("ready")
         pipe.recv()
 
 
-class _Raw:
-    """What raw Zenoh does with the same bytes: a FIFO and a thread, as fast as it goes."""
+def read_on_thread(entity: Any, arrive: Callable[[Any], None]) -> Any:
+    """Raw Zenoh at its fastest from Python: a FIFO and a thread. Returns the entity, which must be kept."""
+    channel = entity.handler
 
-    def __init__(self, bus: ZenohBus) -> None:
-        self.latencies_ns: list[int] = []
-        self.flood_ns: list[int] = []
-        self._channels = [
-            bus.session.declare_subscriber(RAW_KEY, zenoh.handlers.FifoChannel(1 << 16)),
-            bus.session.declare_subscriber(f"{RAW_KEY}/flood", zenoh.handlers.FifoChannel(1 << 16)),
-        ]
-        for subscriber, arrive in zip(self._channels, (self._late, self._flooded), strict=True):
-            threading.Thread(target=_read, args=(subscriber.handler, arrive), daemon=True).start()
+    def run() -> None:
+        try:
+            while True:
+                arrive(channel.recv())
+        except zenoh.ZError:
+            return
 
-    def _late(self, sample: zenoh.Sample) -> None:
-        sent_ns = int.from_bytes(sample.payload.to_bytes()[:8], "little")
-        self.latencies_ns.append(time.monotonic_ns() - sent_ns)
-
-    def _flooded(self, sample: zenoh.Sample) -> None:
-        sample.payload.to_bytes()
-        self.flood_ns.append(time.monotonic_ns())
+    threading.Thread(target=run, daemon=True).start()
+    return entity
 
 
-def _read(channel: object, arrive: object) -> None:
-    try:
-        while True:
-            arrive(channel.recv())  # type: ignore[operator,attr-defined]
-    except zenoh.ZError:
-        return
+def run_service(service: Any, inbox: Inbox, pipe: Connection, answer: Callable[..., Any]) -> None:
+    """Run a service as its role does, until "end"; questions are answered on a thread beside it."""
+    process = Process(service, inbox, MonotonicClock(), 10.0)
+
+    def questions() -> None:
+        while (question := pipe.recv()) != "end":
+            pipe.send(answer(*question))
+        process.stop()
+
+    threading.Thread(target=questions, daemon=True).start()
+    process.run()
 
 
-def receiver(network: NetworkConfig, pipe: Connection) -> None:
-    """Receives what `bench.wire` sends, and answers its questions about it."""
-    applied_ns: list[int] = []
-    flooded_ns: list[int] = []
+class _MapPeer:
+    """A process that does nothing but take part in the map."""
+
+    def __init__(self, feed: MapFeed, pipe: Connection) -> None:
+        self.counters = Counters()
+        self._feed = feed
+        self._pipe = pipe
+
+    def start(self, now_ns: int) -> None:
+        self._feed.start(now_ns)
+        self._pipe.send("ready")
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        self._feed.handle(event, now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        self._feed.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        pass
+
+
+def map_peer(network: NetworkConfig, pipe: Connection) -> None:
+    """Applies the sets that it hears to a cost map, and notes when; receives raw samples beside that."""
+    applied: list[tuple[int, int, int]] = []  # (tile, seq, when)
+    raw_ns: list[int] = []
+    cpu_ns: dict[str, int] = {}
 
     def accepted(each: MarkSet) -> None:
-        now_ns = time.monotonic_ns()
-        if each.author == "flood.1":
-            flooded_ns.append(now_ns)
-        else:
-            applied_ns.append(now_ns - int(statements(each).stamps_ns.max()))
+        applied.append((each.tile, each.seq, time.monotonic_ns()))
+
+    def received(sample: zenoh.Sample) -> None:
+        sample.payload.to_bytes()
+        raw_ns.append(time.monotonic_ns())
+
+    def answer(what: str) -> Any:
+        match what:
+            case "applied":
+                found = (list(applied), list(raw_ns))
+                applied.clear()
+                raw_ns.clear()
+                cpu_ns["start"] = time.process_time_ns()
+                return found
+            case "cpu":
+                return time.process_time_ns() - cpu_ns["start"]
+            case _:
+                return (len(applied), len(raw_ns))
 
     with open_bus(network) as bus:
-        raw = _Raw(bus)
-        events: SimpleQueue[Event | str] = SimpleQueue()
+        inbox = Inbox()
+        replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
+        feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
+        raw = bus.session.declare_subscriber(f"{RAW}/**", zenoh.handlers.FifoChannel(1 << 16))
+        kept = read_on_thread(raw, received)
+        run_service(_MapPeer(feed, pipe), inbox, pipe, answer)
+        del kept
+
+
+def map_holder(network: NetworkConfig, pipe: Connection, sets: int, marks: int) -> None:
+    """Holds sets and answers for them as a keeper does; and the same bytes to raw queries, by set and in bulk."""
+    held = [some_set(tile, 0, marks) for tile in range(sets)]
+    with open_bus(network) as bus:
+        inbox = Inbox()
         replica = MapReplica(GRID)
-        feed = MapFeed(replica, bus, events.put, MapConfig(), "bench", serves_all=True, on_accepted=accepted)
-        held = [some_set(tile, 0, 40) for tile in range(JOIN_SETS)]
-        _serve_raw(bus, held)
-        feed.start(time.monotonic_ns())
-
-        def questions() -> None:
-            while True:
-                events.put(pipe.recv())
-
-        threading.Thread(target=questions, daemon=True).start()
-        pipe.send("ready")
-        while True:
-            try:
-                event = events.get(timeout=0.1)
-            except Empty:
-                feed.tick(time.monotonic_ns())
-                continue
-            match event:
-                case "end":
-                    return
-                case "latencies":
-                    time.sleep(0.2)
-                    pipe.send((applied_ns, raw.latencies_ns))
-                    for each in held:
-                        replica.merge(each)
-                case str() as question:
-                    _, which, wanted = question.split()
-                    times = raw.flood_ns if which == "raw" else flooded_ns
-                    if len(times) < int(wanted) and (not times or time.monotonic_ns() - times[-1] < 1e9):
-                        threading.Timer(0.02, events.put, (question,)).start()
-                        continue
-                    pipe.send(((len(times) - 1) / (times[-1] - times[0]) * 1e9, len(times)))
-                case _:
-                    feed.handle(event, time.monotonic_ns())
+        replica.merge_many(held)
+        feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench", name="holder.1", serves_all=True)
+        kept = [
+            _serve_raw(bus, f"{RAW}/sets", [encode(each) for each in held]),
+            _serve_raw(bus, f"{RAW}/bulk", [encode(each) for each in packed(held)]),
+        ]
+        run_service(_MapPeer(feed, pipe), inbox, pipe, lambda *_: None)
+        del kept
 
 
-def _serve_raw(bus: ZenohBus, held: list[MarkSet]) -> None:
-    queryable = bus.session.declare_queryable(f"{RAW_KEY}/all", zenoh.handlers.FifoChannel(16))
-    payloads = [encode(each) for each in held]
-
+def _serve_raw(bus: ZenohBus, key: str, payloads: list[bytes]) -> Any:
     def answer(query: zenoh.Query) -> None:
         for payload in payloads:
-            query.reply(f"{RAW_KEY}/all", payload)
+            query.reply(key, payload)
         query.drop()  # type: ignore[no-untyped-call]
 
-    threading.Thread(target=_read, args=(queryable.handler, answer), daemon=True).start()
-    bus._kept = queryable  # type: ignore[attr-defined] # collected, it would be undeclared
+    return read_on_thread(bus.session.declare_queryable(key, zenoh.handlers.FifoChannel(16)), answer)
 
 
-def replica_cost(pipe: Connection) -> None:
-    """Memory and times of a replica of a 4096 x 4096 map with a million marks."""
+def replica_cost(network: NetworkConfig, pipe: Connection) -> None:
+    """Tells the memory and times of a replica of a 4096 x 4096 map with a million marks."""
     grid = GridSpec(4096, 4096, 1.0)
     replica = MapReplica(grid)
-    replica.merge(some_set(0, 0, 61))
+    replica.merge_many([some_set(tile, 0, 61) for tile in range(16)])
     replica.digest()
-    payload_bytes = 15
-    before = _resident_bytes()
-    began_s, cpu_s = time.perf_counter(), time.process_time()
+    before = resident_bytes()
+    cpu_s = time.process_time()
     for tile in range(grid.tiles):
         replica.merge(some_set(tile, 1, 61, f"a{tile % 8}.1"))
-    merged_s, merged_cpu_s = time.perf_counter() - began_s, time.process_time() - cpu_s
-    held = _resident_bytes() - before
+    one_by_one_s = time.process_time() - cpu_s
+    held = resident_bytes() - before
+    marks = grid.tiles * 61
     began_s = time.perf_counter()
     digest = replica.digest()
     first_ms = (time.perf_counter() - began_s) * 1e3
     replica.merge(some_set(7, 2, 61, "a7.1"))
     began_s = time.perf_counter()
     replica.digest()
-    marks = grid.tiles * 61
+    again_ms = (time.perf_counter() - began_s) * 1e3
+    again = [some_set(tile, 3, 61, f"a{tile % 8}.1") for tile in range(grid.tiles)]
+    cpu_s = time.process_time()
+    for first in range(0, len(again), 1024):
+        replica.merge_many(again[first : first + 1024])
+    together_s = time.process_time() - cpu_s
+    pipe.send("ready")
+    pipe.recv()
     pipe.send(
         {
             "marks": marks,
             "sets": grid.tiles,
             "bytes_per_mark": round(held / marks, 1),
-            "bytes_per_mark_on_the_wire": payload_bytes,
-            "digest_ms": round(max((time.perf_counter() - began_s) * 1e3, first_ms), 2),
+            "digest_ms": round(max(first_ms, again_ms), 2),
             "digest_bytes": sum(map(len, digest.values())),
-            "merged_s": round(merged_s, 2),
-            "cpu_us_per_set": round(merged_cpu_s / grid.tiles * 1e6, 1),
+            "made_and_merged_cpu_us_per_set": round(one_by_one_s / grid.tiles * 1e6, 1),
+            "merged_together_cpu_us_per_set": round(together_s / grid.tiles * 1e6, 1),
         }
     )
+    pipe.recv()
 
 
-def _resident_bytes() -> int:
+def resident_bytes() -> int:
     with open("/proc/self/statm", encoding="ascii") as statm:
         return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
