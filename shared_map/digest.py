@@ -37,6 +37,12 @@ class Ledger:
                 [each.tile for each in theirs], [each.epoch for each in theirs], [each.seq for each in theirs]
             )
 
+    def drop(self, author: str, tile: int) -> None:
+        """Nothing is held any more of this tile of an author."""
+        rows = self._authors.get(author)
+        if rows is not None and rows.drop(tile) == 0:
+            del self._authors[author]
+
     def forget(self, author: str) -> None:
         self._authors.pop(author, None)
 
@@ -110,6 +116,13 @@ class _Rows:
         at = [place[tile] for tile in tiles]
         for name, values in (("tile", tiles), ("epoch", epochs), ("seq", seqs)):
             self._rows[name][at] = values
+
+    def drop(self, tile: int) -> int:
+        """Returns how many are left."""
+        if tile in self._place:
+            self._rows = np.delete(self.sorted(), self._place[tile])
+            self._place = {tile: place for place, tile in enumerate(self._rows["tile"].tolist())}
+        return len(self._place)
 
     def of(self, tiles: Iterable[int]) -> NDArray[np.void]:
         return self._rows[[place for tile in sorted(tiles) if (place := self._place.get(tile)) is not None]]

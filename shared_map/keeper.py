@@ -14,13 +14,15 @@ from typing import IO
 from urllib.parse import quote
 
 from shared_map.digest import Ledger
+from shared_map.folding import united, without
+from shared_map.marks import base_seq, is_burial
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
-from swarm.messages import MarkSet
+from swarm.messages import FOLDS, MarkSet
 
 log = logging.getLogger(__name__)
 
-STORE_VERSION = "1"
+STORE_VERSION = "2"
 _MEMORY = ":memory:"
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -28,6 +30,12 @@ CREATE TABLE IF NOT EXISTS sets (
     tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
     cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL,
     untils_ns BLOB NOT NULL,
+    PRIMARY KEY (tile, author)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS folded (
+    tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
+    cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL,
+    untils_ns BLOB NOT NULL, since_ns INTEGER NOT NULL,
     PRIMARY KEY (tile, author)
 ) WITHOUT ROWID;
 """
@@ -41,6 +49,10 @@ ON CONFLICT (tile, author) DO UPDATE SET grp = excluded.grp, epoch = excluded.ep
     untils_ns = excluded.untils_ns
 WHERE (excluded.epoch, excluded.seq) >= (sets.epoch, sets.seq)
 """
+_BURY = "DELETE FROM sets WHERE tile = ? AND author = ? AND (epoch, seq) <= (?, ?)"
+_OUTDATE = "DELETE FROM folded WHERE tile = ? AND author = ? AND (epoch, seq) < (?, ?)"
+"""What was dropped from a set counts only as long as its author says nothing newer."""
+_DROP = f"REPLACE INTO folded ({', '.join(_COLUMNS)}, since_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 
 
 class KeeperStore:
@@ -110,8 +122,23 @@ class KeeperStore:
 
     def load(self) -> Iterator[MarkSet]:
         """Everything in the store. Raises StoreError where a row is no set."""
+        return self._sets("FROM sets")
+
+    def folded(self, tile: int) -> dict[str, MarkSet]:
+        """Author -> what was dropped from its set of this tile, under the number of the last folding."""
+        return {each.author: each for each in self._sets("FROM folded WHERE tile = ?", tile)}
+
+    def forget_folded(self, before_ns: int) -> None:
+        """Drop for good what was folded before. Raises StoreError."""
         try:
-            for row in self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM sets"):
+            with self._db:
+                self._db.execute("DELETE FROM folded WHERE since_ns < ?", (before_ns,))
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    def _sets(self, where: str, *values: object) -> Iterator[MarkSet]:
+        try:
+            for row in self._db.execute(f"SELECT {', '.join(_COLUMNS)} {where}", values):
                 fields = dict(zip(_FIELDS, row, strict=True))
                 mark_set = MarkSet(**fields)
                 mark_set.check()
@@ -119,16 +146,46 @@ class KeeperStore:
         except (sqlite3.Error, ValueError, TypeError) as error:
             raise StoreError(_damaged(self.path, str(error))) from error
 
-    def save(self, sets: Iterable[MarkSet]) -> None:
-        """Commit all or none; on the disk when this returns. Raises StoreError, which leaves the store usable."""
-        rows = [tuple(getattr(each, field) for field in _FIELDS) for each in sets]
+    def _set_at(self, table: str, tile: int, author: str) -> MarkSet | None:
+        found = list(self._sets(f"FROM {table} WHERE tile = ? AND author = ?", tile, author))
+        return found[0] if found else None
+
+    def save(self, sets: Iterable[MarkSet], now_ns: int = 0) -> None:
+        """Commit all or none; on the disk when this returns. What a folding drops from the set that it replaces is
+        set aside. Raises StoreError, which leaves the store usable."""
+        given = list(sets)
+        own = [each for each in given if each.seq % FOLDS == 0]
         try:
             with self._db:
-                self._db.executemany(_UPSERT, rows)
+                self._db.executemany(_UPSERT, [_row(each) for each in own])
+                self._db.executemany(_OUTDATE, [(each.tile, each.author, each.epoch, each.seq) for each in own])
+                for each in given:
+                    if each.seq % FOLDS:
+                        self._save_folding(each, now_ns)
         except sqlite3.ProgrammingError:
             raise  # a bug of ours, and no disk will get better
         except sqlite3.Error as error:
             raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    def _save_folding(self, folding: MarkSet, now_ns: int) -> None:
+        at = (folding.tile, folding.author)
+        stored = self._set_at("sets", *at)
+        if stored is not None and (stored.epoch, stored.seq) > (folding.epoch, folding.seq):
+            return
+        base = (folding.epoch, base_seq(folding.seq))
+        before = [
+            each
+            for each in (stored, self._set_at("folded", *at))
+            if each is not None and (each.epoch, base_seq(each.seq)) == base
+        ]
+        if before:
+            self._db.execute(_DROP, (*_row(without(united(*before), folding)), now_ns))
+        elif is_burial(folding):
+            self._db.execute(_DROP, (*_row(folding), now_ns))
+        if is_burial(folding):
+            self._db.execute(_BURY, (*at, folding.epoch, folding.seq))
+        else:
+            self._db.execute(_UPSERT, _row(folding))
 
     def close(self) -> None:
         self._db.close()
@@ -144,6 +201,10 @@ class KeeperStore:
         if self._lock is not None:
             self._lock.close()
             self._lock = None
+
+
+def _row(of: MarkSet) -> tuple[object, ...]:
+    return tuple(getattr(of, field) for field in _FIELDS)
 
 
 def _open(path: str) -> sqlite3.Connection:
@@ -237,8 +298,11 @@ class Keeper:
         return list(self._waiting.values())
 
     def saved(self, sets: Iterable[MarkSet]) -> None:
-        """These are on the disk."""
+        """These are on the disk, or buried there."""
         for each in sets:
-            self.committed.record(each.author, each.tile, each.epoch, each.seq)
+            if is_burial(each):
+                self.committed.drop(each.author, each.tile)
+            else:
+                self.committed.record(each.author, each.tile, each.epoch, each.seq)
             if self._waiting.get((each.tile, each.author)) is each:
                 del self._waiting[each.tile, each.author]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
-from swarm.messages import FOREVER, STAMP_LIMIT_NS, TILE_AREA, MarkKind, MarkSet, column, pack_column
+from swarm.messages import FOLDS, FOREVER, STAMP_LIMIT_NS, TILE_AREA, MarkKind, MarkSet, column, pack_column
 
 NO_STATEMENT = -1
 """In place of a stamp: nobody says anything about the cell."""
@@ -86,6 +86,21 @@ def _packed_untils(untils_ns: NDArray[np.int64] | None) -> bytes:
     if untils_ns is None or (untils_ns == FOREVER).all():
         return b""
     return pack_column(untils_ns, "<i8")
+
+
+def base_seq(seq: int) -> int:
+    """The number of the author's own set that a folding is made of; of an own set its number."""
+    return seq - seq % FOLDS
+
+
+def next_seq(seq: int) -> int:
+    """The number of an author's next set: above all foldings of the last one."""
+    return base_seq(seq) + FOLDS
+
+
+def is_burial(of: MarkSet) -> bool:
+    """Whether a keeper says that nothing of an author that is gone is left here (see `folding`)."""
+    return not of.kinds and of.seq % FOLDS > 0
 
 
 def supersedes(new: MarkSet, old: MarkSet) -> bool:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from shared_map.batch import Arrival, cells_of, difference_of_many
 from shared_map.digest import Held, Ledger, fingerprint
+from shared_map.graves import Graves
 from shared_map.marks import (
     NO_STATEMENT,
     NOTHING_SAID,
@@ -23,7 +24,9 @@ from shared_map.marks import (
     fault,
     first_end_ns,
     grid_cells,
+    is_burial,
     mark_set,
+    next_seq,
     resolve,
     sparse,
     standing,
@@ -98,6 +101,8 @@ class MapReplica:
         self.ledger = Ledger()
         self.room = room or Room()
         self.crowded_out: str | None = None  # the author of the set that last had no room
+        self._graves = Graves()
+        self._tile_count = grid.tiles
         self._ragged = bool(grid.rows % TILE_CELLS or grid.cols % TILE_CELLS)
         self._cost_map = cost_map
         self._tiles: dict[int, dict[str, MarkSet]] = {}
@@ -123,6 +128,11 @@ class MapReplica:
         if received.author == self.author:
             self._outbid(received, held)
             return None
+        if is_burial(received):
+            return self._bury(received, held)
+        if not self.room.take(received, held):
+            self._crowd_out(received)
+            return None
         return self._accept(received, measured)
 
     def merge_many(self, received: Sequence[MarkSet], *, measured: bool = True) -> Merged:
@@ -130,18 +140,20 @@ class MapReplica:
         out of the result."""
         merged = Merged([], [])
         for sets in self._rounds(received):
-            if len(sets) < _WORTH_ARRAYS:
-                for each in sets:
-                    changed = self.merge(each, measured=measured)
-                    if changed is not None:
-                        merged.sets.append(each)
-                        merged.changed.append(len(changed))
-            else:
-                self._accept_many(sets, measured, merged)
+            many = len(sets) >= _WORTH_ARRAYS
+            for each in filter(is_burial, sets) if many else sets:
+                changed = self.merge(each, measured=measured)
+                if changed is not None:
+                    merged.sets.append(each)
+                    merged.changed.append(len(changed))
+            if many:
+                self._accept_many([each for each in sets if not is_burial(each)], measured, merged)
         return merged
 
     def _rounds(self, received: Sequence[MarkSet]) -> list[list[MarkSet]]:
         """The newest set of each tile and author, in groups in which no tile occurs twice."""
+        if len(received) == 1:
+            return [list(received)]
         newest: dict[tuple[int, str], MarkSet] = {}
         for each in received:
             held = newest.setdefault((each.tile, each.author), each)
@@ -170,12 +182,15 @@ class MapReplica:
             if each.author == self.author:
                 self._outbid(each, held)
                 continue
-            others = () if sets is None else [other for name, other in sets.items() if name != each.author]
-            arrivals.append(Arrival(each, held, others))
+            if not self.room.take(each, held):
+                self._crowd_out(each)
+                continue
             if sets is None:
-                sets = self._tiles[each.tile] = {}
-            sets[each.author] = each
-            self.room.take(each, held)
+                arrivals.append(Arrival(each, held, ()))
+                self._tiles[each.tile] = {each.author: each}
+            else:
+                arrivals.append(Arrival(each, held, [of for name, of in sets.items() if name != each.author]))
+                sets[each.author] = each
             if each.untils_ns:
                 self._note_end(each)
         if not arrivals:
@@ -190,18 +205,35 @@ class MapReplica:
         merged.changed.extend(np.bincount(changed.places // TILE_AREA, minlength=len(arrivals)).tolist())
 
     def _admissible(self, received: MarkSet, held: MarkSet | None) -> bool:
-        """Whether a set is part of this map, news and within bounds; if not, why is counted."""
-        if received.tile >= self.grid.tiles or (self._ragged and fault(received, self.grid) is not None):
+        """Whether a set is part of this map and news; if not, why is counted."""
+        if received.tile >= self._tile_count or (self._ragged and fault(received, self.grid) is not None):
             self.counts["sets_refused"] += 1
             return False
-        if held is not None and not supersedes(received, held):
+        known = self._graves.holds(received) if held is None else not supersedes(received, held)
+        if known:
             self.counts["sets_repeated"] += 1
             return False
-        if not self.room.for_set(received, held):
-            self.counts["sets_without_room"] += 1
-            self.crowded_out = received.author
-            return False
         return True
+
+    def _bury(self, burial: MarkSet, held: MarkSet | None) -> NDArray[np.uint32]:
+        """Nothing that an author which is gone said about a tile counts any more: forget that it said anything."""
+        self._graves.dig(burial, self._now_ns)
+        self.counts["sets_merged"] += 1
+        if held is None:
+            return _NO_CELLS
+        sets = self._tiles[held.tile]
+        others = [sets[name] for name in sorted(sets) if name != held.author and sets[name].kinds]
+        changed = difference(held, burial, others, self._now_ns)
+        del sets[held.author]
+        if not sets:
+            del self._tiles[held.tile]
+        self.ledger.drop(held.author, held.tile)
+        self.room.free(held)
+        return self._apply(held.tile, changed, False)
+
+    def _crowd_out(self, received: MarkSet) -> None:
+        self.counts["sets_without_room"] += 1
+        self.crowded_out = received.author
 
     def _outbid(self, received: MarkSet, held: MarkSet | None) -> None:
         """Somebody who took us for dead wrote under our name: say what we say again, under a higher epoch."""
@@ -210,9 +242,14 @@ class MapReplica:
             self.counts["sets_refused"] += 1
             return
         said = NOTHING_SAID if held is None else statements(held)
-        seq = 0 if held is None else held.seq + 1
-        self._accept(mark_set(self.author, self.group, received.tile, received.epoch + 1, seq, said), False)
-        self._pending[received.tile] = None
+        seq = 0 if held is None else next_seq(held.seq)
+        self._say(mark_set(self.author, self.group, received.tile, received.epoch + 1, seq, said))
+
+    def _say(self, own: MarkSet) -> None:
+        """Take in a set of our own, which is to go out."""
+        self.room.take(own, self._tiles.get(own.tile, {}).get(own.author), own=True)
+        self._accept(own, False)
+        self._pending[own.tile] = None
 
     def _accept(self, received: MarkSet, measured: bool) -> NDArray[np.uint32]:
         tile = received.tile
@@ -223,7 +260,6 @@ class MapReplica:
             [sets[name] for name in sorted(sets) if name != received.author and sets[name].kinds],
             self._now_ns,
         )
-        self.room.take(received, sets.get(received.author))
         sets[received.author] = received
         self.ledger.record(received.author, tile, received.epoch, received.seq)
         self.counts["sets_merged"] += 1
@@ -266,7 +302,7 @@ class MapReplica:
             coming = [end for each in sets if (end := first_end_ns(each, self._now_ns)) is not None]
             if coming:
                 heapq.heappush(self._ends, (min(coming), tile))
-            own = self._tiles[tile].get(self.author) if self.author is not None else None
+            own = self._tiles.get(tile, {}).get(self.author) if self.author is not None else None
             if own is not None and own.untils_ns:
                 left = standing(own, self._now_ns)
                 if len(left.cells) < len(own.kinds):
@@ -345,6 +381,7 @@ class MapReplica:
     def tick(self, now_ns: int) -> list[PublishSet]:
         """The own sets that are due to go out; what ends by itself by now has ended."""
         self._end_statements(now_ns)
+        self._graves.forget(now_ns)
         due = [
             tile
             for tile in self._pending
@@ -364,9 +401,8 @@ class MapReplica:
     def _put_own(self, tile: int, own: Statements) -> None:
         assert self.author is not None
         held = self._tiles.get(tile, {}).get(self.author)
-        epoch, seq = (1, 0) if held is None else (held.epoch, held.seq + 1)
-        self._accept(mark_set(self.author, self.group, tile, epoch, seq, own), False)
-        self._pending[tile] = None
+        epoch, seq = (1, 0) if held is None else (held.epoch, next_seq(held.seq))
+        self._say(mark_set(self.author, self.group, tile, epoch, seq, own))
 
     # --- comparing ------------------------------------------------------------------------------------------
 
@@ -389,7 +425,7 @@ class MapReplica:
 
     def _wants(self, author: str, tile: int) -> bool:
         """Not what lies outside, nor what there would be no room for: it would be asked for again and again."""
-        if tile >= self.grid.tiles:
+        if tile >= self._tile_count:
             return False
         return not self.room.full_for(author) or author in self._tiles.get(tile, {})
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from swarm.messages import MarkSet
+from swarm.messages import TILE_AREA, MarkSet
 
 MAX_SETS = 1 << 18
 """Sets in all, tombstones included: every tile of a 16,384 x 16,384 map once. About half a kilobyte each."""
@@ -23,36 +23,52 @@ class Room:
         self.sets = 0
         self.marks = 0
         self._max_sets, self._max_marks = max_sets, max_marks
-        self._authors: dict[str, tuple[int, int]] = {}  # -> (sets, marks)
+        self._authors: dict[str, list[int]] = {}  # -> [sets, marks]
 
-    def for_set(self, new: MarkSet, old: MarkSet | None) -> bool:
-        """Whether there is room to replace `old` by `new`. There always is for what takes no more than before."""
-        more_sets = old is None
-        more_marks = len(new.kinds) - (0 if old is None else len(old.kinds))
-        if more_marks <= 0 and not more_sets:
-            return True
-        sets, marks = self._authors.get(new.author, (0, 0))
-        if more_sets and (self.sets >= self._max_sets or sets >= self._max_sets // _SHARE):
+    def take(self, new: MarkSet, old: MarkSet | None, *, own: bool = False) -> bool:
+        """Make room for `new` in the place of `old`; False if there is none. There always is for what takes no more
+        than before, and for one's own."""
+        marks = len(new.kinds)
+        sets = 1
+        if old is not None:
+            marks -= len(old.kinds)
+            sets = 0
+        held = self._authors.get(new.author)
+        if held is None:
+            held = [0, 0]
+        if (
+            not own
+            and (sets or marks > 0)
+            and (
+                (sets and (self.sets >= self._max_sets or held[0] >= self._max_sets // _SHARE))
+                or self.marks + marks > self._max_marks
+                or held[1] + marks > self._max_marks // _SHARE
+            )
+        ):
             return False
-        return more_marks <= 0 or (
-            self.marks + more_marks <= self._max_marks and marks + more_marks <= self._max_marks // _SHARE
-        )
+        self._authors[new.author] = held
+        held[0] += sets
+        held[1] += marks
+        self.sets += sets
+        self.marks += marks
+        return True
 
-    def take(self, new: MarkSet, old: MarkSet | None) -> None:
-        """`new` is held now, in the place of `old`."""
-        more_sets = int(old is None)
-        more_marks = len(new.kinds) - (0 if old is None else len(old.kinds))
-        sets, marks = self._authors.get(new.author, (0, 0))
-        self._authors[new.author] = (sets + more_sets, marks + more_marks)
-        self.sets += more_sets
-        self.marks += more_marks
+    def free(self, old: MarkSet) -> None:
+        """`old` is held no more."""
+        held = self._authors[old.author]
+        held[0] -= 1
+        held[1] -= len(old.kinds)
+        self.sets -= 1
+        self.marks -= len(old.kinds)
+        if held == [0, 0]:
+            del self._authors[old.author]
 
     def full_for(self, author: str) -> bool:
-        """Whether an author's next set of a new tile would have no room."""
+        """Whether an author's next set of a new tile, a full one at worst, would have no room."""
         sets, marks = self._authors.get(author, (0, 0))
         return (
             self.sets >= self._max_sets
-            or self.marks >= self._max_marks
+            or self.marks + TILE_AREA > self._max_marks
             or sets >= self._max_sets // _SHARE
-            or marks >= self._max_marks // _SHARE
+            or marks + TILE_AREA > self._max_marks // _SHARE
         )

@@ -6,19 +6,24 @@ import logging
 
 from shared_map.base_map_bus import BaseMapServer
 from shared_map.feed import MapFeed
+from shared_map.folding import FoldPlan, fold
 from shared_map.keeper import Keeper, KeeperStore
-from shared_map.replica import MapReplica
+from shared_map.replica import MapReplica, PublishSet
 from shared_map.terrain import Terrain
-from swarm.bus import Bus, Event, Post
+from swarm.bus import Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.membership import Member
+from swarm.messages import Digest, MarkSet
 from swarm.role import RoleSetup
 
 log = logging.getLogger(__name__)
 
 _RETRY_NS = NS_PER_S
 _NOTE_AGAIN_NS = 60 * NS_PER_S
+_FOLD_EVERY_NS = NS_PER_S
+_FOLD_TILES = 64
+_SWEEP_EVERY_NS = 600 * NS_PER_S
 
 
 class KeeperService:
@@ -42,9 +47,15 @@ class KeeperService:
             name=setup.author,
             serves_all=True,
             held=self._keeper.committed.held,
-            on_accepted=self._keeper.accept,
+            on_accepted=self._accepted,
         )
-        for name in ("sets_saved", "saves_failed", "sets_refused", "marks_merged"):
+        config = setup.scenario.map
+        self._fold_after_ns = int(config.fold_after_s * NS_PER_S)
+        self._fold_keep_ns = int(config.fold_keep_s * NS_PER_S)
+        self._fold_plan = FoldPlan(self._fold_after_ns, 0)
+        self._fold_due_ns = 0
+        self._sweep_due_ns = 0
+        for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged"):
             self.counters.count(name, 0)
         self._save_due_ns = 0
         self._noted_ns: int | None = None
@@ -57,16 +68,22 @@ class KeeperService:
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._base_map.start(self._bus)
+        self._fold_plan = FoldPlan(self._fold_after_ns, now_ns)
         self._feed.start(now_ns)
         log.info("keeper started: %d tiles in store %s", len(self.replica.tiles), self._store.path)
 
     def handle(self, event: Event, now_ns: int) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Digest):
+            self._fold_plan.heard(event.message.author, now_ns)
         if not self._member.handle(event):
             self._feed.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
         if now_ns >= self._save_due_ns:
             self._save(now_ns)
+        if now_ns >= self._fold_due_ns and not self._keeper.waiting:
+            self._fold_due_ns = now_ns + _FOLD_EVERY_NS
+            self._fold(now_ns)
         self._feed.tick(now_ns)
         self._name_throttled(now_ns)
         counts = self.replica.counts
@@ -90,13 +107,48 @@ class KeeperService:
                 self._member.note(now_ns, "quota", text)
         self._named = [author for author in self._named if author in throttled]
 
+    def _accepted(self, mark_set: MarkSet) -> None:
+        self._keeper.accept(mark_set)
+        self._fold_plan.accepted(mark_set)
+
+    def _fold(self, now_ns: int) -> None:
+        """Fold what the dead have left, a few tiles at a time. On the disk first: what is put is never less than
+        what the store could put back."""
+        plan = self._fold_plan
+        plan.update(self.replica.ledger, now_ns)
+        tiles = plan.take_due(_FOLD_TILES, now_ns)
+        folded: list[MarkSet] = []
+        try:
+            for tile in tiles:
+                sets, dropped = self.replica.sets(tile), self._store.folded(tile)
+                names = {*dropped, *(each.author for each in sets)}
+                gone = {name for name in names if plan.is_gone(name, now_ns)}
+                new = fold(sets, dropped, gone, now_ns - self._fold_after_ns)
+                left = {each.author: each for each in sets if each.author in gone}
+                plan.folded(tile, (left | {each.author: each for each in new}).values(), now_ns)
+                folded.extend(new)
+            if folded:
+                self._store.save(folded, now_ns)
+            if now_ns >= self._sweep_due_ns:
+                self._sweep_due_ns = now_ns + _SWEEP_EVERY_NS
+                self._store.forget_folded(now_ns - self._fold_keep_ns)
+        except StoreError as error:
+            plan.put_off(tiles)
+            self._fold_due_ns = now_ns + 10 * _FOLD_EVERY_NS
+            log.warning("cannot fold: %s", error)
+            return
+        self.replica.merge_many(folded, measured=False)
+        self._keeper.saved(folded)
+        self._feed.publish(PublishSet(each) for each in folded)
+        self.counters.count("sets_folded", len(folded))
+
     def _save(self, now_ns: int) -> None:
         """Commit what waits. A disk that refuses is told of, tried again, and no reason to stop serving."""
         waiting = self._keeper.waiting
         if not waiting:
             return
         try:
-            self._store.save(waiting)
+            self._store.save(waiting, now_ns)
         except StoreError as error:
             self.counters.count("saves_failed")
             self._save_due_ns = now_ns + _RETRY_NS

@@ -202,12 +202,17 @@ class MapConfig(Section, frozen=True, kw_only=True):
     digest_s            every replica tells this often what it holds
     author_marks_per_s  who changes more cells than this for ten seconds is heard with delay, and named
     total_marks_per_s   the same of all authors together; then those above an equal share of it wait
+    fold_after_s        an author of whom a keeper has heard nothing for so long is taken for dead, and what it said
+                        is folded with what other dead authors said; longer than a partition is likely to last
+    fold_keep_s         what was folded can be put back for so long
     """
 
     publish_hz: Positive = 10.0
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0
+    fold_after_s: Positive = 60.0
+    fold_keep_s: Positive = 86_400.0
 
 
 class TlsConfig(Section, frozen=True, kw_only=True):

@@ -20,7 +20,7 @@ from swarm.clock import NS_PER_S, ManualClock
 from swarm.config import MapConfig, Scenario
 from swarm.grid import GridSpec
 from swarm.memory_bus import MemoryNetwork, PerfectLinks
-from swarm.messages import MarkKind, MarkSet
+from swarm.messages import FOLDS, MarkKind, MarkSet
 from swarm.role import RoleSetup
 from swarm.scheduler import Scheduler
 
@@ -42,8 +42,9 @@ def set_of(
     epoch: int = 1,
     group: str = "all",
 ) -> MarkSet:
-    """said: cell in the tile -> (kind, pace, stamp)"""
+    """said: cell in the tile -> (kind, pace, stamp); seq counts the author's own sets"""
     cells = sorted(said)
+    seq *= FOLDS
     return mark_set(
         author,
         group,

@@ -24,7 +24,7 @@ from shared_map.terrain import terrain_of_pace
 from swarm.bus import Event, Heard
 from swarm.clock import MonotonicClock
 from swarm.config import MapConfig, NetworkConfig, Scenario
-from swarm.messages import DIGEST_ROW, Digest, MarkKind
+from swarm.messages import DIGEST_ROW, FOLDS, Digest, MarkKind
 from swarm.process import Inbox, Process
 from swarm.role import RoleSetup
 from swarm.topics import DIGEST, MARKS
@@ -69,7 +69,7 @@ class Load:
             for tile in range(TILES):
                 self.put += 1
                 stamps = np.full(PER_TILE, self.put, np.int64)
-                each = mark_set("load.1", "all", tile, 1, self.put, Statements(cells, kinds, paces, stamps))
+                each = mark_set("load.1", "all", tile, 1, self.put * FOLDS, Statements(cells, kinds, paces, stamps))
                 self._bus.publish(MARKS, each, region=0, tile=tile, author="load.1")
             time.sleep(0.002)
 
