@@ -13,13 +13,23 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.bands import Progress, in_bands, no_progress, padded_rows
-from shared_map.layers import TerrainClass, grade_of_padded
+from shared_map.layers import TerrainClass, grade_of_padded, spread
+from shared_map.lines import COARSEST_M, REACH, line_strength, long_lines
 
-HALO = 6
+HALO = REACH
 """Rows around a band that its features look at."""
 LEVEL_GRADE, SHORE_GRADE = np.float32(0.05), np.float32(0.15)
 """About 3 and 8.5 degrees: water is level; beside it the bank already tilts the slope of a 3 x 3 window."""
+LIKELY, CERTAIN, STILL = np.uint8(1), np.uint8(2), np.uint8(4)
+STILL_GRADE = np.float32(0.004)
+LEVEL_M, LEVEL_PER_CELL = 0.25, 0.025
+"""Standard deviation of a lake's heights, m: of the survey, and per metre of cell for the bank in a cell at the shore.
+Lakes that were measured have at most nine tenths of it; the shadow of a cloud lies over more."""
 SMALLEST_LAKE = 12
+SHORE = (2, 2, 2)
+"""Around lakes, as `spread` takes it: a beach is a bright line, too."""
+ROAD_GRADE = np.float32(0.5)
+"""Of the hillside that a road is cut into, as 3 x 3 cells have it."""
 
 
 class Features:
@@ -40,7 +50,7 @@ class Features:
         darkest = np.minimum(np.minimum(self.red, self.green), self.blue)
         self.saturation = (brightest - darkest) / np.maximum(brightest, np.float32(1))
         self.grade = grade
-        self.sharp = colour
+        self.sharp, self.rgb = colour, rgb
 
     def columns(self) -> Floats:
         """(cells, features) for a learner."""
@@ -62,18 +72,24 @@ def by_rules(
     """Classes of a photo without labels. Where the photo shows nothing (`seen` is false) the class is UNKNOWN."""
     rows, cols = rgb.shape[:2]
     classes = np.empty((rows, cols), np.uint8)
-    likely = np.empty((rows, cols), np.bool_)
-    certain = np.empty((rows, cols), np.bool_)
+    wetness = np.empty((rows, cols), np.uint8)
+    lines = np.zeros((rows, cols), np.uint8)
 
     def work(row0: int, row1: int) -> None:
         inner, features = _features(rgb, elevation_m, resolution_m, row0, row1)
         classes[row0:row1] = _ground(features)[inner]
-        maybe, sure = _water(features)
-        likely[row0:row1], certain[row0:row1] = maybe[inner], sure[inner]
+        wetness[row0:row1] = _water(features)[inner]
+        if resolution_m <= COARSEST_M:
+            strength = line_strength(features.rgb)
+            strength[features.grade > ROAD_GRADE] = 0
+            lines[row0:row1] = strength[inner]
 
     in_bands(rows, work, "classifying the photo", progress)
-    classes[_lakes(likely, certain)] = TerrainClass.WATER
-    _roads_or_not(classes)
+    lakes = _lakes(wetness, elevation_m, resolution_m)
+    if lines.any():
+        lines[spread(lakes, SHORE)] = 0
+        classes[long_lines(lines)] = TerrainClass.ROAD
+    classes[lakes] = TerrainClass.WATER
     if seen is not None:
         classes[~seen] = TerrainClass.UNKNOWN
     return classes
@@ -101,8 +117,8 @@ def _ground(f: Features) -> Bytes:
     classes[bare & (f.grade > np.float32(0.2)) & (f.light > 105)] = TerrainClass.ROCK
     classes[grey & (f.light > 100) & (f.grade > np.float32(0.7))] = TerrainClass.ROCK
     classes[grey & (f.grade < np.float32(0.2)) & (f.texture > 22) & (f.around > 95)] = TerrainClass.BUILT
-    line = f.light > f.around + 12
-    classes[grey & line & (f.grade < np.float32(0.25)) & (f.light > 110) & (f.light < 215)] = TerrainClass.ROAD
+    speck = f.light > f.around + 12
+    classes[grey & speck & (f.grade < np.float32(0.25)) & (f.light > 110) & (f.light < 215)] = TerrainClass.BUILT
     woody = (f.green >= np.float32(0.93) * f.red) & (f.blue <= np.float32(1.2) * f.green)
     classes[woody & (f.around < 78)] = TerrainClass.FOREST
     classes[woody & (f.around < 96) & (f.texture > 17) & ~(green & (f.light > 90))] = TerrainClass.FOREST
@@ -113,11 +129,11 @@ def _ground(f: Features) -> Bytes:
     return classes
 
 
-def _water(f: Features) -> tuple[Bools, Bools]:
-    """(perhaps water, certainly water)."""
+def _water(f: Features) -> Bytes:
+    """Of each cell, which of LIKELY, CERTAIN and STILL it is."""
     bluish = (f.blue > np.float32(1.2) * f.red) & (f.green > np.float32(1.02) * f.red) & (f.around < 170)
     black = (f.light < 40) & (f.blue >= f.red)
-    dead_level = f.grade < np.float32(0.004)
+    dead_level = f.grade < STILL_GRADE
     coloured = bluish | black | (dead_level & (f.light < 65) & (f.blue >= f.red))
     # Sky light in a shadow is blue, not green: a lake is both.
     teal = (f.blue > np.float32(1.45) * f.red) & (f.green > np.float32(1.4) * f.red)
@@ -126,38 +142,42 @@ def _water(f: Features) -> tuple[Bools, Bools]:
     red, green, blue = f.sharp[..., 0], f.sharp[..., 1], f.sharp[..., 2]
     wet = (blue > np.float32(1.2) * red) & (green > np.float32(1.02) * red)
     wet |= (green < 50) & (blue >= red) & (dead_level | black)
-    return (wet | (coloured & smooth)) & (f.grade < SHORE_GRADE), coloured & (smooth | dead_level)
+    wetness: Bytes = ((wet | (coloured & smooth)) & (f.grade < SHORE_GRADE)) * LIKELY
+    wetness |= (coloured & (smooth | dead_level)) * CERTAIN
+    wetness |= dead_level * STILL
+    return wetness
 
 
-def _lakes(likely: Bools, certain: Bools) -> Bools:
-    """Patches of likely water of which a fifth is certain; small ones are puddles or shadows of houses."""
+def _lakes(wetness: Bytes, elevation_m: Floats | None, resolution_m: float) -> Bools:
+    """Patches of likely water of which a fifth is certain, and that are level. Where a shadow lies over a shore the
+    patch is not: then what is still of it, and its shore."""
+    from scipy import ndimage
+
+    likely = (wetness & LIKELY) > 0
+    lakes, tilted = _patches(likely, wetness, elevation_m, resolution_m)
+    if tilted.any():
+        still, _ = _patches(tilted & ((wetness & STILL) > 0), wetness, elevation_m, resolution_m)
+        lakes |= tilted & spread(still, SHORE)
+    return np.asarray(ndimage.binary_fill_holes(lakes), np.bool_) if lakes.any() else lakes
+
+
+def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats | None, resolution_m: float) -> tuple[Bools, Bools]:
+    """(level, tilted) patches; small ones are puddles or shadows of houses and are neither."""
     from scipy import ndimage
 
     labels, count = ndimage.label(likely)
-    if count == 0:
-        return np.zeros(likely.shape, np.bool_)
     sizes = np.bincount(labels.reshape(-1))
-    sure = np.bincount(labels[certain], minlength=count + 1)
-    lake = (sizes >= SMALLEST_LAKE) & (5 * sure >= sizes)
-    lake[0] = False
-    wet = np.asarray(lake[labels], np.bool_)
-    return np.asarray(ndimage.binary_fill_holes(wet), np.bool_) if wet.any() else wet
-
-
-def _roads_or_not(classes: Bytes) -> None:
-    """Bright grey lines are roads if they are long and thin; specks and patches of the same colour are not."""
-    from scipy import ndimage
-
-    labels, count = ndimage.label(classes == TerrainClass.ROAD, np.ones((3, 3), np.int8))
-    if count == 0:
-        return
-    sizes = np.bincount(labels.reshape(-1))
-    long = np.zeros(count + 1, np.bool_)
-    for number, box in enumerate(ndimage.find_objects(labels), 1):
-        if box is not None:
-            reach = max(box[0].stop - box[0].start, box[1].stop - box[1].start)
-            long[number] = reach >= 12 and sizes[number] <= 4 * reach
-    classes[(labels > 0) & ~long[labels]] = TerrainClass.BUILT
+    certain = np.bincount(labels[(wetness & CERTAIN) > 0], minlength=count + 1)
+    wet = (sizes >= SMALLEST_LAKE) & (5 * certain >= sizes)
+    wet[0] = False
+    tilted = np.zeros(count + 1, np.bool_)
+    if elevation_m is not None and wet.any():
+        of_cell = labels[likely]
+        heights = np.nan_to_num(elevation_m[likely].astype(np.float64))
+        mean = np.bincount(of_cell, heights, count + 1) / np.maximum(sizes, 1)
+        variance = np.bincount(of_cell, (heights - mean[of_cell]) ** 2, count + 1) / np.maximum(sizes, 1)
+        tilted = wet & (variance > (LEVEL_M + LEVEL_PER_CELL * resolution_m) ** 2)
+    return np.asarray((wet & ~tilted)[labels], np.bool_), np.asarray(tilted[labels], np.bool_)
 
 
 # --- learnt -------------------------------------------------------------------------------------------------

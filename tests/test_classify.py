@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import ndimage
+from skimage.draw import line
 
 from shared_map.classify import by_rules, confusion, held_out, learnt, overlap
 from shared_map.labels import Labels, read_labels
 from shared_map.layers import TerrainClass
+from shared_map.noise import fractal
 from shared_map.sources import Source, load_source
 from shared_map.synthetic import landscape, paint_photo
 from swarm.config import TerrainConfig
@@ -94,6 +99,73 @@ def test_a_white_cloud_and_its_shadow_on_a_slope_are_no_water() -> None:
     photo[40:60, 40:60] = (25, 32, 60)
     found = by_rules(photo, elevation_m, 20.0)
     assert not (found == TerrainClass.WATER).any()
+
+
+def shaded(photo: NDArray[np.uint8], where: NDArray[np.bool_], dark: float, tint: float) -> NDArray[np.uint8]:
+    """A cloud's shadow with soft borders: darker, and bluer by the light of the sky."""
+    depth = ndimage.gaussian_filter(where.astype(np.float32), 2)[..., None]
+    factor = 1 + (np.array([dark * (2 - tint), dark, dark * tint]) - 1) * depth
+    return np.asarray(np.clip(photo * factor, 0, 255), np.uint8)
+
+
+@pytest.mark.parametrize("dark", [0.2, 0.3, 0.45, 0.6])
+@pytest.mark.parametrize("tint", [1.0, 1.15, 1.3])
+def test_shadows_of_clouds_do_not_become_water(dark: float, tint: float) -> None:
+    elevation_m, classes = landscape(300, 400, 20.0, 300.0, seed=4)
+    photo = paint_photo(elevation_m, classes, 20.0, seed=4)
+    clouds = fractal(np.random.default_rng(7), 300, 400, 60.0)
+    shadow = clouds > np.quantile(clouds, 0.8)
+    found = by_rules(shaded(photo, shadow, dark, tint), elevation_m, 20.0)
+    assert (found == TerrainClass.WATER).sum() < 0.01 * shadow.sum()
+
+
+def test_a_shadow_over_the_shore_leaves_the_lake_and_takes_little_of_the_land(
+    davos: tuple[Source, Labels],
+) -> None:
+    source, labels = davos
+    assert source.photo is not None
+    lake = labels.groups == 0
+    shadow = np.zeros(lake.shape, np.bool_)
+    shadow[180:280, 380:480] = True  # half of the lake, and the meadow to its west
+    found = by_rules(shaded(source.photo, shadow, 0.4, 1.15), source.elevation_m, 10.0) == TerrainClass.WATER
+    assert (found & lake).sum() / lake.sum() > 0.9
+    assert (found & shadow & ~lake).sum() < 0.1 * (shadow & ~lake).sum()
+
+
+def traced_roads(shape: tuple[int, int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(cells on traced roads, windows in which every road was traced): tests/davosdorf_roads.toml."""
+    file = tomllib.loads(Path(__file__).with_name("davosdorf_roads.toml").read_text())
+    roads, whole = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    for road in file["roads"]:
+        for (col0, row0), (col1, row1) in itertools.pairwise(road["cells"]):
+            roads[line(row0, col0, row1, col1)] = True  # type: ignore[no-untyped-call]
+    for col0, row0, col1, row1 in file["whole"]:
+        whole[row0:row1, col0:col1] = True
+    return roads, whole
+
+
+def test_most_roads_of_davos_are_found_and_little_else(davos: tuple[Source, Labels]) -> None:
+    source, labels = davos
+    roads, whole = traced_roads(source.classes.shape)
+    found = source.classes == TerrainClass.ROAD
+    to_found, to_roads = (ndimage.distance_transform_edt(~cells) for cells in (found, roads))
+    assert (to_found[roads] <= 2).mean() > 0.6
+    assert (to_roads[found & whole] <= 2).mean() > 0.9
+    for kind in (TerrainClass.WATER, TerrainClass.FOREST, TerrainClass.GRASS, TerrainClass.ROCK):
+        assert found[labels.classes == kind].mean() < 0.005
+
+
+def test_a_line_is_a_road_if_it_is_long_and_bright_on_both_sides() -> None:
+    photo = np.full((90, 120, 3), (96, 128, 70), np.uint8)
+    photo[:, :30] = (150, 150, 140)  # a field with an edge
+    photo[20, 40:110] = (170, 170, 165)
+    photo[20, 60] = photo[20, 75] = (60, 80, 50)  # trees over it
+    photo[50, 40:52] = (170, 170, 165)  # too short
+    level = np.zeros((90, 120), np.float32)
+    found = by_rules(photo, level, 10.0) == TerrainClass.ROAD
+    assert found[19:22, 42:108].any(axis=0).all()
+    assert not found[25:].any()
+    assert not (by_rules(photo, level, 90.0) == TerrainClass.ROAD).any()  # no road is that wide
 
 
 def test_bands_do_not_show(davos: tuple[Source, Labels], monkeypatch: pytest.MonkeyPatch) -> None:
