@@ -33,13 +33,13 @@ class Arrival(NamedTuple):
 class Said(NamedTuple):
     """Columns of statements about cells of several tiles; all of one length.
 
-    places     arrival * TILE_AREA + cell in its tile; increasing, none twice, once resolved
+    places     arrival * TILE_AREA + cell in its tile, below 2**31; increasing, none twice, once resolved
     kinds      MarkKind
     paces      s/m, 0 where the kind is not PACE
     stamps_ns  NO_STATEMENT where nobody says anything any more
     """
 
-    places: NDArray[np.int64]
+    places: NDArray[np.int32]
     kinds: NDArray[np.uint8]
     paces: NDArray[np.float32]
     stamps_ns: NDArray[np.int64]
@@ -58,24 +58,24 @@ def difference_of_many(arrivals: Sequence[Arrival], now_ns: int) -> Said:
     return found[0] if len(found) == 1 else _together(found)
 
 
-def cells_of(grid: GridSpec, tiles: NDArray[np.int64], places: NDArray[np.int64]) -> NDArray[np.uint32]:
+def cells_of(grid: GridSpec, tiles: NDArray[np.int64], places: NDArray[np.int32]) -> NDArray[np.uint32]:
     """Flat indices in the grid. `tiles` are those of the arrivals."""
     tile_rows, tile_cols = np.divmod(tiles, grid.tile_cols)
-    corners = tile_rows * (TILE_CELLS * grid.cols) + tile_cols * TILE_CELLS
-    arrival, inner = places >> _AREA_BITS, places & (TILE_AREA - 1)
-    cells = corners[arrival] + (inner >> _SIDE_BITS) * grid.cols + (inner & (TILE_CELLS - 1))
-    found: NDArray[np.uint32] = cells.astype(np.uint32)
-    return found
+    corners = (tile_rows * (TILE_CELLS * grid.cols) + tile_cols * TILE_CELLS).astype(np.uint32)
+    inner = np.arange(TILE_AREA)
+    offsets = (inner // TILE_CELLS * grid.cols + inner % TILE_CELLS).astype(np.uint32)
+    cells: NDArray[np.uint32] = corners[places >> _AREA_BITS] + offsets[places & (TILE_AREA - 1)]
+    return cells
 
 
 def _undisputed(arrivals: Sequence[Arrival], numbers: list[int], now_ns: int) -> Said:
     """Nobody else says anything about these tiles: what the author says now differs from what it said."""
-    after, _ = _columns([arrivals[at].new for at in numbers], numbers, now_ns)
+    after = _columns([arrivals[at].new for at in numbers], numbers, now_ns)
     replaced = [(at, old) for at in numbers if (old := arrivals[at].old) is not None and old.kinds]
     if not replaced:
         clear = after.kinds == _CLEAR
         return after.taken(~clear) if clear.any() else after
-    before, _ = _columns([old for _, old in replaced], [at for at, _ in replaced], now_ns)
+    before = _columns([old for _, old in replaced], [at for at, _ in replaced], now_ns)
     return _changed(before, after)
 
 
@@ -89,8 +89,9 @@ def _disputed(arrivals: Sequence[Arrival], numbers: list[int], now_ns: int) -> S
 
 def _winners(sets: list[tuple[int, MarkSet]], rank: dict[str, int], now_ns: int) -> Said:
     """Per place the newest statement, on a tie that of the larger author."""
-    said, of_set = _columns([each for _, each in sets], [at for at, _ in sets], now_ns)
-    ranks = np.array([rank[each.author] for _, each in sets], np.int64)[of_set]
+    all_sets = [each for _, each in sets]
+    said = _columns(all_sets, [at for at, _ in sets], now_ns)
+    ranks = _per_statement([rank[each.author] for each in all_sets], all_sets, now_ns)
     order = np.lexsort((ranks, said.stamps_ns, said.places))
     places = said.places[order]
     last = np.ones(len(places), bool)
@@ -98,24 +99,35 @@ def _winners(sets: list[tuple[int, MarkSet]], rank: dict[str, int], now_ns: int)
     return said.taken(order[last])
 
 
-def _columns(sets: list[MarkSet], numbers: list[int], now_ns: int) -> tuple[Said, NDArray[np.int64]]:
-    """The statements of all sets that still stand, in the order of the sets, and which set each is of."""
-    counts = np.array([len(each.kinds) for each in sets], np.int64)
-    of_set = np.repeat(np.arange(len(sets)), counts)
+def _columns(sets: list[MarkSet], numbers: list[int], now_ns: int) -> Said:
+    """The statements of all sets that still stand, in the order of the sets."""
     kinds = column(b"".join([each.kinds for each in sets]), "<u1")
     paces = column(b"".join([each.paces for each in sets]), "<f4")
     stamps_ns = column(b"".join([each.stamps_ns for each in sets]), "<i8")
     cells = column(b"".join([each.cells for each in sets]), "<u2")
-    places = (np.array(numbers, np.int64) << _AREA_BITS)[of_set] + cells
+    places = np.repeat(np.array(numbers, np.int32) << _AREA_BITS, [len(each.kinds) for each in sets])
+    places += cells
     if kinds.any():
         paces = np.where(kinds == _PACE, paces, np.float32(0))
     said = Said(places, kinds, paces, stamps_ns)
-    if any(each.untils_ns for each in sets):
-        forever = np.int64(FOREVER).tobytes()
-        ends = b"".join([each.untils_ns or forever * len(each.kinds) for each in sets])
-        stands = np.flatnonzero(column(ends, "<i8") > now_ns)
-        return said.taken(stands), of_set[stands]
-    return said, of_set
+    stands = _stand(sets, now_ns)
+    return said if stands is None else said.taken(stands)
+
+
+def _per_statement(values: list[int], sets: list[MarkSet], now_ns: int) -> NDArray[np.int32]:
+    """A value of each set, repeated for each of its statements that still stand."""
+    spread = np.repeat(np.array(values, np.int32), [len(each.kinds) for each in sets])
+    stands = _stand(sets, now_ns)
+    return spread if stands is None else spread[stands]
+
+
+def _stand(sets: list[MarkSet], now_ns: int) -> NDArray[np.bool_] | None:
+    """Which statements have not ended; None if none of them ever ends."""
+    if not any([each.untils_ns for each in sets]):  # noqa: C419 - a list is looked through in half the time
+        return None
+    forever = np.int64(FOREVER).tobytes()
+    ends = b"".join([each.untils_ns or forever * len(each.kinds) for each in sets])
+    return np.asarray(column(ends, "<i8") > now_ns)
 
 
 def _changed(before: Said, after: Said) -> Said:
@@ -153,5 +165,4 @@ def _together(parts: Sequence[Said]) -> Said:
 
 _CLEAR = int(MarkKind.CLEAR)
 _PACE = int(MarkKind.PACE)
-_SIDE_BITS = TILE_CELLS.bit_length() - 1
 _AREA_BITS = TILE_AREA.bit_length() - 1

@@ -177,12 +177,28 @@ class MapFeed:
 
     def _hear(self, samples: Sequence[tuple[str, Message]], now_ns: int) -> None:
         """Sets that were put: each under the key of its tile and author, as access is granted by key."""
+        if len(samples) == 1:
+            self._hear_one(*samples[0], now_ns)
+            return
         sets = [
             each for key, each in samples
             if isinstance(each, MarkSet) and key.endswith(f"/{each.tile}/{each.author}")
         ]  # fmt: skip
         self.replica.counts["sets_refused"] += len(samples) - len(sets)
         self._admit(sets, now_ns)
+
+    def _hear_one(self, key: str, heard: Message, now_ns: int) -> None:
+        """As `_hear`, without what only many need: somebody may wait for this one."""
+        if not isinstance(heard, MarkSet) or not key.endswith(f"/{heard.tile}/{heard.author}"):
+            self.replica.counts["sets_refused"] += 1
+        elif not self._quota.admits(heard, now_ns):
+            self._name_late(heard.author, now_ns)
+        else:
+            changed = self.replica.merge(heard)
+            if changed is not None and self._on_accepted is not None:
+                self._on_accepted(heard)
+            self._quota.charge(heard.author, 0 if changed is None else len(changed), now_ns)
+            self._name_crowded_out(now_ns)
 
     def _told(self, event: Replied) -> list[MarkSet]:
         """The sets in a reply. Nobody speaks for another there either, whether of one tile or of many."""
@@ -209,7 +225,7 @@ class MapFeed:
                 self._merge_charged(taken, marks, now_ns)
                 taken, marks, said = [], {}, None
             if said is None and not self._quota.admits(each, now_ns):
-                self._name_once(author, "marks more than its share: it is heard with delay", now_ns)
+                self._name_late(author, now_ns)
                 continue
             taken.append(each)
             marks[author] = (said or 0) + len(each.kinds)
@@ -222,9 +238,7 @@ class MapFeed:
             costs[each.author] += changed
         for author, cost in costs.items():
             self._quota.charge(author, cost, now_ns)
-        if self.replica.crowded_out is not None:
-            self._name_once(self.replica.crowded_out, "says more than there is room for: it is not heard", now_ns)
-            self.replica.crowded_out = None
+        self._name_crowded_out(now_ns)
 
     def _merge_waiting(self, now_ns: int) -> None:
         while (mark_set := self._quota.due(now_ns)) is not None:
@@ -238,6 +252,14 @@ class MapFeed:
             for each in merged.sets:
                 self._on_accepted(each)
         return merged
+
+    def _name_late(self, author: str, now_ns: int) -> None:
+        self._name_once(author, "marks more than its share: it is heard with delay", now_ns)
+
+    def _name_crowded_out(self, now_ns: int) -> None:
+        if self.replica.crowded_out is not None:
+            self._name_once(self.replica.crowded_out, "says more than there is room for: it is not heard", now_ns)
+            self.replica.crowded_out = None
 
     def _name_once(self, author: str, what: str, now_ns: int) -> None:
         if now_ns - self._named_ns.get(author, -_NAME_AGAIN_NS) >= _NAME_AGAIN_NS:

@@ -260,6 +260,8 @@ _CLEAR = int(MarkKind.CLEAR)
 _PACE = int(MarkKind.PACE)
 _NOBODY = (_CLEAR, 0.0, NO_STATEMENT)
 _NO_PACE = np.float32(0)
+_FEW_CELLS = 16
+"""Up to so many, lists are faster than arrays."""
 _TILE_BITS = np.uint32(TILE_CELLS.bit_length() - 1)
 _TILE_MASK = np.uint32(TILE_CELLS - 1)
 _TILE: NDArray[np.uint16] = np.arange(TILE_AREA, dtype=np.uint16)
@@ -288,7 +290,11 @@ NOTHING_SAID = Statements(
 def grid_cells(grid: GridSpec, tile: int, cells: NDArray[np.integer]) -> NDArray[np.uint32]:
     """Flat indices in the grid of cells inside a tile."""
     tile_row, tile_col = divmod(tile, grid.tile_cols)
-    corner = np.uint32(tile_row * TILE_CELLS * grid.cols + tile_col * TILE_CELLS)
+    place = tile_row * TILE_CELLS * grid.cols + tile_col * TILE_CELLS
+    if len(cells) <= _FEW_CELLS:
+        few: list[int] = cells.tolist()
+        return np.array([place + c // TILE_CELLS * grid.cols + c % TILE_CELLS for c in few], np.uint32)
+    corner = np.uint32(place)
     inner = cells.astype(np.uint32)
     return (inner >> _TILE_BITS) * np.uint32(grid.cols) + (inner & _TILE_MASK) + corner
 

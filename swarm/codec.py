@@ -60,6 +60,11 @@ def decode_either(payload: bytes, usual: type[M], other: type[N] | None) -> M | 
 
 def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | ProtocolError]:
     """As `decode`, of many payloads, each for itself: the rules of many sets of marks are checked at once."""
+    if len(payloads) == 1:
+        try:
+            return [decode(payloads[0], message_type)]
+        except ProtocolError as error:
+            return [error]
     found: list[M | ProtocolError] = []
     sets: list[tuple[int, MarkSet]] = []
     for payload in payloads:

@@ -27,6 +27,9 @@ Cell = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 32)]
 """A cell, row or column as others name it. The message cannot know the grid: it may lie outside."""
 
 _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+_KNOWN_IDS: set[str] = set()
+"""Ids that have been looked at: the same few hundred come thousands of times a second."""
+_MAX_KNOWN_IDS = 4096
 
 
 def pack_column(values: Any, dtype: str) -> bytes:
@@ -45,7 +48,13 @@ def check_column(name: str, data: bytes, width: int, count: int) -> None:
 
 
 def check_id(name: str, value: str) -> None:
-    if _ID.fullmatch(value) is None:
+    if value in _KNOWN_IDS:
+        return
+    if _ID.fullmatch(value) is not None:
+        if len(_KNOWN_IDS) >= _MAX_KNOWN_IDS:
+            _KNOWN_IDS.clear()  # somebody uses a new one each time
+        _KNOWN_IDS.add(value)
+    else:
         raise ValueError(f"{name} {value[:80]!r} is not 1 to 64 of letters, digits, '_', '.', '-'")
 
 

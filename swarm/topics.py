@@ -118,6 +118,8 @@ _CHUNK = re.compile(r"[^/*$?#\s]+|\*")
 
 def _chunk(value: str | int) -> str:
     chunk = str(value)
+    if isinstance(value, int):
+        return chunk
     if _CHUNK.fullmatch(chunk) is None:
         raise ValueError(f"{chunk!r} cannot be a part of a key: no '/', '*', '$', '?', '#' or blanks")
     return chunk
