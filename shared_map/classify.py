@@ -23,8 +23,8 @@ LEVEL_GRADE, SHORE_GRADE = np.float32(0.05), np.float32(0.15)
 LIKELY, CERTAIN, STILL = np.uint8(1), np.uint8(2), np.uint8(4)
 STILL_GRADE = np.float32(0.004)
 LEVEL_M, LEVEL_PER_CELL = 0.25, 0.025
-"""Standard deviation of a lake's heights, m: of the survey, and per metre of cell for the bank in a cell at the shore.
-Lakes that were measured have at most nine tenths of it; the shadow of a cloud lies over more."""
+"""Standard deviation of a lake's heights: metres of the survey, and per metre of cell for the bank in a cell at the
+shore. Lakes that were measured have at most nine tenths of it; the shadow of a cloud lies over more."""
 SMALLEST_LAKE = 12
 SHORE = (2, 2, 2)
 """Around lakes, as `spread` takes it: a beach is a bright line, too."""
