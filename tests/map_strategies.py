@@ -190,7 +190,7 @@ class MapSwarm:
         return service
 
     def keeper(self, id: str, store: KeeperStore, incarnation: int = 1) -> KeeperService:
-        setup = RoleSetup(Scenario(), "run", "keeper", id, incarnation, 0)
+        setup = RoleSetup(Scenario(map=self.config), "run", "keeper", id, incarnation, 0)
         node = f"{id}.{incarnation}"
         bus = self.network.bus(node)
         service: KeeperService | None = None

@@ -3,10 +3,10 @@
 python -m launch_scripts.bench.partition --rounds 20 --seconds 30 --json
 
 Needs root and `ip` (iproute2). Two namespaces stand for two machines, a pair of veth for the cable between them. On
-each side run, as processes of their own, a router, a keeper with its store on disk, two authors that say
-something about eight cells every 50 ms, and a listener; the sides meet over tls/ with certificates made for the purpose. A round
-takes the cable down, lets both sides write, stops writing, puts the cable up, and measures until every replica of
-both sides tells the same digest and none has changed for a second.
+each side run, as processes of their own, a router, a keeper with its store on disk, two authors that say something
+about eight cells every 50 ms, and a listener; the sides meet over tls/ with certificates made for the purpose. A
+round takes the cable down, lets both sides write, stops writing, puts the cable up, and measures until every
+replica of both sides tells the same digest and none has changed for a second.
 """
 
 from __future__ import annotations
