@@ -8,8 +8,8 @@ import numpy as np
 
 from swarm.messages import MarkSet, MarkSets, column, pack_column
 
-MAX_BULK_BYTES = 1 << 20
-"""A reply is cut off about here: the reader merges one while the next is on its way."""
+MAX_BULK_BYTES = 1 << 18
+"""A reply is cut off about here: while the reader merges one, the next is packed and on its way."""
 _BULK_SETS = 4096
 
 

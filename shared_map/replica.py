@@ -34,6 +34,7 @@ from shared_map.marks import (
     supersedes,
     tile_cells,
 )
+from shared_map.reading import Reading
 from shared_map.room import Room
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
@@ -79,8 +80,10 @@ class MapReplica:
     author      name under which `write` speaks; None for those who only listen
     publish_hz  each tile's set goes out at most this often
     room        bounds of what it may hold of others
-    counts      sets_merged, sets_repeated, sets_refused, sets_without_room, marks_merged (cells whose winner
-                changed), marks_written
+    reading     whose sets it takes in and about which tiles; everybody's and all if not given
+    counts      sets_merged, sets_repeated, sets_refused, sets_without_room, sets_foreign (of a group that is not
+                read), sets_elsewhere (about tiles of no interest), marks_merged (cells whose winner changed),
+                marks_written
     """
 
     def __init__(
@@ -92,14 +95,16 @@ class MapReplica:
         group: str = "all",
         publish_hz: float = 10.0,
         room: Room | None = None,
+        reading: Reading | None = None,
     ) -> None:
         self.grid = grid
         self.author = author
         self.group = group
-        names = ("merged", "repeated", "refused", "without_room")
+        names = ("merged", "repeated", "refused", "without_room", "foreign", "elsewhere")
         self.counts = dict.fromkeys([f"sets_{name}" for name in names] + ["marks_merged", "marks_written"], 0)
         self.ledger = Ledger()
         self.room = room or Room()
+        self.reading = reading or Reading(grid)
         self.crowded_out: str | None = None  # the author of the set that last had no room
         self._graves = Graves()
         self._tile_count = grid.tiles
@@ -141,19 +146,21 @@ class MapReplica:
         merged = Merged([], [])
         for sets in self._rounds(received):
             many = len(sets) >= _WORTH_ARRAYS
-            for each in filter(is_burial, sets) if many else sets:
+            singly = [each for each in sets if not each.kinds and is_burial(each)] if many else sets
+            for each in singly:
                 changed = self.merge(each, measured=measured)
                 if changed is not None:
                     merged.sets.append(each)
                     merged.changed.append(len(changed))
             if many:
-                self._accept_many([each for each in sets if not is_burial(each)], measured, merged)
+                rest = [each for each in sets if each.kinds or not is_burial(each)] if singly else sets
+                self._accept_many(rest, measured, merged)
         return merged
 
-    def _rounds(self, received: Sequence[MarkSet]) -> list[list[MarkSet]]:
+    def _rounds(self, received: Sequence[MarkSet]) -> Sequence[Sequence[MarkSet]]:
         """The newest set of each tile and author, in groups in which no tile occurs twice."""
-        if len(received) == 1:
-            return [list(received)]
+        if len({each.tile for each in received}) == len(received):
+            return [received]
         newest: dict[tuple[int, str], MarkSet] = {}
         for each in received:
             held = newest.setdefault((each.tile, each.author), each)
@@ -171,7 +178,7 @@ class MapReplica:
             rounds[nth].append(each)
         return rounds
 
-    def _accept_many(self, received: list[MarkSet], measured: bool, merged: Merged) -> None:
+    def _accept_many(self, received: Sequence[MarkSet], measured: bool, merged: Merged) -> None:
         """Take in sets of different tiles."""
         arrivals: list[Arrival] = []
         for each in received:
@@ -209,6 +216,13 @@ class MapReplica:
         if received.tile >= self._tile_count or (self._ragged and fault(received, self.grid) is not None):
             self.counts["sets_refused"] += 1
             return False
+        if received.author != self.author:
+            if not self.reading.hears(received.author, received.group):
+                self.counts["sets_foreign"] += 1
+                return False
+            if not self.reading.concerns(received.tile):
+                self.counts["sets_elsewhere"] += 1
+                return False
         known = self._graves.holds(received) if held is None else not supersedes(received, held)
         if known:
             self.counts["sets_repeated"] += 1
@@ -419,7 +433,7 @@ class MapReplica:
 
     def compare(self, theirs: Held) -> list[tuple[str, list[int]]]:
         """(author, tiles) to ask for: what they hold newer than we."""
-        missing = self.ledger.missing(theirs)
+        missing = self.reading.wanted(self.ledger.missing(theirs))
         inside = ((author, [t for t in tiles if self._wants(author, t)]) for author, tiles in missing)
         return [(author, tiles) for author, tiles in inside if tiles]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -191,6 +192,7 @@ class Process:
         counters = self._service.counters
         counters.count("ticks_dropped", 0)
         self._service.start(self._clock.now_ns())
+        gc.freeze()  # what lives as long as we do is not looked through again and again while somebody waits
         due_ns = self._clock.now_ns()
         try:
             while not self._stopping:
