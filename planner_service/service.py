@@ -23,6 +23,7 @@ from planner_service.planner import Planner
 from planner_service.strategies import GrownTree, TargetTree
 from shared_map.cost_map import CostMap
 from shared_map.feed import MapFeed
+from shared_map.reading import Reading, readable_for_target
 from shared_map.replica import MapReplica
 from shared_map.terrain import Terrain
 from swarm.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
@@ -60,7 +61,8 @@ class PlannerService:
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
         self.counters = self._member.counters
         self._cost_map = CostMap(terrain)
-        self._replica = MapReplica(terrain.grid, self._cost_map)
+        reading = Reading(terrain.grid, readable_for_target(scenario, setup.id))
+        self._replica = MapReplica(terrain.grid, self._cost_map, reading=reading)
         self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role)
         self._planner = Planner(
             setup.id,
@@ -106,7 +108,8 @@ class PlannerService:
     def tick(self, now_ns: int) -> None:
         self._feed.tick(now_ns)
         self._perform(self._planner.tick(now_ns))
-        self.counters.counts["marks_merged"] = self._replica.counts["marks_merged"]
+        for name in ("marks_merged", "sets_foreign"):
+            self.counters.counts[name] = self._replica.counts[name]
         if self._planner.tree.ready and not self._served:
             self._served = True
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)

@@ -23,6 +23,7 @@ NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
+GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
 Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Point = tuple[Metres, Metres]
 
@@ -138,6 +139,8 @@ class GroupConfig(Section, frozen=True, kw_only=True):
     targets  ids they may chase; all if empty
     start    spread over the terrain, or clustered around one random place
     cells    explicit [row, col] places for the first vehicles
+    reads    groups whose marks and positions its vehicles take in, besides their own; "*" is all
+    writes   groups that may take in its marks and positions; both must agree
     """
 
     name: Name = "all"
@@ -145,6 +148,8 @@ class GroupConfig(Section, frozen=True, kw_only=True):
     targets: tuple[Name, ...] = ()
     start: Literal["spread", "cluster"] = "spread"
     cells: tuple[tuple[int, int], ...] = ()
+    reads: tuple[GroupName, ...] = ("*",)
+    writes: tuple[GroupName, ...] = ("*",)
 
 
 class VehicleConfig(Section, frozen=True, kw_only=True):
@@ -359,12 +364,23 @@ def _check(scenario: Scenario, source: str) -> None:
     names = [group.name for group in scenario.groups]
     if len(set(names)) < len(names):
         raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
+    for name in names:
+        longer = [other for other in names if other.startswith(f"{name}.")]
+        if longer:  # the id of an author begins with its group and a point
+            raise ConfigError(
+                f"{source}: groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
+            )
     for group in scenario.groups:
         for id in group.targets:
             if id not in ids:
                 raise ConfigError(
                     f"{source}: groups: {group.name} chases {id!r}, which is no target{nearest(id, ids)}"
                 )
+        for key in ("reads", "writes"):
+            for name in getattr(group, key):
+                if name != "*" and name not in names:
+                    where = f"{source}: groups: {group.name}: {key}"
+                    raise ConfigError(f"{where} names {name!r}, which is no group{nearest(name, names)}")
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
             check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")

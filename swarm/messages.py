@@ -353,9 +353,10 @@ class Claims(Message, frozen=True, kw_only=True, tag=schema_of("claims")):
 
 
 class Grounds(Message, frozen=True, kw_only=True, tag=schema_of("grounds")):
-    """The regions in which an agent's vehicles may claim cells: in a question to all agents, and in each answer.
+    """The plots in which an agent's vehicles may claim cells: in a question to all agents, and in each answer.
 
     seq     grows with each change within an incarnation; 0 while the agent has not put its vehicles anywhere
+    plots   squares of 64 x 64 cells, counted row by row as regions are
     silent  asked: dead agents whose last words are wanted
     words   answered: the newest claims that were heard of those
     """
@@ -363,7 +364,7 @@ class Grounds(Message, frozen=True, kw_only=True, tag=schema_of("grounds")):
     agent: str
     incarnation: Natural
     seq: Natural
-    regions: list[Natural]
+    plots: list[Natural]
     silent: list[str] = []
     words: list[Claims] = []
 

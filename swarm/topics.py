@@ -156,7 +156,7 @@ CLAIMS = Topic(
 )  # fmt: skip
 GROUNDS = Topic(
     "grounds", "grounds/{agent}", Grounds,
-    "in which regions agents claim cells: asked of all before a region is entered", "on change", request=Grounds,
+    "in which plots agents claim cells: asked of all before one is entered", "on change", request=Grounds,
     published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(

@@ -1,4 +1,4 @@
-"""Shared ground: agents that share no region neither wait for nor hear each other, and still never meet."""
+"""Shared ground: agents that share no plot neither wait for nor hear each other, and still never meet."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.messages import Claims, Grounds
 from vehicle_agent.avoidance import Resumption, RightOfWay
-from vehicle_agent.grounds import SharedGround
+from vehicle_agent.grounds import PLOT_CELLS, SharedGround
 
 GRID = GridSpec(1, 2048, 10.0)
-"""A strip of eight regions."""
+"""A strip of 32 plots."""
 AGENTS = ("a0", "a1", "a2", "a3", "a4", "a5")
-CELLS = [256 * region + off for region in range(8) for off in (100, 101)]
-"""A ring of places, two in each region: whoever drives along it changes regions all the time."""
+CELLS = [256 * plot + off for plot in range(8) for off in (100, 101)]
+"""A ring of places, two to a plot: whoever drives along it changes plots all the time."""
 SPAWNS = {agent: {f"{agent}-u": CELLS[2 * n]} for n, agent in enumerate(AGENTS)}
 
 
@@ -30,7 +30,7 @@ class Process:
         self.agent = agent
         self.incarnation = incarnation
         self.ground = SharedGround(agent, incarnation, GRID, AGENTS, witnesses)
-        self.near = Interest(GRID, 0)
+        self.near = Interest(GRID, 0, square_cells=PLOT_CELLS)
         self.rights = RightOfWay(agent, incarnation, SPAWNS, self.ground)
         self.alive: dict[str, int] = {}
         self.gathering: Resumption | None = Resumption(agent)
@@ -274,7 +274,7 @@ def tell(asker: SharedGround, *others: SharedGround) -> None:
         asker.answered(other.answer(), question.seq)
 
 
-def test_a_region_is_settled_when_everybody_who_lives_has_answered() -> None:
+def test_a_plot_is_settled_when_everybody_who_lives_has_answered() -> None:
     a, b, c = three()
     a.wish(frozenset({0}))
     tell(a, b)
@@ -287,7 +287,7 @@ def test_a_region_is_settled_when_everybody_who_lives_has_answered() -> None:
     assert a.question(2 * NS_PER_S) is None
 
 
-def test_whoever_shares_a_region_must_echo_and_the_others_need_not() -> None:
+def test_whoever_shares_a_plot_must_echo_and_the_others_need_not() -> None:
     a, b, c = three()
     a.wish(frozenset({0}))
     b.wish(frozenset({0, 1}))
@@ -357,30 +357,30 @@ def test_a_radius_wider_than_a_region_covers_all_between() -> None:
 
 def test_nothing_is_wanted_where_not_everybody_knows_that_we_are() -> None:
     a, b, _ = three()
-    rights = RightOfWay("a", 1, {"a": {"u": 100}}, a)
+    rights = RightOfWay("a", 1, {"a": {"u": 30}}, a)
     rights.set_alive({"a": 1, "b": 1, "c": 1})
-    rights.place("u", 255)
+    rights.place("u", 63)
     a.wish(frozenset({0, 1}))
-    rights.ask("u", [256, 257])
+    rights.ask("u", [64, 65])
     assert rights.wants("u") == []
     tell(a, b, three()[2])
-    rights.ask("u", [256, 257])
-    assert rights.wants("u") == [256, 257]
+    rights.ask("u", [64, 65])
+    assert rights.wants("u") == [64, 65]
 
 
-def test_where_somebody_died_of_whom_nobody_heard_anything_the_region_stays_closed() -> None:
+def test_where_somebody_died_of_whom_nobody_heard_anything_the_plot_stays_closed() -> None:
     a, b, c = three()
     b.wish(frozenset({0}))
     tell(b, a, c)
     a.set_alive({"a": 1})
-    rights = RightOfWay("a", 1, {"a": {"u": 256}}, a)
-    rights.place("u", 256)
+    rights = RightOfWay("a", 1, {"a": {"u": 64}}, a)
+    rights.place("u", 64)
     a.wish(frozenset({0, 1}))
     assert a.settled(0)
-    rights.ask("u", [255])
+    rights.ask("u", [63])
     assert rights.wants("u") == []
     words = Claims(agent="b", incarnation=1, seq=9, clock=3, holds={"v": [30]}, wants=[], seen={})
     rights.heard(words)
-    rights.ask("u", [255])
-    assert rights.wants("u") == [255]
+    rights.ask("u", [63])
+    assert rights.wants("u") == [63]
     assert rights.holder(30) == "v"

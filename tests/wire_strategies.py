@@ -176,7 +176,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     Fleet: fleets(),
     Claims: claims,
     Grounds: st.builds(
-        Grounds, agent=ids, incarnation=naturals, seq=naturals, regions=st.lists(naturals, max_size=3),
+        Grounds, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(naturals, max_size=3),
         silent=st.lists(ids, max_size=2), words=st.lists(claims, max_size=2),
     ),
     Followed: st.builds(
@@ -254,7 +254,7 @@ EXAMPLES: tuple[Message, ...] = (
         wants=[Want(vehicle="a0-00", cell=6, ticket=3)], seen={"a1": (7, 2)},
     ),
     Grounds(
-        agent="a0", incarnation=7, seq=2, regions=[0, 3], silent=["a1"],
+        agent="a0", incarnation=7, seq=2, plots=[0, 3], silent=["a1"],
         words=[Claims(agent="a1", incarnation=7, seq=2, clock=1, holds={"a1-00": [9]}, wants=[], seen={})],
     ),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),

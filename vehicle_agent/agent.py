@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.climb import Climb
+from shared_map.presence import Presence
 from swarm.clock import NS_PER_S
 from swarm.config import AgentPlan, Scenario
 from swarm.grid import GridSpec
@@ -102,6 +103,7 @@ class Agent:
         sensor: Sensor,
         spawns: Mapping[str, Mapping[str, int]],
         incarnation: int,
+        presence: Presence | None = None,
         shared_ground: SharedGround | None = None,
     ) -> None:
         self.plan = plan
@@ -115,7 +117,8 @@ class Agent:
         self._map = ground
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
-        self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance)
+        presence = presence or Presence(ground.grid, 0, 1.0)
+        self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance, presence)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._homeless: dict[str, int] = {}

@@ -4,7 +4,7 @@ The rule is Ricart and Agrawala's (1981) on messages that each carry their sende
 repetition and reordering do no harm. A vehicle may enter a cell when every other live agent has echoed the message
 in which the want first stood, and in nobody's newest claims the cell is held, or wanted with a lower
 (ticket, agent, vehicle). With `SharedGround` only those neighbours and witnesses are waited for and heard whom it
-names, and a cell is wanted only in a region that it calls settled.
+names, and a cell is wanted only in a plot that it calls settled.
 
 Why no two get the same cell: A goes by a message of B that echoes A's want, B by one of A that echoes B's. Had B
 got the cell before it sent that message, the message would say so. So B got it later, when it knew A's want, and
@@ -191,7 +191,7 @@ class RightOfWay:
         self._changed = True
 
     def _settled_part(self, mine: _Mine, ahead: Sequence[int]) -> Sequence[int]:
-        """The cells up to the first in a region that not everybody knows to be ours."""
+        """The cells up to the first in a plot that not everybody knows to be ours."""
         if self._ground is not None:
             for index, cell in enumerate(ahead):
                 if cell not in mine.holds and not self._is_settled(cell):
@@ -202,10 +202,10 @@ class RightOfWay:
         ground = self._ground
         if ground is None:
             return True
-        region = ground.region_of(cell)
-        if not ground.settled(region):
+        plot = ground.plot_of(cell)
+        if not ground.settled(plot):
             return False
-        for agent, incarnation in ground.dead_in(region):
+        for agent, incarnation in ground.dead_in(plot):
             other = self._others.get(agent)
             if other is None or other.claims.incarnation < incarnation:
                 return False  # nobody who lives can tell where its vehicles stand

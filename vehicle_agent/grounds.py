@@ -1,14 +1,14 @@
-"""With whom an agent comes to terms about cells: whoever shares a region with it, and two witnesses.
+"""With whom an agent comes to terms about cells: whoever shares a plot with it, and two witnesses.
 
-An agent's ground are the regions in which its vehicles may claim cells. Before it claims anything in a region, it
-tells every live agent, and each must have answered. An answer carries the other's own ground. So of two agents in
-one region each knows of the other before it claims anything there: had B not been in the region when it answered A,
-it came later, knew of A by then, and cannot claim before A has answered, too. Whoever shares no region need not be
-waited for and is not listened to: what claims cost grows with the neighbours, not with the swarm.
+An agent's ground are the plots (64 x 64 cells) in which its vehicles may claim cells. Before it claims anything in
+a plot, it tells every live agent, and each must have answered. An answer carries the other's own ground. So of two
+agents in one plot each knows of the other before it claims anything there: had B not been in the plot when it
+answered A, it came later, knew of A by then, and cannot claim before A has answered, too. Whoever shares no plot
+need not be waited for and is not listened to: what claims cost grows with the neighbours, not with the swarm.
 
 Two witnesses, the next two live agents in the order of the run, are waited for like neighbours. So somebody knows
-where the vehicles of an agent stand that drove alone and died. Who comes into a dead agent's region first asks
-everybody for its last words: until all who live have answered, and somebody knew them, the region stays closed.
+where the vehicles of an agent stand that drove alone and died. Who comes into a dead agent's plot first asks
+everybody for its last words: until all who live have answered, and somebody knew them, the plot stays closed.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.messages import Grounds
 
+PLOT_CELLS = 64
+"""Side of a plot. Smaller ones have fewer neighbours on them, and are entered more often."""
 _ASK_AGAIN_NS = NS_PER_S // 5
 
 
@@ -29,7 +31,7 @@ class _Known:
 
     incarnation: int
     seq: int
-    regions: frozenset[int]
+    plots: frozenset[int]
 
 
 class SharedGround:
@@ -47,14 +49,14 @@ class SharedGround:
     ) -> None:
         self.agent = agent
         self.incarnation = incarnation
-        self.regions: frozenset[int] = frozenset()
+        self.plots: frozenset[int] = frozenset()
         self.heard_from: frozenset[str] = frozenset()
         self.echoed_by: frozenset[str] = frozenset()
         self._grid = grid
         self._agents = list(agents)
         self._witnesses = witnesses
         self._seq = 0
-        self._since: dict[int, int] = {}  # region -> the question from which on it is ours
+        self._since: dict[int, int] = {}  # plot -> the question from which on it is ours
         self._others: dict[str, _Known] = {}
         self._agreed: dict[str, tuple[int, int]] = {}  # agent -> (its incarnation, our seq that it answered)
         self._alive: dict[str, int] = {}
@@ -64,13 +66,13 @@ class SharedGround:
 
     # --- what changes ---------------------------------------------------------------------------------------
 
-    def wish(self, regions: frozenset[int]) -> None:
-        """Make these our ground. Give up a region only when nothing there is held or wanted any more."""
-        if regions == self.regions:
+    def wish(self, plots: frozenset[int]) -> None:
+        """Make these our ground. Give up a plot only when nothing there is held or wanted any more."""
+        if plots == self.plots:
             return
         self._seq += 1
-        self._since = {region: self._since.get(region, self._seq) for region in regions}
-        self.regions = regions
+        self._since = {plot: self._since.get(plot, self._seq) for plot in plots}
+        self.plots = plots
         self._asked_ns = None
         self._conclude()
 
@@ -99,7 +101,7 @@ class SharedGround:
             return
         if known is not None and (grounds.incarnation, grounds.seq) <= (known.incarnation, known.seq):
             return
-        self._others[grounds.agent] = _Known(grounds.incarnation, grounds.seq, frozenset(grounds.regions))
+        self._others[grounds.agent] = _Known(grounds.incarnation, grounds.seq, frozenset(grounds.plots))
         self._mourn()
         self._conclude()
 
@@ -117,20 +119,20 @@ class SharedGround:
     def _mourn(self) -> None:
         """Of who has died on our ground we need the last words: nothing there is settled before all were asked."""
         dead = frozenset(id for id, known in self._others.items() if self._alive.get(id) != known.incarnation)
-        lost = [id for id in sorted(dead - self._dead) if self._others[id].regions & self.regions]
+        lost = [id for id in sorted(dead - self._dead) if self._others[id].plots & self.plots]
         self._dead = dead
         if lost:
             self._seq += 1
             for id in lost:
-                for region in self._others[id].regions & self.regions:
-                    self._since[region] = self._seq
+                for plot in self._others[id].plots & self.plots:
+                    self._since[plot] = self._seq
             self._asked_ns = None
 
     def _conclude(self) -> None:
         agreed = min(
             (self._agreed_seq(id, incarnation) for id, incarnation in self._alive.items()), default=1 << 62
         )
-        self._settled = frozenset(region for region, since in self._since.items() if since <= agreed)
+        self._settled = frozenset(plot for plot, since in self._since.items() if since <= agreed)
         neighbours = {id for id in self._alive if self._is_neighbour(id)}
         self.echoed_by = frozenset(neighbours.union(self._next_placed(1)))
         self.heard_from = self.echoed_by.union(self._next_placed(-1))
@@ -144,7 +146,7 @@ class SharedGround:
         known = self._others.get(agent)
         if known is None or known.incarnation != self._alive[agent]:
             return agent not in self._agreed  # it has answered and has no ground yet
-        return bool(known.regions & self.regions)
+        return bool(known.plots & self.plots)
 
     def _next_placed(self, step: int) -> list[str]:
         """Along the order of the run: our witnesses after us (1), those whose witness we are before us (-1)."""
@@ -160,17 +162,19 @@ class SharedGround:
 
     # --- what one may ask -----------------------------------------------------------------------------------
 
-    def region_of(self, cell: int) -> int:
-        return self._grid.region_of(cell)
+    def plot_of(self, cell: int) -> int:
+        """Plots are counted row by row, as regions are."""
+        row, col = self._grid.row_col(cell)
+        return row // PLOT_CELLS * -(-self._grid.cols // PLOT_CELLS) + col // PLOT_CELLS
 
-    def settled(self, region: int) -> bool:
-        """Whether everybody who lives knows that this region is ours."""
-        return region in self._settled
+    def settled(self, plot: int) -> bool:
+        """Whether everybody who lives knows that this plot is ours."""
+        return plot in self._settled
 
-    def dead_in(self, region: int) -> list[tuple[str, int]]:
-        """(agent, incarnation) of those who died with this region in their ground."""
+    def dead_in(self, plot: int) -> list[tuple[str, int]]:
+        """(agent, incarnation) of those who died with this plot in their ground."""
         known = ((id, self._others[id]) for id in sorted(self._dead))
-        return [(id, each.incarnation) for id, each in known if region in each.regions]
+        return [(id, each.incarnation) for id, each in known if plot in each.plots]
 
     def is_far(self, agent: str) -> bool:
         """Whether a live agent has told its ground, and its claims are none of our concern."""
@@ -183,7 +187,7 @@ class SharedGround:
         if self._asked_ns is not None and now_ns - self._asked_ns < _ASK_AGAIN_NS:
             return None
         self._asked_ns = now_ns
-        silent = [id for id in sorted(self._dead) if self._others[id].regions & self.regions]
+        silent = [id for id in sorted(self._dead) if self._others[id].plots & self.plots]
         return self._ours(silent=silent)
 
     def answer(self) -> Grounds:
@@ -195,6 +199,6 @@ class SharedGround:
             agent=self.agent,
             incarnation=self.incarnation,
             seq=self._seq,
-            regions=sorted(self.regions),
+            plots=sorted(self.plots),
             silent=list(silent),
         )

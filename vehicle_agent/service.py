@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from shared_map.cost_map import CostMap
 from shared_map.feed import MapFeed
 from shared_map.interest import Interest
+from shared_map.presence import Presence
+from shared_map.reading import Reading, author_of, readable_groups
 from shared_map.replica import MapReplica
 from shared_map.terrain import Terrain
 from swarm.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
@@ -23,6 +25,7 @@ from swarm.messages import (
     Claims,
     CostReply,
     CostRequest,
+    Fleet,
     Followed,
     Grounds,
     Nothing,
@@ -38,7 +41,7 @@ from swarm.topics import CLAIMS, COST, FLEET, FOLLOWED, GROUNDS, POSE, PUSHED_RO
 from vehicle_agent.agent import Agent, AgentAction, AskCosts, AskRoutes, LocalMap
 from vehicle_agent.avoidance import Resumption
 from vehicle_agent.fleet import FleetReport, directions_of
-from vehicle_agent.grounds import SharedGround
+from vehicle_agent.grounds import PLOT_CELLS, SharedGround
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensor import TruthSensor
 from vehicle_agent.vehicle import Follow, VehicleAction
@@ -52,8 +55,9 @@ _RESUME_TIMEOUT_S = 2.0
 _ASK_AGAIN_NS = NS_PER_S // 10
 _MOURN_NS = NS_PER_S // 2
 """An agent whose token fell is waited for a little longer: if our own link is cut, word of that may come later."""
+_NEAR_CELLS = 4
 _GROUND_LEAD_CELLS = 24
-"""A region is asked for so far ahead of its first claim: the answers are there before a vehicle is."""
+"""A plot is asked for so far ahead of its first claim: the answers are there before a vehicle is."""
 _GROUNDS_TIMEOUT_S = 1.0
 _CLAIMS_IDLE_NS = NS_PER_S // 2
 _FIRST_START_NS = 5 * NS_PER_S
@@ -83,8 +87,16 @@ class AgentService:
         self._post = post
         self._setup = setup
         self._cost_map = CostMap(terrain)
+        group = plan.group.name
+        self._author = author_of(group, setup.author)
+        readable = readable_groups(scenario, group)
         self._replica = MapReplica(
-            grid, self._cost_map, author=setup.author, group=plan.group.name, publish_hz=scenario.map.publish_hz
+            grid,
+            self._cost_map,
+            author=self._author,
+            group=group,
+            publish_hz=scenario.map.publish_hz,
+            reading=Reading(grid, readable),
         )
         self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
@@ -92,17 +104,22 @@ class AgentService:
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
         agents = [each.id for each in plan_agents(scenario)]
         self._ground = SharedGround(plan.id, setup.incarnation, grid, agents)
-        self._near = Interest(grid, scenario.vehicles.claim_cells + _GROUND_LEAD_CELLS)
+        lead_cells = scenario.vehicles.claim_cells + _GROUND_LEAD_CELLS
+        self._plots = Interest(grid, lead_cells, square_cells=PLOT_CELLS)
+        self._regions = Interest(grid, lead_cells)
         self._listens_to: frozenset[str] = frozenset()
-        self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation, self._ground)
-        self._fleet = FleetReport(grid, setup.author, plan.group.name)
+        lease_ns = int(scenario.network.lease_s * NS_PER_S)
+        self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, readable)
+        self._looks_at: frozenset[int] = frozenset()
+        self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation, self._presence, self._ground)
+        self._fleet = FleetReport(grid, self._author, group)
         self._resumption: Resumption | None = Resumption(plan.id)
         self._resume_due_ns: int | None = None
         self._roster = Roster()
         self._mourned_ns: dict[str, int] = {}
         self._link_up = True
         self._trust_roster_ns = 0
-        self._lease_ns = int(scenario.network.lease_s * NS_PER_S)
+        self._lease_ns = lease_ns
         self._claims_due_ns = 0
         self._asked_ns: dict[str, int] = {}
         restarted = setup.incarnation - setup.started_ns > _FIRST_START_NS
@@ -132,6 +149,8 @@ class AgentService:
         match event:
             case Heard(message=Claims() as claims):
                 agent.hear_claims(claims)
+            case Heard(message=Fleet() as fleet):
+                self._presence.hear(fleet, now_ns)
             case Heard(message=TargetPose() as pose):
                 agent.hear_pose(pose, now_ns)
             case Heard(message=PushedRoute() as pushed):
@@ -196,6 +215,7 @@ class AgentService:
             self._mourned_ns = {id: due_ns for id, due_ns in self._mourned_ns.items() if due_ns > now_ns}
             self._roster_changed(now_ns)
         self._come_to_terms(now_ns)
+        self._presence.expire(now_ns)
         may_enter = self._link_up and now_ns >= self._trust_roster_ns
         if may_enter:
             agent.rights.grant()
@@ -207,8 +227,10 @@ class AgentService:
                 agent.map_changed(now_ns)
         self._perform(agent.decide(now_ns), now_ns)
         self.counters.count("blocked_ticks", agent.blocked_ticks)
+        self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
-            self._bus.publish(FLEET, fleet, region=region, author=self._setup.author)
+            self._presence.hear(fleet, now_ns)
+            self._bus.publish(FLEET, fleet, region=region, author=self._author)
         if agent.rights.restless or now_ns >= self._claims_due_ns:
             self._claims_due_ns = now_ns + _CLAIMS_IDLE_NS
             self._bus.publish(CLAIMS, agent.rights.speak(), agent=self._setup.id)
@@ -243,9 +265,16 @@ class AgentService:
             self._member.note(now_ns, "resumed", text)
 
     def _come_to_terms(self, now_ns: int) -> None:
-        """Tell everybody in which regions we claim cells, and listen to whom that concerns."""
+        """Tell everybody in which plots we claim cells, and listen to whom that concerns."""
         ground = self._ground
-        ground.wish(self._near.update(self._agent.places))
+        places = self._agent.places
+        ground.wish(self._plots.update(places))
+        regions = self._regions.update(places)
+        for region in sorted(regions - self._looks_at):
+            self._bus.subscribe(FLEET, self._post, region=region)
+        for region in sorted(self._looks_at - regions):
+            self._bus.unsubscribe(FLEET, region=region)  # what was heard there ends with its lease
+        self._looks_at = regions
         question = ground.question(now_ns)
         if question is not None:
             self._bus.ask(

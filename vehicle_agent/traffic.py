@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.presence import Presence
 from swarm.clock import NS_PER_S
 from swarm.config import Scenario
 from swarm.grid import GridSpec
@@ -34,6 +35,8 @@ _LOTS_LAST = 15.0
 """Lots are drawn anew after so many times the patience."""
 _DETOUR_CELLS = 6
 _DETOUR_HORIZON = 40
+_LOOK_AHEAD_CELLS = 5
+_CROWD_WEIGHT = 0.2
 _POLITE_NS = NS_PER_S * 3 // 10
 
 
@@ -52,7 +55,9 @@ class _Standing:
 class Traffic:
     """Decides for each vehicle which cells to claim next.
 
-    pace  float32 (rows, cols) of the map, inf is lethal; read only
+    pace      float32 (rows, cols) of the map, inf is lethal; read only
+    presence  who is near: parked vehicles are driven around before one stands behind them, and whoever makes way
+              does so to where it is emptier
     """
 
     def __init__(
@@ -62,8 +67,10 @@ class Traffic:
         rights: RightOfWay,
         scenario: Scenario,
         chance: random.Random,
+        presence: Presence,
     ) -> None:
         self._grid = grid
+        self._presence = presence
         self._pace = pace.reshape(-1)
         self._rights = rights
         self._claim_cells = scenario.vehicles.claim_cells
@@ -94,6 +101,7 @@ class Traffic:
         note = self._notes.setdefault(vehicle.id, _Standing(patience_ns=self._patience(vehicle)))
         if not vehicle.motion.at_rest:
             note.blocked_since_ns = None
+            self._look_ahead(vehicle, note, in_reach, now_ns)
             self._rights.ask(vehicle.id, self._ahead(vehicle, note, now_ns))
             return False
         if note.aside is not None and self._aside_goes_on(vehicle, note, now_ns):
@@ -103,6 +111,7 @@ class Traffic:
             note.wanted_since_ns = None
         elif note.wanted_since_ns is None:
             note.wanted_since_ns = now_ns
+        self._look_ahead(vehicle, note, in_reach, now_ns)
         ahead = self._ahead(vehicle, note, now_ns)
         self._rights.ask(vehicle.id, ahead)
         next_cell = self.next_cell(vehicle, now_ns)
@@ -270,6 +279,7 @@ class Traffic:
             if cell == wanter.stands_on or (in_reach is not None and not in_reach(cell)):
                 continue
             score = self._chance.random() + self._in_path(wanter.stands_on, here, cell)
+            score += _CROWD_WEIGHT * self._crowd(cell)
             if self._in_the_way(vehicle.id, cell):
                 if in_reach is not None:
                     continue
@@ -286,6 +296,12 @@ class Traffic:
         vehicle.handle(MakesWay(), now_ns)
         self._rights.ask(vehicle.id, [note.aside])
         return True
+
+    def _crowd(self, cell: int) -> int:
+        """How many vehicles are within two cells."""
+        row, col = divmod(cell, self._grid.cols)
+        size_m = self._grid.resolution_m
+        return len(self._presence.near((col + 0.5) * size_m, (row + 0.5) * size_m, 2.5 * size_m))
 
     def _in_path(self, pusher: int | None, here: int, cell: int) -> float:
         """How likely the pusher wants this cell next: 2 straight ahead, 0 to the side."""
@@ -317,13 +333,33 @@ class Traffic:
                     steps.append((found, math.sqrt(2.0)))
         return steps
 
-    def _detour(self, vehicle: Vehicle, in_reach: Callable[[int], bool]) -> bool:
-        """Put a way around who stands ahead into the route, if there is one nearby over free cells."""
-        here = vehicle.cell
+    def _look_ahead(self, vehicle: Vehicle, note: _Standing, in_reach: Callable[[int], bool], now_ns: int) -> None:
+        """Drive around whoever is parked on the route, before standing behind it."""
+        if now_ns < note.detour_due_ns or note.aside is not None or vehicle.state is not VehicleState.FOLLOWING:
+            return
+        entering = vehicle.motion.entering
+        start = vehicle.cell if entering is None else entering
+        for index, cell in enumerate(vehicle.route.ahead(_LOOK_AHEAD_CELLS)):
+            if in_reach(cell):
+                return
+            if cell != start and self._presence.parked_on(cell) not in (None, vehicle.id):
+                note.detour_due_ns = now_ns + note.patience_ns
+                self._detour(vehicle, in_reach, start, index)
+                return
+
+    def _detour(
+        self, vehicle: Vehicle, in_reach: Callable[[int], bool], start: int | None = None, blocked: int = 0
+    ) -> bool:
+        """Put a way around who stands ahead into the route, if there is one nearby over free cells.
+
+        start    leave the route from this cell on, the one that is entered, instead of from the vehicle's own
+        blocked  which of the cells ahead is taken: come back to the route behind it
+        """
+        here = vehicle.cell if start is None else start
         route = vehicle.route.ahead(_DETOUR_HORIZON)
         rest_s: dict[int, float] = {}
         total_s = 0.0
-        for index in range(len(route) - 1, 0, -1):
+        for index in range(len(route) - 1, blocked, -1):
             rest_s[route[index]] = total_s
             total_s += float(self._pace[route[index]])
         reached: dict[int, float] = {here: 0.0}
@@ -353,5 +389,7 @@ class Traffic:
         detour = [best[1]]
         while came_from[detour[-1]] != here:
             detour.append(came_from[detour[-1]])
+        if here != vehicle.cell:
+            detour.append(here)
         detour.reverse()
-        return vehicle.route.splice(detour) or vehicle.route.begin([here, *detour], here)
+        return vehicle.route.splice(detour) or vehicle.route.begin([vehicle.cell, *detour], vehicle.cell)

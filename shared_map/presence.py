@@ -1,0 +1,193 @@
+"""Presence: where everybody's vehicles are now, as a room of the shared map that is not stored.
+
+An author tells the vehicles of one region in one message, which replaces its earlier one; what has not been said
+again for the length of a lease is forgotten. So presence needs no merging, and a lost message no repair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.grid import GridSpec
+from swarm.liveness import Leases
+from swarm.messages import Fleet, VehicleState
+
+PARKED = frozenset({VehicleState.IDLE, VehicleState.ARRIVED, VehicleState.STRANDED})
+"""States of a vehicle that will not leave its cell by itself."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vehicles:
+    """Some vehicles, in columns of one length.
+
+    ids, groups  str
+    cells        int64    flat index in the grid
+    east_m       float32  from the grid's west border; south_m from its north border
+    states       uint8    VehicleState
+    """
+
+    ids: list[str]
+    groups: list[str]
+    cells: NDArray[np.int64]
+    east_m: NDArray[np.float32]
+    south_m: NDArray[np.float32]
+    states: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def taken(self, where: NDArray[np.intp]) -> Vehicles:
+        chosen = where.tolist()
+        return Vehicles(
+            [self.ids[n] for n in chosen],
+            [self.groups[n] for n in chosen],
+            self.cells[where],
+            self.east_m[where],
+            self.south_m[where],
+            self.states[where],
+        )
+
+
+class Presence:
+    """The newest word of each (author, region), for as long as its lease lasts.
+
+    groups     whose vehicles count; None for everybody's
+    bucket_m   side of the squares by which neighbours are looked up: about the radius that is asked for most
+    """
+
+    def __init__(self, grid: GridSpec, lease_ns: int, bucket_m: float, groups: Iterable[str] | None = None) -> None:
+        self._grid = grid
+        self._bucket_m = bucket_m
+        self._groups = None if groups is None else frozenset(groups)
+        self._leases = Leases(lease_ns)
+        self._newest: dict[str, Fleet] = {}
+        self._index: _Index | None = None
+        self._parked: dict[int, str] | None = None
+
+    def hear(self, fleet: Fleet, now_ns: int) -> None:
+        """Take in where an author's vehicles of one region are; late and repeated messages change nothing."""
+        if self._groups is not None and fleet.group not in self._groups:
+            return
+        key = f"{fleet.author}/{fleet.region}"
+        known = self._newest.get(key)
+        if known is not None and fleet.seq <= known.seq:
+            return
+        self._leases.heard(key, now_ns)
+        self._newest[key] = fleet
+        self._forget_index()
+
+    def expire(self, now_ns: int) -> None:
+        """Forget what has not been said again for the length of a lease."""
+        late = self._leases.expired(now_ns)
+        for key in late:
+            del self._newest[key]
+        if late:
+            self._forget_index()
+
+    @property
+    def count(self) -> int:
+        """How many reports of vehicles are held."""
+        return sum(len(fleet.ids) for fleet in self._newest.values())
+
+    @property
+    def vehicles(self) -> Vehicles:
+        """Everybody's."""
+        return self._indexed().vehicles
+
+    def near(self, east_m: float, south_m: float, radius_m: float) -> Vehicles:
+        """Those within a radius of a place, at most one metre of rounding away, the nearest first."""
+        index = self._indexed()
+        found = index.candidates(east_m, south_m, radius_m)
+        distance_m = np.hypot(index.vehicles.east_m[found] - east_m, index.vehicles.south_m[found] - south_m)
+        inside = distance_m <= radius_m
+        return index.vehicles.taken(found[inside][np.argsort(distance_m[inside], kind="stable")])
+
+    def crowds(self, east_m: NDArray[np.floating], south_m: NDArray[np.floating]) -> NDArray[np.int64]:
+        """How many vehicles are in the square of the lookup around each of many places and in the eight beside it:
+        int64 per place, for the price of one look at all of them."""
+        return self._indexed().crowds(np.asarray(east_m), np.asarray(south_m))
+
+    def parked_on(self, cell: int) -> str | None:
+        """Who stands on a cell and will not leave it by itself."""
+        if self._parked is None:
+            self._parked = self._find_parked()
+        return self._parked.get(cell)
+
+    def _find_parked(self) -> dict[int, str]:
+        parked: dict[int, str] = {}
+        for fleet in self._newest.values():
+            for n, state in enumerate(fleet.states):
+                if state in PARKED:
+                    parked[int.from_bytes(fleet.cells[4 * n : 4 * n + 4], "little")] = fleet.ids[n]
+        return parked
+
+    def _forget_index(self) -> None:
+        self._index = None
+        self._parked = None
+
+    def _indexed(self) -> _Index:
+        if self._index is None:
+            self._index = _Index(_gathered(list(self._newest.values())), self._grid, self._bucket_m)
+        return self._index
+
+
+def _gathered(fleets: list[Fleet]) -> Vehicles:
+    """Many messages as columns. Of a vehicle that crosses a border two regions may tell: the newer counts."""
+    ids = [id for fleet in fleets for id in fleet.ids]
+    groups = [fleet.group for fleet in fleets for _ in fleet.ids]
+    cells = np.frombuffer(b"".join(fleet.cells for fleet in fleets), "<u4").astype(np.int64)
+    east_m = np.frombuffer(b"".join(fleet.east_m for fleet in fleets), "<f4")
+    south_m = np.frombuffer(b"".join(fleet.south_m for fleet in fleets), "<f4")
+    states = np.frombuffer(b"".join(fleet.states for fleet in fleets), np.uint8)
+    everybody = Vehicles(ids, groups, cells, east_m, south_m, states)
+    if len(set(ids)) == len(ids):
+        return everybody
+    stamps = [fleet.stamp_ns for fleet in fleets for _ in fleet.ids]
+    newest: dict[str, int] = {}
+    for n, id in enumerate(ids):
+        if id not in newest or stamps[n] >= stamps[newest[id]]:
+            newest[id] = n
+    return everybody.taken(np.array(sorted(newest.values()), np.intp))
+
+
+class _Index:
+    """Vehicles in order of the square that they are in: those of a row of squares lie together."""
+
+    def __init__(self, vehicles: Vehicles, grid: GridSpec, bucket_m: float) -> None:
+        self.vehicles = vehicles
+        self._bucket_m = bucket_m
+        self._across = int(grid.cols * grid.resolution_m // bucket_m) + 3  # a column to spare on either side
+        squares = self._squares(vehicles.east_m, vehicles.south_m)
+        self._order: NDArray[np.intp] = np.argsort(squares, kind="stable")
+        self._sorted: NDArray[np.int64] = squares[self._order]
+
+    def _squares(self, east_m: NDArray[np.floating], south_m: NDArray[np.floating]) -> NDArray[np.int64]:
+        cols = np.clip((east_m // self._bucket_m).astype(np.int64), 0, self._across - 3) + 1
+        return (south_m // self._bucket_m).astype(np.int64) * self._across + cols
+
+    def candidates(self, east_m: float, south_m: float, radius_m: float) -> NDArray[np.intp]:
+        """The vehicles of all squares that a circle touches."""
+        size_m, last = self._bucket_m, self._across - 3
+        west = min(max(int((east_m - radius_m) // size_m), 0), last)
+        east = min(max(int((east_m + radius_m) // size_m), 0), last)
+        rows = np.arange((south_m - radius_m) // size_m, (south_m + radius_m) // size_m + 1).astype(np.int64)
+        firsts = np.searchsorted(self._sorted, rows * self._across + west + 1, side="left")
+        lasts = np.searchsorted(self._sorted, rows * self._across + east + 1, side="right")
+        parts = [self._order[a:b] for a, b in zip(firsts.tolist(), lasts.tolist(), strict=True) if b > a]
+        return np.concatenate(parts) if parts else _NOBODY
+
+    def crowds(self, east_m: NDArray[np.floating], south_m: NDArray[np.floating]) -> NDArray[np.int64]:
+        squares = self._squares(east_m, south_m)
+        count = np.zeros(len(squares), np.int64)
+        for row in (-1, 0, 1):
+            middle = squares + row * self._across
+            count += np.searchsorted(self._sorted, middle + 1, side="right")
+            count -= np.searchsorted(self._sorted, middle - 1, side="left")
+        return count
+
+
+_NOBODY: NDArray[np.intp] = np.empty(0, np.intp)
