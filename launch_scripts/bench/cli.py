@@ -133,8 +133,9 @@ def peers(
     swarm bench peers --size 512 --field maze
     swarm bench peers --field ridge.tif --json
 
-    CPU time of one thread, peak memory from the bare field to the grown tree, and the largest relative difference
-    of any cell's cost to ours. Memory says little on fields much smaller than 512 x 512.
+    CPU time of one thread, peak memory from the bare field to the grown tree,
+    and the largest relative difference of any cell's cost to ours. Memory says
+    little on fields much smaller than 512 x 512.
     """
     from launch_scripts.bench.peers import missing_sentence, run, tables
     from launch_scripts.bench.rivals import missing_packages
@@ -194,7 +195,10 @@ def paper(
 
 @app.command()
 def scale(
-    sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048,4096",
+    sizes: Annotated[
+        str | None,
+        typer.Option(help="Cells a side, several with commas.", show_default="512,1024,2048; --full: and 4096"),
+    ] = None,
     targets: Annotated[str, typer.Option(help="Numbers of targets.")] = "1,10,100",
     vehicles: Annotated[str, typer.Option(help="Numbers of vehicles.")] = "10,100,1000,10000",
     strategies: Strategies = _ALL,
@@ -213,14 +217,18 @@ def scale(
     swarm bench scale --picture scale.png
     swarm bench scale --sizes 4096 --targets 10 --vehicles 1000 --frames 120
 
-    Varies one thing at a time, from the smallest size and the middle numbers of targets and vehicles; --full takes
-    every combination. Trees that do not fit into half of the free memory are run in groups.
+    Varies one thing at a time, from the smallest size and the middle numbers of
+    targets and vehicles: some four minutes on a quiet machine, and six more for
+    a size of 4096. --full takes every combination. Trees that do not fit into
+    half of the free memory are run in groups.
     """
     from launch_scripts.bench.fields import FIELDS
     from launch_scripts.bench.scale import base_of, points_of, run_scale, tables
 
     if field not in FIELDS:
         raise ConfigError(f"--field is {field!r}, expected {', '.join(FIELDS)}: a file has only one size")
+    if sizes is None:
+        sizes = "512,1024,2048,4096" if full else "512,1024,2048"
     axes = (_numbers(sizes, "sizes", 16), _numbers(targets, "targets"), _numbers(vehicles, "vehicles"))
     chosen = _strategies(strategies)
     _check_picture(picture)
