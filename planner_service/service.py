@@ -25,13 +25,14 @@ from shared_map.cost_map import CostMap
 from shared_map.feed import MapFeed
 from shared_map.reading import Reading, readable_for_target
 from shared_map.replica import MapReplica
+from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain import Terrain
 from swarm.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.config import agent_of
 from swarm.membership import Member
-from swarm.messages import CostRequest, Fleet, RouteRequest, TargetPose
+from swarm.messages import CostRequest, Fleet, RouteRequest, Sighted, TargetPose
 from swarm.role import RoleSetup
-from swarm.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, STATUS
+from swarm.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +63,8 @@ class PlannerService:
         self.counters = self._member.counters
         self._cost_map = CostMap(terrain)
         reading = Reading(terrain.grid, readable_for_target(scenario, setup.id))
+        self._untracked = setup.id in scenario.untracked
+        self._sightings = Sightings(reading)
         self._replica = MapReplica(terrain.grid, self._cost_map, reading=reading)
         self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role)
         self._planner = Planner(
@@ -83,7 +86,7 @@ class PlannerService:
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._feed.start(now_ns)
-        self._bus.subscribe(POSE, self._post, target=self._target)
+        self._bus.subscribe(SIGHTED if self._untracked else POSE, self._post, target=self._target)
         self._bus.subscribe(FLEET, self._post)
         self._bus.serve(ROUTE, self._post, target=self._target)
         self._bus.serve(COST, self._post, target=self._target)
@@ -94,6 +97,10 @@ class PlannerService:
         match event:
             case Heard(message=TargetPose() as pose):
                 self._perform(self._planner.handle(PoseHeard(pose), now_ns))
+            case Heard(message=Sighted() as sighted):
+                if self._sightings.hear(sighted):
+                    for seen in self._sightings.best(now_ns).values():
+                        self._perform(self._planner.handle(PoseHeard(pose_of(seen)), now_ns))
             case Heard(message=Fleet() as fleet):
                 self._perform(self._planner.handle(FleetHeard(fleet), now_ns))
             case Asked(request=RouteRequest() as routes):
@@ -107,6 +114,7 @@ class PlannerService:
 
     def tick(self, now_ns: int) -> None:
         self._feed.tick(now_ns)
+        self._sightings.expire(now_ns)
         self._perform(self._planner.tick(now_ns))
         for name in ("marks_merged", "sets_foreign"):
             self.counters.counts[name] = self._replica.counts[name]

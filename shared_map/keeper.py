@@ -16,9 +16,10 @@ from urllib.parse import quote
 from shared_map.digest import Ledger
 from shared_map.folding import united, without
 from shared_map.marks import base_seq, is_burial
-from swarm.errors import StoreError
+from swarm.codec import decode, encode
+from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
-from swarm.messages import FOLDS, MarkSet
+from swarm.messages import FOLDS, MarkSet, Sighted
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +39,14 @@ CREATE TABLE IF NOT EXISTS folded (
     untils_ns BLOB NOT NULL, since_ns INTEGER NOT NULL,
     PRIMARY KEY (tile, author)
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS sightings (
+    target TEXT PRIMARY KEY, stamp_ns INTEGER NOT NULL, sighted BLOB NOT NULL
+) WITHOUT ROWID;
+"""
+_SEEN = """
+INSERT INTO sightings (target, stamp_ns, sighted) VALUES (?, ?, ?)
+ON CONFLICT (target) DO UPDATE SET stamp_ns = excluded.stamp_ns, sighted = excluded.sighted
+WHERE excluded.stamp_ns >= sightings.stamp_ns
 """
 _FIELDS = ("tile", "author", "group", "epoch", "seq", "cells", "kinds", "paces", "stamps_ns", "untils_ns")
 _COLUMNS = tuple("grp" if field == "group" else field for field in _FIELDS)  # GROUP is a word of SQL
@@ -186,6 +195,24 @@ class KeeperStore:
             self._db.execute(_BURY, (*at, folding.epoch, folding.seq))
         else:
             self._db.execute(_UPSERT, _row(folding))
+
+    def save_sightings(self, seen: Iterable[Sighted]) -> None:
+        """Keep where each target was seen last. Raises StoreError, which leaves the store usable."""
+        try:
+            with self._db:
+                self._db.executemany(_SEEN, [(each.target, each.stamp_ns, encode(each)) for each in seen])
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    def sightings(self) -> list[Sighted]:
+        """Where each target was seen last, in order of target; of a store from before there were any, nothing."""
+        try:
+            rows = self._db.execute("SELECT sighted FROM sightings ORDER BY target").fetchall()
+            return [decode(row[0], Sighted) for row in rows]
+        except sqlite3.OperationalError:
+            return []
+        except (sqlite3.Error, ProtocolError) as error:
+            raise StoreError(_damaged(self.path, str(error))) from error
 
     def close(self) -> None:
         self._db.close()

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 
 from shared_map.base_map_bus import BaseMapServer
 from shared_map.feed import MapFeed
 from shared_map.folding import FoldPlan, fold
 from shared_map.keeper import Keeper, KeeperStore
 from shared_map.replica import MapReplica, PublishSet
+from shared_map.sightings import Sightings
 from shared_map.terrain import Terrain
 from swarm.bus import Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.membership import Member
-from swarm.messages import Digest, MarkSet
+from swarm.messages import Digest, MarkSet, Sighted
 from swarm.role import RoleSetup
+from swarm.topics import SIGHTED
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +37,7 @@ class KeeperService:
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
         self.counters = self._member.counters
         self._bus = bus
+        self._post = post
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
         self._keeper = Keeper()
@@ -58,6 +62,9 @@ class KeeperService:
         for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged"):
             self.counters.count(name, 0)
         self._save_due_ns = 0
+        self._sightings = Sightings(self.replica.reading)
+        self._seen: dict[str, Sighted] = {}
+        self._sightings_due_ns = 0
         self._noted_ns: int | None = None
         self._named: list[str] = []
         store.bind(terrain.digest, terrain.grid)
@@ -70,9 +77,13 @@ class KeeperService:
         self._base_map.start(self._bus)
         self._fold_plan = FoldPlan(self._fold_after_ns, now_ns)
         self._feed.start(now_ns)
+        self._bus.subscribe(SIGHTED, self._post)
         log.info("keeper started: %d tiles in store %s", len(self.replica.tiles), self._store.path)
 
     def handle(self, event: Event, now_ns: int) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Sighted):
+            self._sightings.hear(event.message)
+            return
         if isinstance(event, Heard) and isinstance(event.message, Digest):
             self._fold_plan.heard(event.message.author, now_ns)
         if not self._member.handle(event):
@@ -84,6 +95,8 @@ class KeeperService:
         if now_ns >= self._fold_due_ns and not self._keeper.waiting:
             self._fold_due_ns = now_ns + _FOLD_EVERY_NS
             self._fold(now_ns)
+        if now_ns >= self._sightings_due_ns:
+            self._save_sightings(now_ns)
         self._feed.tick(now_ns)
         self._name_throttled(now_ns)
         counts = self.replica.counts
@@ -95,6 +108,16 @@ class KeeperService:
     def stop(self, now_ns: int) -> None:
         self._save(now_ns)
         self._member.publish_stats(now_ns)
+
+    def _save_sightings(self, now_ns: int) -> None:
+        """Where targets were seen is for people to look at: what a full disk does not take is not missed."""
+        self._sightings_due_ns = now_ns + NS_PER_S
+        new = {id: each for id, each in self._sightings.best(now_ns).items() if self._seen.get(id) != each}
+        self._sightings.expire(now_ns)
+        if new:
+            self._seen.update(new)
+            with suppress(StoreError):
+                self._store.save_sightings(new.values())
 
     def _name_throttled(self, now_ns: int) -> None:
         """Tell people once who marks more than its share."""

@@ -85,7 +85,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     roads: Annotated[int, Meta(ge=0, le=200)] = 0
     rows: Annotated[int, Meta(ge=1, le=16384)] = 256
     cols: Annotated[int, Meta(ge=1, le=16384)] = 256
-    relief_m: NotNegative = 400.0
+    relief_m: Annotated[float, Meta(ge=0, le=20_000)] = 400.0
     rivers: Annotated[int, Meta(ge=0, le=50)] = 0
     hidden: HiddenConfig = HiddenConfig()
 
@@ -121,6 +121,8 @@ class TargetConfig(Section, frozen=True, kw_only=True):
 
     walk      still; random: a new heading now and then; waypoints: to random places by the cheapest way;
               evade: away from the nearest vehicles; external: somebody else publishes its pose
+    tracker   always: its pose is published all the time; sighted: only vehicles that have it in sight tell where
+              it is, and planners go by what they saw last
     caught    jump: a captured target turns up elsewhere; stay: it goes on as before
     start     [row, col]; a random passable cell if not given
     """
@@ -129,6 +131,7 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     count: Annotated[int, Meta(ge=1, le=1000)] = 1
     walk: Literal["still", "random", "waypoints", "evade", "external"] = "waypoints"
     speed_m_per_s: NotNegative = 4.0
+    tracker: Literal["always", "sighted"] = "always"
     caught: Literal["jump", "stay"] = "jump"
     start: tuple[int, int] | None = None
 
@@ -156,6 +159,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     """How vehicles behave.
 
     sense_range_m     radius within which the simulated sensor sees the true ground
+    sighting_lasts_s  what they tell of a target that they saw ends by itself after so long
     capture_range_m   a target this near is captured
     route_cells       steps of a route asked for at a time; 0 is the whole route
     claim_cells       cells ahead that a vehicle claims
@@ -167,6 +171,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     per_agent: Annotated[int, Meta(ge=1, le=1000)] = 25
     tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
     sense_range_m: Positive = 300.0
+    sighting_lasts_s: Positive = 30.0
     capture_range_m: Positive = 150.0
     route_cells: Annotated[int, Meta(ge=0)] = 0
     claim_cells: Annotated[int, Meta(ge=1, le=16)] = 3
@@ -280,6 +285,11 @@ class Scenario(Section, frozen=True, kw_only=True):
     @property
     def target_ids(self) -> list[str]:
         return [id for target in self.targets for id in ids_of(target)]
+
+    @property
+    def untracked(self) -> frozenset[str]:
+        """Targets of which nobody knows more than vehicles see."""
+        return frozenset(id for target in self.targets if target.tracker == "sighted" for id in ids_of(target))
 
     @property
     def vehicle_count(self) -> int:

@@ -412,6 +412,29 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
         check_id("target", self.target)
 
 
+class Sighted(Message, frozen=True, kw_only=True, tag=schema_of("sighted")):
+    """A target-sighted mark: where a vehicle of this author saw a target, within `uncertainty_m` of the place. It
+    says nothing about the ground, ends by itself, and the author's next about this target replaces it."""
+
+    author: str
+    group: str
+    target: str
+    seq: Natural
+    stamp_ns: Natural
+    until_ns: Natural
+    cell: Cell
+    x_m: Metres
+    y_m: Metres
+    uncertainty_m: Metres
+
+    def __post_init__(self) -> None:
+        check_id("author", self.author)
+        check_id("group", self.group)
+        check_id("target", self.target)
+        if self.uncertainty_m < 0:
+            raise ValueError(f"uncertainty_m is {self.uncertainty_m}, expected 0 or more")
+
+
 class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-request")):
     """Asks for routes from cells to the planner's target. A person may give `row` and `col` instead of `cells`.
 

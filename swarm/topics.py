@@ -31,6 +31,7 @@ from swarm.messages import (
     RouteReply,
     RouteRequest,
     RunInfo,
+    Sighted,
     Stats,
     TargetPose,
 )
@@ -168,6 +169,14 @@ PUSHED_ROUTE = Topic(
     "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
 )  # fmt: skip
 POSE = Topic("pose", "target/{target}/pose", TargetPose, "where a target is", "every tick")
+TRUE_POSE = Topic(
+    "true-pose", "world/target/{target}/pose", TargetPose,
+    "where a target is that nobody tracks: for simulated sensors, not for planners", "every tick",
+)  # fmt: skip
+SIGHTED = Topic(
+    "sighted", "sighted/{target}/{author}", Sighted, "where a vehicle of this author saw a target",
+    "while it is in sight, at most 2 Hz",
+)  # fmt: skip
 ROUTE = Topic(
     "route", "target/{target}/route", RouteReply, "routes from cells to the target", "asked",
     request=RouteRequest, published=False,
@@ -189,8 +198,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CLAIMS, GROUNDS, FOLLOWED, PUSHED_ROUTE, POSE, ROUTE, COST,
-    STATUS, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CLAIMS, GROUNDS, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED,
+    TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

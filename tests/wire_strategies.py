@@ -38,6 +38,7 @@ from swarm.messages import (
     RouteRequest,
     RouteStatus,
     RunInfo,
+    Sighted,
     Stats,
     TargetPose,
     VehicleState,
@@ -186,6 +187,10 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         TargetPose, target=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, cell=cells, x_m=metres,
         y_m=metres, captures=naturals, jumps=naturals,
     ),
+    Sighted: st.builds(
+        Sighted, author=ids, group=ids, target=ids, seq=naturals, stamp_ns=naturals, until_ns=naturals, cell=cells,
+        x_m=metres, y_m=metres, uncertainty_m=st.floats(0, 1e9),
+    ),
     RouteRequest: route_requests(),
     RouteReply: st.builds(
         RouteReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=naturals,
@@ -259,6 +264,10 @@ EXAMPLES: tuple[Message, ...] = (
     ),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
+    Sighted(
+        author="all.a0.7", group="all", target="t0", seq=2, stamp_ns=10, until_ns=90, cell=9, x_m=1.5, y_m=-2.5,
+        uncertainty_m=8.0,
+    ),
     RouteRequest(cells=[4, 5], vehicles=["a0-00", "a0-01"], max_cells=50, force=True),
     RouteReply(
         target="t0", incarnation=7, target_cell=9, map_version=3, tree_age_ms=12.5, rows=10, cols=10,

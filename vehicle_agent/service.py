@@ -14,6 +14,7 @@ from shared_map.interest import Interest
 from shared_map.presence import Presence
 from shared_map.reading import Reading, author_of, readable_groups
 from shared_map.replica import MapReplica
+from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain import Terrain
 from swarm.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
@@ -32,16 +33,18 @@ from swarm.messages import (
     PushedRoute,
     RouteReply,
     RouteRequest,
+    Sighted,
     TargetPose,
     VehicleState,
     column,
 )
 from swarm.role import RoleSetup
-from swarm.topics import CLAIMS, COST, FLEET, FOLLOWED, GROUNDS, POSE, PUSHED_ROUTE, ROUTE
+from swarm.topics import CLAIMS, COST, FLEET, FOLLOWED, GROUNDS, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, TRUE_POSE
 from vehicle_agent.agent import Agent, AgentAction, AskCosts, AskRoutes, LocalMap
 from vehicle_agent.avoidance import Resumption
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.grounds import PLOT_CELLS, SharedGround
+from vehicle_agent.lookout import Lookout
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensor import TruthSensor
 from vehicle_agent.vehicle import Follow, VehicleAction
@@ -111,6 +114,15 @@ class AgentService:
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
         self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, readable)
         self._looks_at: frozenset[int] = frozenset()
+        self._untracked = scenario.untracked
+        self._sightings = Sightings(self._replica.reading)
+        self._lookout = Lookout(
+            grid,
+            self._author,
+            group,
+            scenario.vehicles.sense_range_m,
+            scenario.vehicles.sighting_lasts_s,
+        )
         self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation, self._presence, self._ground)
         self._fleet = FleetReport(grid, self._author, group)
         self._resumption: Resumption | None = Resumption(plan.id)
@@ -138,6 +150,10 @@ class AgentService:
         self._member.join()
         self._feed.start(now_ns)
         self._bus.subscribe(POSE, self._post)
+        if self._untracked:
+            self._bus.subscribe(TRUE_POSE, self._post)
+            for target in sorted(self._untracked):
+                self._bus.subscribe(SIGHTED, self._post, target=target)
         self._bus.subscribe(PUSHED_ROUTE, self._post, agent=self._setup.id)
         self._resume_due_ns = now_ns + _SETTLE_NS
         self._alone_ns = now_ns + _ALONE_NS
@@ -151,8 +167,12 @@ class AgentService:
                 agent.hear_claims(claims)
             case Heard(message=Fleet() as fleet):
                 self._presence.hear(fleet, now_ns)
-            case Heard(message=TargetPose() as pose):
-                agent.hear_pose(pose, now_ns)
+            case Heard(topic=topic, message=TargetPose() as pose):
+                self._lookout.truth(pose)
+                if topic is POSE and pose.target not in self._untracked:
+                    agent.hear_pose(pose, now_ns)
+            case Heard(message=Sighted() as sighted):
+                self._hear_sighted(sighted, now_ns)
             case Heard(message=PushedRoute() as pushed):
                 self.counters.count("routes_pushed")
                 self._publish_followed(agent.route_pushed(pushed, now_ns))
@@ -225,6 +245,7 @@ class AgentService:
                 self.counters.count("marks", len(findings))
                 self._feed.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(now_ns)
+        self._tell_sighted(now_ns)
         self._perform(agent.decide(now_ns), now_ns)
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
@@ -315,6 +336,19 @@ class AgentService:
         self._ground.set_alive(agents)
         self._agent.rights.set_alive(agents)
         self._agent.set_planners(self._roster.alive("planner"), now_ns)
+
+    # --- targets in sight -----------------------------------------------------------------------------------
+
+    def _tell_sighted(self, now_ns: int) -> None:
+        self._sightings.expire(now_ns)
+        for sighted in self._lookout.look(self._agent.vehicles.values(), now_ns):
+            self.counters.count("targets_sighted")
+            self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
+            self._hear_sighted(sighted, now_ns)
+
+    def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
+        if sighted.target in self._untracked and self._sightings.hear(sighted):
+            self._agent.hear_pose(pose_of(self._sightings.best(now_ns)[sighted.target]), now_ns)
 
     # --- doing what was decided -----------------------------------------------------------------------------
 

@@ -38,6 +38,8 @@ def inspect(store: Store, as_json: Annotated[bool, typer.Option("--json", help="
     authors: dict[str, list[MarkSet]] = {}
     for each in sets:
         authors.setdefault(each.author, []).append(each)
+    with KeeperStore(store, read_only=True) as kept:
+        seen = kept.sightings()
     found = {
         "store": str(store),
         "terrain": terrain,
@@ -55,6 +57,16 @@ def inspect(store: Store, as_json: Annotated[bool, typer.Option("--json", help="
             }
             for author, of in sorted(authors.items())
         },
+        "sightings": {
+            each.target: {
+                "row_col": list(divmod(each.cell, grid.cols)),
+                "uncertainty_m": each.uncertainty_m,
+                "author": each.author,
+                "stamp_ns": each.stamp_ns,
+                "until_ns": each.until_ns,
+            }
+            for each in seen
+        },
     }
     if as_json:
         print(json.dumps(found, indent=2))
@@ -64,6 +76,10 @@ def inspect(store: Store, as_json: Annotated[bool, typer.Option("--json", help="
           f"{found['cells_lethal']} of them lethal")  # fmt: skip
     for author, of in sorted(authors.items()):
         print(f"  {author:40} {sum(len(each.kinds) for each in of):7} marks in {len(of):5} tiles")
+    for sighted in seen:
+        row, col = divmod(sighted.cell, grid.cols)
+        where = f"row {row}, col {col}, within {sighted.uncertainty_m:.0f} m"
+        print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
 
 
 @app.command()

@@ -131,6 +131,11 @@ class Drawing:
             )
             rec.log("world/targets/names", labels)
 
+    def sightings(self, points: Points, within_m: Floats) -> None:
+        """Balls as large as nobody knows better where the targets are."""
+        balls = rr.Points3D(points.positions, colors=points.colours, radii=within_m, labels=points.ids)
+        self._rec.log("world/targets/sighted", balls)
+
     def trails(self, who: str, strips: list[Floats]) -> None:
         """The newest piece of everybody's trail; the view shows the pieces of the last seconds together."""
         if strips:

@@ -18,7 +18,7 @@ from launch_scripts.report.relief import hillshade
 from shared_map.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain import Terrain
 from swarm.grid import GridSpec, Window
-from swarm.messages import VehicleState
+from swarm.messages import Sighted, VehicleState
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -39,6 +39,7 @@ STATE_COLOURS = {
     VehicleState.LOST: (40, 84, 60),
 }
 TARGET_COLOUR = (255, 46, 46)
+SIGHTED_COLOUR = (255, 170, 150)
 LETHAL_MARK = (86, 22, 150)
 SLOW_MARK = (235, 150, 0)
 FAST_MARK = (90, 200, 250)
@@ -231,6 +232,16 @@ def target_points(ground: Ground, places_m: Mapping[str, tuple[float, float]]) -
     east_south = np.array(list(places_m.values()), np.float32).reshape(-1, 2)
     positions = ground.place(east_south[:, 0], east_south[:, 1], 2.2 * ground.scale_m)
     return Points(list(places_m), positions, np.tile(np.array(TARGET_COLOUR, np.uint8), (len(positions), 1)))
+
+
+def sighting_points(ground: Ground, seen: Mapping[str, Sighted]) -> tuple[Points, Floats]:
+    """Where targets were seen last, and float32 (n,) within how many metres."""
+    grid = ground.grid
+    east_m = np.array([each.x_m - grid.west_m for each in seen.values()], np.float32)
+    south_m = np.array([grid.north_m - each.y_m for each in seen.values()], np.float32)
+    positions = ground.place(east_m, south_m, 0.3 * ground.scale_m)
+    colours = np.tile(np.array(SIGHTED_COLOUR, np.uint8), (len(positions), 1))
+    return Points(list(seen), positions, colours), np.array([s.uncertainty_m for s in seen.values()], np.float32)
 
 
 def label_places(ground: Ground, targets: Points) -> Floats:

@@ -17,6 +17,7 @@ from launch_scripts.monitor.scene import (
     label_places,
     poles,
     route_strip,
+    sighting_points,
     target_points,
     vehicle_points,
     window_outline,
@@ -27,16 +28,17 @@ from launch_scripts.report.record import RECORDED_TOPICS, Recorder, messages_per
 from shared_map.cost_map import CostMap
 from shared_map.feed import MapFeed
 from shared_map.replica import MapReplica
+from shared_map.sightings import Sightings
 from shared_map.terrain import Terrain
 from swarm.bus import Appeared, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.grid import Window, walk
 from swarm.liveness import Peer
 from swarm.membership import Member
-from swarm.messages import Fleet, Followed, Note, PlannerStatus, TargetPose
+from swarm.messages import Fleet, Followed, Note, PlannerStatus, Sighted, TargetPose
 from swarm.role import RoleSetup
 from swarm.stats import Counters
-from swarm.topics import MARKS
+from swarm.topics import MARKS, SIGHTED
 
 _TRAILS_NS = NS_PER_S // 2
 _ROUTES_NS = 3 * NS_PER_S // 2
@@ -85,6 +87,8 @@ class MonitorService:
         self._target_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
         self._routes: dict[str, RouteNow] = {}
         self._stale_tiles: dict[int, None] = {}
+        self._sightings = Sightings(replica.reading)
+        self._sightings_new = False
         self._fleets_new = self._targets_new = self._windows_new = False
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
@@ -99,6 +103,7 @@ class MonitorService:
         for topic in RECORDED_TOPICS:
             if topic is not MARKS:
                 self._bus.subscribe(topic, self._post)
+        self._bus.subscribe(SIGHTED, self._post)
         self._bus.watch_alive(self._post)
         self._feed.start(now_ns)
         self._drawing.set_time(0, 0.0)
@@ -122,6 +127,8 @@ class MonitorService:
             case TargetPose(stamp_ns=stamp_ns):
                 self._targets_new = True
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
+            case Sighted() as sighted:
+                self._sightings_new |= self._sightings.hear(sighted)
             case PlannerStatus():
                 self._windows_new = True
             case Followed() as followed:
@@ -207,6 +214,9 @@ class MonitorService:
             if trails_due:
                 places = np.array([pole[0] for pole in feet], np.float32)
                 self._drawing.trails("targets", self._target_trails.advance(targets.ids, places))
+        if self._sightings_new:
+            self._sightings_new = False
+            self._drawing.sightings(*sighting_points(self._ground, self._sightings.best(now_ns)))
         if self._windows_new:
             self._windows_new = False
             self._draw_windows()

@@ -24,7 +24,7 @@ from swarm.errors import ConfigError
 from swarm.membership import Member
 from swarm.messages import NO_TARGET, CostReply, CostRequest, Fleet, PlannerStatus, TargetPose, VehicleState, column
 from swarm.role import RoleSetup
-from swarm.topics import COST, FLEET, POSE, STATUS
+from swarm.topics import COST, FLEET, POSE, STATUS, TRUE_POSE
 
 LISTEN_NS = NS_PER_S
 """A starting driver asks the planners where their targets are before it makes places up. So long it waits for a
@@ -284,7 +284,8 @@ class TargetsService:
             match action:
                 case Publish(pose):
                     self.counters.count("poses")
-                    self._bus.publish(POSE, pose, target=pose.target)
+                    topic = TRUE_POSE if pose.target in self._scenario.untracked else POSE
+                    self._bus.publish(topic, pose, target=pose.target)
                 case Captured(target, vehicle, cell):
                     self.counters.count("captures")
                     self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell)

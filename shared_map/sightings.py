@@ -1,0 +1,64 @@
+"""Where targets were seen: marks that say nothing about the ground and end by themselves.
+
+Of each author the newest word about a target counts, and of all authors' about one target the newest that has not
+ended. So merging depends on neither order, grouping nor repetition, as with other marks; they change no pace.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from shared_map.reading import Reading
+from swarm.messages import Sighted, TargetPose
+
+_MOST = 10_000
+
+
+class Sightings:
+    """The newest word of each (target, author), as long as it lasts."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading = reading
+        self._newest: dict[tuple[str, str], Sighted] = {}
+
+    def hear(self, sighted: Sighted) -> bool:
+        """Take in what was seen. False of what is not read, not news, or too much to keep."""
+        key = (sighted.target, sighted.author)
+        known = self._newest.get(key)
+        if known is not None and (sighted.stamp_ns, sighted.seq) <= (known.stamp_ns, known.seq):
+            return False
+        if not self._reading.hears(sighted.author, sighted.group):
+            return False
+        if known is None and len(self._newest) >= _MOST:
+            return False
+        self._newest[key] = sighted
+        return True
+
+    def expire(self, now_ns: int) -> None:
+        """Forget what has ended by itself."""
+        self._newest = {key: each for key, each in self._newest.items() if each.until_ns > now_ns}
+
+    def best(self, now_ns: int) -> Mapping[str, Sighted]:
+        """Target -> the newest sighting of it; of two at one time the surer, then that of the larger author."""
+        best: dict[str, Sighted] = {}
+        for (target, _), each in self._newest.items():
+            if each.until_ns > now_ns and (target not in best or _rank(each) > _rank(best[target])):
+                best[target] = each
+        return best
+
+
+def _rank(sighted: Sighted) -> tuple[int, float, str]:
+    return sighted.stamp_ns, -sighted.uncertainty_m, sighted.author
+
+
+def pose_of(sighted: Sighted) -> TargetPose:
+    """A sighting in the place of a tracker's word: the later it was made, the higher its number."""
+    return TargetPose(
+        target=sighted.target,
+        incarnation=0,
+        seq=sighted.stamp_ns,
+        stamp_ns=sighted.stamp_ns,
+        cell=sighted.cell,
+        x_m=sighted.x_m,
+        y_m=sighted.y_m,
+    )
