@@ -66,7 +66,10 @@ def zenohd(
         typer.Option(help="Name of a certificate whose bearer may do everything in the namespace."),
     ] = None,
     agent: Annotated[
-        list[str] | None, typer.Option(help="Agent with a certificate of its name: writes only what is its own.")
+        list[str] | None,
+        typer.Option(
+            help="Agent, as GROUP.ID (all.a0), with a certificate of that name: writes only what is its own."
+        ),
     ] = None,
     plugins: Annotated[
         Path | None, typer.Option(help="Folder with libzenoh_plugin_storage_manager.so, to store marks, too.")

@@ -7,7 +7,7 @@ from typing import Any
 
 from swarm.codec import MAX_PAYLOAD_BYTES
 from swarm.config import NetworkConfig
-from swarm.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, MARKS, NOTE, STATS
+from swarm.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, STATS
 
 PUTS = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
 READS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
@@ -24,7 +24,7 @@ def zenohd_config(
     """What `zenohd -c FILE` reads, as JSON.
 
     trusted  certificate names that may do everything in the namespace: keepers, planners, routers
-    agents   certificate names of agents, each named as its agent: may write only what is their own
+    agents   certificate names of agents, each its group and id (all.a0): may write only what is their own
     plugins  folder of `libzenoh_plugin_storage_manager.so`; without one marks are passed on, not stored
     volume   of the storage: "memory", or one whose backend is installed
     With names given, whoever has another one, or none, may do nothing. Without, all that connect may do all.
@@ -67,7 +67,7 @@ def zenohd_config(
 def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]) -> dict[str, Any]:
     """Zenoh's rules, by the common name of the certificate at the other end of a link.
 
-    An agent hears everything and writes under its own name only: authors are called `ID.INCARNATION`.
+    An agent hears everything and writes under its own name only: authors are called `GROUP.ID.INCARNATION`.
     """
     whole = [f"{namespace}/**"]
     rules = [_rule("all", (*PUTS, *READS), whole), _rule("hear", READS, whole)]
@@ -89,14 +89,15 @@ def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]
     }
 
 
-def own_keys(agent: str) -> list[str]:
-    """What an agent may write, below the namespace."""
-    author = f"{agent}.$*"
+def own_keys(name: str) -> list[str]:
+    """What the agent of a name such as all.a0 may write, below the namespace."""
+    author, agent = f"{name}.$*", name.rpartition(".")[2]
     return [
         MARKS.key.format(region="*", tile="*", author=author),
         DIGEST.key.format(author=author),
         FLEET.key.format(region="*", author=author),
         CLAIMS.key.format(**dict.fromkeys(CLAIMS.fields, "*") | {"agent": agent}),
+        GROUNDS.key.format(agent=agent),
         FOLLOWED.key.format(agent=agent, vehicle="*"),
         STATS.key.format(role="agent", id=agent),
         NOTE.key.format(role="agent", id=agent),
