@@ -130,11 +130,14 @@ def _lines(axes: Axes, rows: Sequence[dict[str, Any]], name: str, key: str, labe
 def _shares(axes: Axes, tallies: Mapping[Strategy, Tally]) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
+    handles = []
     for strategy, tally in tallies.items():
         above = np.sort(100 * (np.concatenate(tally.gaps) - 1))
         share = 100 * (1 - np.arange(above.size) / above.size)
         drawn = above >= EXACT_PERCENT
         axes.plot(above[drawn], share[drawn], color=COLOURS[strategy], linewidth=2)
+        label = LABELS[strategy] if drawn.any() else f"{LABELS[strategy]}: exact"
+        handles.append(Line2D([], [], color=COLOURS[strategy], linewidth=2, label=label))
     axes.set_ylim(0.01, 100)
     axes.set_xlim(left=EXACT_PERCENT)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} %"))
@@ -143,7 +146,7 @@ def _shares(axes: Axes, tallies: Mapping[Strategy, Tally]) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
     _plain(axes)
     axes.legend(
-        handles=[Line2D([], [], color=COLOURS[name], linewidth=2, label=LABELS[name]) for name in tallies],
+        handles=handles,
         loc="lower left",
         handlelength=1.2,
     )
