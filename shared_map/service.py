@@ -22,8 +22,12 @@ from swarm.topics import SIGHTED
 
 log = logging.getLogger(__name__)
 
+THROTTLED = "throttled."
+"""Begins the gauge, there only while it is so, of an author that marks more than its share."""
+
 _RETRY_NS = NS_PER_S
 _NOTE_AGAIN_NS = 60 * NS_PER_S
+_NAME_AT_MOST = 16
 _FOLD_EVERY_NS = NS_PER_S
 _FOLD_TILES = 64
 _SWEEP_EVERY_NS = 600 * NS_PER_S
@@ -123,7 +127,11 @@ class KeeperService:
         """Tell people once who marks more than its share."""
         throttled = self._feed.throttled
         self.counters.gauge("authors_throttled", float(len(throttled)))
-        for author in throttled:
+        for author in self._named:
+            self.counters.gauges.pop(THROTTLED + author, None)
+        for author in throttled[:_NAME_AT_MOST]:
+            self.counters.gauge(THROTTLED + author, 1.0)
+        for author in throttled[:_NAME_AT_MOST]:
             if author not in self._named:
                 self._named.append(author)
                 text = f"author {author} marks more than its share: it is heard with delay"

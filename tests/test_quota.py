@@ -5,10 +5,11 @@ from map_strategies import MapSwarm, set_of
 
 from shared_map.keeper import KeeperStore
 from shared_map.quota import Quota
+from shared_map.service import THROTTLED
 from swarm.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config import MapConfig
-from swarm.messages import MarkKind, Note
+from swarm.messages import MarkKind, Note, Stats
 from swarm.topics import NOTE
 
 
@@ -99,7 +100,17 @@ def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up()
     swarm.run(1)
     assert listener.feed.throttled == ["loud.1"]
     assert "calm.1" in listener.replica.digest()
+    assert keeper.counters.gauges[THROTTLED + "loud.1"] == 1
     assert notes == ["author loud.1 marks more than its share: it is heard with delay"]
     swarm.run(400)
     assert listener.feed.throttled == []
+    assert THROTTLED + "loud.1" not in keeper.counters.gauges
     assert listener.replica.fingerprint() == loud.replica.fingerprint() == keeper.replica.fingerprint()
+
+
+def test_status_names_who_is_throttled() -> None:
+    from launch_scripts.commands.ask import _throttled
+
+    gauges = {"sets_waiting": 0.0, THROTTLED + "loud.1": 1.0}
+    stats = Stats(role="keeper", id="0", incarnation=1, stamp_ns=1, counts={}, gauges=gauges, histograms={})
+    assert _throttled({("keeper", "0"): stats}) == ["loud.1"]

@@ -23,7 +23,7 @@ from swarm.grid import GridSpec
 from swarm.messages import MarkKind
 
 SIDE_CELLS = 512
-WRITES = 100
+WRITES = 40
 CELLS = 24
 
 

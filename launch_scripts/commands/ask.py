@@ -188,6 +188,14 @@ def _status_fields(
     }
 
 
+def _throttled(stats: dict[tuple[str, str], Stats]) -> list[str]:
+    """Authors of whom a keeper says that their sets wait."""
+    from shared_map.service import THROTTLED
+
+    gauges = {name for each in stats.values() for name in each.gauges}
+    return sorted(name.removeprefix(THROTTLED) for name in gauges if name.startswith(THROTTLED))
+
+
 def _print_status(
     members: list[RunInfo], stats: dict[tuple[str, str], Stats], planners: dict[str, PlannerStatus]
 ) -> None:
@@ -207,6 +215,8 @@ def _print_status(
         up_s = (now_ns - info.incarnation) / 1e9
         crew.add_row(f"{info.role}-{info.id}", f"{up_s:.0f}", *("-" if n is None else str(n) for n in numbers))
     console.print(crew)
+    for author in _throttled(stats):
+        console.print(f"author {author} marks more than its share: it is heard with delay", style="yellow")
     if planners:
         trees = Table(
             "target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap", pad_edge=False
