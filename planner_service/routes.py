@@ -19,6 +19,8 @@ def read_routes(tree: CostToGoTree, bounds: LowerBounds, asked: NDArray[np.int64
     statuses = np.empty(asked.size, np.uint8)
     find_starts(ground.weight, tree.cost, ground.stride, root, asked, starts, statuses)
     walks = ground.walk(tree.parent, root, starts, max_cells, ground.weight)
+    if max_cells:
+        tree.tighten(walks.last)
     prices = np.empty((4, asked.size), np.float64)
     prices[1] = bounds.at(tree, starts)
     whole = price_routes(

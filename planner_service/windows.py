@@ -21,7 +21,8 @@ class Rungs:
     def __init__(self, grid: GridSpec, half: int) -> None:
         self._grid = grid
         self._half = half
-        self._centres = [-1] * (max(grid.rows, grid.cols) // half).bit_length()
+        self._whole = 0
+        self._centres = [0] * max((max(grid.rows, grid.cols) // half).bit_length(), 1)
 
     def half(self, cell: int, widest: int) -> int:
         """How far the window around a target that came to `cell` should reach, at most `widest` unless one rung is
@@ -35,8 +36,14 @@ class Rungs:
                 found = half
         return found
 
+    def beyond(self, cell: int, widest: int) -> bool:
+        """Whether what lies beyond a window of `widest` cells is due to be renewed: when the next rung would be."""
+        return AHEAD * self._grid.distance_cells(self._whole, cell) >= 2 * widest
+
     def grown(self, cell: int, half: int) -> None:
         """The tree was grown around `cell`, so far to every side."""
+        if half >= max(self._grid.rows, self._grid.cols):
+            self._whole = cell
         for rung in range(len(self._centres)):
             if self._half << rung <= half:
                 self._centres[rung] = cell
@@ -44,8 +51,8 @@ class Rungs:
 
 def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
     """The paper's variable range: the largest k >= k_min whose block index of 2**k cells changed between two cells
-    gives a window that reaches 2**(k+1) cells to every side; if none did, the one of k_min. At least twice as far as
-    the move was long, so that the window holds both cells and some room around them."""
+    gives a window that reaches 2**(k+1) cells to every side; if none did, the one of k_min. At least twice as far
+    as the move was long, so that the window holds both cells and some room around them."""
     row, col = grid.row_col(new)
     old_row, old_col = grid.row_col(old)
     # Of numbers that differ, the highest bit in which they do is the largest block that has changed.

@@ -1,4 +1,4 @@
-"""Kernels of the coarse tree: which cells carry the traffic, and how the others reach them.
+"""Kernels of the coarse tree: which cells carry the traffic, and new costs spreading along them.
 
 Arrays are laid out as `rules` says.
 """
@@ -8,13 +8,55 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from planner_service.kernels.rules import NONE
+from planner_service.kernels.rules import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
 
 
 @njit(cache=True, nogil=True)
-def mark_traffic(parent, stride, least, skeleton):
-    """skeleton := 1 wherever the ways of at least `least` cells pass, in a tree given by its parents."""
-    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
+def _sink(keys, items, size):
+    """Restore a binary heap after its last element, keys[size], was taken from the end to replace the top."""
+    key = keys[size]
+    item = items[size]
+    hole = 0
+    while True:
+        child = 2 * hole + 1
+        if child >= size:
+            break
+        if child + 1 < size and keys[child + 1] < keys[child]:
+            child += 1
+        if keys[child] >= key:
+            break
+        keys[hole] = keys[child]
+        items[hole] = items[child]
+        hole = child
+    keys[hole] = key
+    items[hole] = item
+
+
+@njit(cache=True, nogil=True)
+def _rise(keys, items, size, key, item):
+    hole = size
+    while hole > 0:
+        above = (hole - 1) >> 1
+        if keys[above] <= key:
+            break
+        keys[hole] = keys[above]
+        items[hole] = items[above]
+        hole = above
+    keys[hole] = key
+    items[hole] = item
+
+
+@njit(cache=True, nogil=True)
+def step_offsets(stride):
+    """What each direction code 0..7 adds to a padded cell index."""
+    return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
+
+
+@njit(cache=True, nogil=True)
+def mark_levels(parent, stride, least, level):
+    """Raise `level` (uint8) to 1 where the ways of `least` cells pass in a tree given by its parents, to 2 where
+    those of 4 * least do, and so on. What drains an area four times as large is twice as far from its like."""
+    offsets = step_offsets(stride)
     children = np.zeros(parent.size, np.uint8)
     traffic = np.ones(parent.size, np.uint32)
     for i in range(parent.size):
@@ -25,8 +67,13 @@ def mark_traffic(parent, stride, least, skeleton):
         # A cell is done once all its children are; then it hands on what passes through it.
         while parent[v] != NONE and children[v] == 0:
             children[v] = NONE
-            if traffic[v] >= least:
-                skeleton[v] = 1
+            rest = np.int64(traffic[v])
+            found = 0
+            while rest >= least:
+                found += 1
+                rest >>= 2
+            if found > level[v]:
+                level[v] = found
             u = v + offsets[parent[v]]
             traffic[u] += traffic[v]
             children[u] -= 1
@@ -34,49 +81,114 @@ def mark_traffic(parent, stride, least, skeleton):
 
 
 @njit(cache=True, nogil=True)
-def mark_way(parent, stride, start, skeleton):
-    """skeleton := 1 along the way from a cell to where its parents lead."""
-    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
-    v = start
-    skeleton[v] = 1
-    while parent[v] != NONE:
+def _tighten(weight, cost, parent, stamp, now, offsets, rule, v, trail):
+    """As `tighten`, for one cell. Returns (cells visited, the trail, which may have grown)."""
+    many = 0
+    while stamp[v] < now and parent[v] != NONE:
+        if many == trail.size:
+            longer = np.empty(2 * many, np.int64)
+            longer[:many] = trail
+            trail = longer
+        trail[many] = v
+        many += 1
         v += offsets[parent[v]]
-        skeleton[v] = 1
+    if stamp[v] < now:  # no way leads from here
+        return 0, trail
+    for j in range(many - 1, -1, -1):
+        v = trail[j]
+        k = parent[v]
+        u = v + offsets[k]
+        driven = cost[u] + (weight[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else weight[u])
+        cost[v] = min(cost[v], driven)
+        stamp[v] = now
+    return many, trail
 
 
 @njit(cache=True, nogil=True)
-def find_anchors(parent, stride, skeleton, anchor):
-    """anchor (uint32) := the skeleton cell that each cell's parents lead to; 0 where they lead nowhere."""
-    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
-    known = np.zeros(parent.size, np.uint8)
-    trail = np.empty(parent.size, np.uint32)
-    for i in range(parent.size):
-        anchor[i] = i if skeleton[i] else 0
-        known[i] = 1 if skeleton[i] or parent[i] == NONE else 0
-    for i in range(parent.size):
-        v = i
-        many = 0
-        while known[v] == 0:
-            trail[many] = v
-            many += 1
-            v += offsets[parent[v]]
-        for j in range(many):
-            anchor[trail[j]] = anchor[v]
-            known[trail[j]] = 1
+def tighten(weight, cost, parent, stamp, now, stride, rule, root, cells):
+    """cost := what is driven along the parents, less the tree's offset, on the ways from `cells` to the root.
 
-
-@njit(cache=True, nogil=True)
-def fill_in(cost, active, attach, anchor):
-    """After a flood over the active cells: every cell costs at most its anchor and the way there.
-
-    attach  float32  s; what the way to the anchor costs; inf without one
-    Returns how many cells have an anchor that the flood did not reach: none, unless the skeleton is torn.
+    stamp  uint8  `now` or one more on cells that are known to be right, and on those that become so; less elsewhere
+    Costs only fall, and stay at least what the parent offers. Returns cells visited.
     """
-    torn = 0
-    inf = np.float32(np.inf)
-    for i in range(np.uint64(cost.size)):
-        own = cost[i] if active[i] else inf
-        found = min(own, cost[anchor[i]] + attach[i])
-        torn += found == inf and attach[i] < inf
-        cost[i] = found
-    return torn
+    offsets = step_offsets(stride)
+    trail = np.empty(1024, np.int64)
+    visited = 0
+    stamp[root] = now
+    for i in range(cells.size):
+        many, trail = _tighten(weight, cost, parent, stamp, now, offsets, rule, cells[i], trail)
+        visited += many
+    return visited
+
+
+@njit(cache=True, nogil=True)
+def spread(weight, cost, parent, stamp, now, level, stride, rule, corners, root, box, inner):
+    """Let the costs on the rim of a window around the root spread outward over the cells that carry the traffic.
+
+    level  uint8  which cells take part: of level 1 or more up to `inner` cells from the root, of 2 or more up to
+                  twice as far, of 3 up to four times, ...
+    box    (row0, col0, row1, col1) of the window, whose costs are new
+    stamp, now  as in `tighten`, which a cell is before it is offered anything: an old way from far off is often
+                better than its cost says, and than the way over the skeleton. One more than `now` where that is done
+    Only what gets cheaper is rewritten, with its parent, so that costs stay upper bounds and grow strictly along
+    every way. Returns cells visited.
+    """
+    offsets = step_offsets(stride)
+    row0, col0, row1, col1 = box
+    capacity = 4096 + 4 * (row1 - row0 + col1 - col0)
+    keys = np.empty(capacity, np.float32)
+    items = np.empty(capacity, np.int64)
+    size = 0
+    for row in range(row0, row1):
+        across = 1 if row == row0 or row == row1 - 1 else max(1, col1 - col0 - 1)
+        for col in range(col0, col1, across):
+            v = (row + 1) * stride + col + 1
+            if cost[v] < INF:
+                _rise(keys, items, size, cost[v], v)
+                size += 1
+    root_row = root // stride
+    root_col = root % stride
+    trail = np.empty(1024, np.int64)
+    stamp[root] = now
+    visited = 0
+    while size > 0:
+        key = keys[0]
+        u = items[0]
+        size -= 1
+        _sink(keys, items, size)
+        if key > cost[u]:
+            continue
+        visited += 1
+        if size + 16 > capacity:
+            capacity *= 2
+            new_keys = np.empty(capacity, np.float32)
+            new_items = np.empty(capacity, np.int64)
+            new_keys[:size] = keys[:size]
+            new_items[:size] = items[:size]
+            keys = new_keys
+            items = new_items
+        away = max(abs(u // stride - root_row), abs(u % stride - root_col))
+        ring = 1
+        while away > inner:
+            away >>= 1
+            ring += 1
+        straight = key + weight[u]
+        diagonal = key + (weight[u] * SQRT2 if rule == RULE_OCTILE else weight[u])
+        for k in range(0, 8, 2 if rule == RULE_FOUR else 1):
+            v = u + offsets[k]
+            offer = diagonal if k & 1 else straight
+            if level[v] < ring or not weight[v] < INF or not (stamp[v] <= now or offer < cost[v]):
+                continue
+            shut = max(weight[u + offsets[k - 1]], weight[u + offsets[(k + 1) & 7]]) == INF
+            if k & 1 and not corners and shut:
+                continue
+            if stamp[v] < now:
+                many, trail = _tighten(weight, cost, parent, stamp, now, offsets, rule, v, trail)
+                visited += many
+            stamp[v] = now + 1
+            if offer < cost[v]:
+                cost[v] = offer
+                parent[v] = (k + 4) & 7
+            _rise(keys, items, size, cost[v], v)
+            size += 1
+    return visited
