@@ -8,11 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import flood as kernels
-from planner_service.kernels.rules import RULE_OCTILE, RULE_PAPER, SQRT2_EXACT, TOO_FINE
+from planner_service.kernels.rules import RULE_OCTILE, SQRT2_EXACT, TOO_FINE
+from planner_service.kernels.wide import flood_wide
 from shared_map.arrays import Floats
 
-MAX_RATIO = 1 << 14
-"""Between dearest and cheapest step: beyond it buckets as wide as the cheapest give way to a heap."""
+MAX_RATIO = 1 << 12
+"""Between dearest and cheapest step: beyond it, turning over buckets as narrow as the cheapest, most of them empty,
+costs more than a radix heap; on a small grid, beyond one bucket for so many cells:"""
+CELLS_PER_BUCKET = 16
+SMALL_RATIO = 64
+"""No grid is so small that a ring of this many buckets does not pay."""
 FINE = float(1 << 20)
 """While no cost exceeds so many smallest weights, float32 tells any cell's cost from its parent's."""
 
@@ -33,32 +38,21 @@ def flood(
 ) -> float:
     """Grow the exact tree of a padded root. Returns a bound that no cost exceeds.
 
-    active  cells that take part; the cost of others is without meaning, and so are all parents. inf is returned,
-    and
-            nothing done, where the weights' ratio is too large for that
+    low, high  bounds of the finite weights, s
+    active     cells that take part; the cost of others is without meaning, and so are all parents
     """
+    box = (0, 0, weight.size // stride - 2, stride - 2)
     longest = high * (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
-    if longest <= min(MAX_RATIO, max(512, weight.size // 16)) * low:
+    if longest <= min(MAX_RATIO, max(SMALL_RATIO, weight.size // CELLS_PER_BUCKET)) * low:
         width = np.float32(low * 0.98)
         ring = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
-        shift = 6 if ring <= 64 else 4
-        if rule == RULE_OCTILE:
-            last = kernels.flood_octile(weight, active, cost, stride, root, corners, width, ring, shift)
-        else:
-            diagonals = rule == RULE_PAPER
-            last = kernels.flood_single(weight, active, cost, stride, root, diagonals, corners, width, ring, shift)
+        last = kernels.flood(weight, active, cost, stride, root, rule, corners, width, ring)
         if last != TOO_FINE:
             if parent is not None:
-                rows = weight.size // stride - 2
-                kernels.point_to_parents(
-                    weight, cost, stride, rule, corners, root, (0, 0, rows, stride - 2), parent
-                )
+                kernels.point_to_parents(weight, cost, stride, rule, corners, root, box, parent)
             return float((last + 1) * width)
-    if active.size:
-        return math.inf
-    touched = np.empty(weight.size, np.uint8) if parent is None else parent
-    reach = float(kernels.flood_wide(weight, cost, stride, root, rule, corners, touched))
+    parents = np.empty(weight.size, np.uint8) if parent is None else parent
+    reach = float(flood_wide(weight, active, cost, stride, root, rule, corners, np.float32(low), parents))
     if parent is not None and reach <= FINE * low:
-        box = (0, 0, weight.size // stride - 2, stride - 2)
         kernels.point_to_parents(weight, cost, stride, rule, corners, root, box, parent)
     return reach

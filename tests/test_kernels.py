@@ -13,7 +13,8 @@ import pytest
 from strategies import RULES, random_pace
 
 from planner_service.ground import Ground
-from planner_service.kernels import flood
+from planner_service.growth import ALL_CELLS
+from planner_service.kernels.wide import flood_wide
 from planner_service.tree import CostToGoTree
 from swarm.config import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
@@ -90,7 +91,8 @@ def test_buckets_and_heap_give_the_same_costs_to_the_last_bit() -> None:
         ground = tree.ground
         cost, parent = np.empty_like(tree.cost), np.empty_like(tree.parent)
         root = ground.pad(target)
-        flood.flood_wide(ground.weight, cost, ground.stride, root, ground.rule, ground.corners, parent)
+        low = np.float32(ground.low)
+        flood_wide(ground.weight, ALL_CELLS, cost, ground.stride, root, ground.rule, ground.corners, low, parent)
         np.testing.assert_array_equal(cost, tree.cost)
 
 

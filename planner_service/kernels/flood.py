@@ -1,11 +1,16 @@
-"""The exact tree of one root: floods that find the costs, and the parents that follow from them.
+"""The exact tree of one root: a flood over a ring of buckets, and the parents that follow from its costs.
 
 The graph is grown from the root backward. A step from u to its neighbour v costs weight[v] * length, so a settled v
 offers all its neighbours the same key: cost[v] + weight[v]. Ordered by that exit key, the first touch of a cell
 is final. Octile steps make two keys per cell, straight and diagonal.
 
+What the loops look like was measured, and small changes cost much: cells are touched without branches, sorted into
+buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
+out of the chunks of their bucket into one row before they make their offers.
+
 Arrays are laid out as `rules` says. Indices are unsigned 64-bit: signed ones make numba test for negative ones,
 which blocks vectorisation. A uint64 meets only uint64 here, because with an int64 it would silently become float64.
+Scratch is allocated for the worst case; of what is not written, the system keeps no page.
 """
 
 from __future__ import annotations
@@ -28,6 +33,8 @@ from planner_service.kernels.rules import (
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
+_ZERO32 = np.float32(0.0)
+_CHUNK_BITS = 6
 
 
 @njit(cache=True, nogil=True)
@@ -39,7 +46,7 @@ def open_costs(weight, active, cost):
             cost[i] = INF if weight[i] < INF else LETHAL
         return
     for i in range(weight.size):
-        cost[i] = (INF if active[i] else np.float32(0.0)) if weight[i] < INF else LETHAL
+        cost[i] = (INF if active[i] else _ZERO32) if weight[i] < INF else LETHAL
 
 
 @njit(cache=True, nogil=True)
@@ -47,355 +54,236 @@ def close_costs(cost):
     """After a flood: inf on lethal cells too."""
     for i in range(cost.size):
         c = cost[i]
-        cost[i] = c if c >= np.float32(0.0) else INF
+        cost[i] = c if c >= _ZERO32 else INF
 
 
 @njit(cache=True, nogil=True)
-def flood_single(weight, active, cost, stride, root, diagonals, corners, width, ring, shift):
-    """First-touch flood where every step has length 1: one exit key per cell. `cost` is written whole.
+def _make_queue(buckets, items):
+    """A queue of cells in `buckets`, for at most `items` at once, in chunks of 2**_CHUNK_BITS cells.
+
+    pool    uint32  the chunks
+    link    uint32  of each full chunk, the next one of its bucket
+    spare   uint32  a stack of chunks that were emptied
+    counts  uint64  how many are spare; how many were ever used
+    head    uint64  of each bucket, the position of its first cell: the start of a chunk
+    tail    uint64  of each bucket, the position behind its last cell, in a chunk with room for one
+    """
+    shift = _CHUNK_BITS
+    chunks = buckets + (items >> shift) + 1
+    pool = np.empty(chunks << shift, np.uint32)
+    link = np.empty(chunks, np.uint32)
+    spare = np.empty(chunks, np.uint32)
+    counts = np.array((0, buckets), np.uint64)
+    head = np.empty(buckets, np.uint64)
+    tail = np.empty(buckets, np.uint64)
+    for b in range(buckets):
+        head[b] = b << shift
+        tail[b] = b << shift
+    return pool, link, spare, counts, head, tail, np.uint64(shift)
+
+
+@njit(cache=True, nogil=True)
+def _choose(weight, cost, length, inverse, least, cells, count, buckets):
+    """buckets := which one each cell's exit key falls into, `least` at least."""
+    for i in range(count):
+        v = np.uint64(cells[i])
+        buckets[i] = max(np.int32((cost[v] + weight[v] * length) * inverse), least)
+
+
+@njit(cache=True, nogil=True)
+def _put(queue, cells, count, buckets, ring, first):
+    """Put cells into the queue, each into its bucket modulo `ring`, of the ring that begins at bucket `first`."""
+    pool, link, spare, counts, _, tail, shift = queue
+    low = (_ONE << shift) - _ONE
+    mask = ring - _ONE
+    for i in range(count):
+        b = (np.uint64(buckets[i]) & mask) + first
+        t = tail[b]
+        pool[t] = cells[i]
+        t += _ONE
+        if t & low == _ZERO:
+            if counts[0] == _ZERO:
+                chunk = counts[1]
+                counts[1] += _ONE
+            else:
+                counts[0] -= _ONE
+                chunk = np.uint64(spare[counts[0]])
+            link[(t - _ONE) >> shift] = chunk
+            t = chunk << shift
+        tail[b] = t
+
+
+@njit(cache=True, nogil=True)
+def _take(queue, b, batch):
+    """Move all cells of a bucket to `batch`. Returns how many."""
+    pool, link, spare, counts, head, tail, shift = queue
+    size = _ONE << shift
+    position = head[b]
+    end = tail[b]
+    n = _ZERO
+    while position >> shift != end >> shift:
+        for i in range(size):
+            batch[n + i] = pool[position + i]
+        n += size
+        chunk = position >> shift
+        spare[counts[0]] = chunk
+        counts[0] += _ONE
+        position = np.uint64(link[chunk]) << shift
+    for i in range(end - position):
+        batch[n + i] = pool[position + i]
+    head[b] = position
+    tail[b] = position
+    return n + (end - position)
+
+
+@njit(cache=True, nogil=True)
+def _offer_straight(weight, cost, s, batch, n, touched):
+    """Offer their exit keys to four neighbours. Writes the cells that had no cost yet to `touched`; returns how
+    many."""
+    count = _ZERO
+    for p in range(n):
+        u = np.uint64(batch[p])
+        key = cost[u] + weight[u]
+        for i in (u - s, u - _ONE, u + _ONE, u + s):
+            old = cost[i]
+            cost[i] = min(old, key)
+            touched[count] = i
+            count += np.uint64(old == INF)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _offer_diagonal(weight, cost, s, corners, batch, n, touched, count):
+    """As `_offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
+    for p in range(n):
+        u = np.uint64(batch[p])
+        key = cost[u] + weight[u] * SQRT2
+        above = u - s
+        below = u + s
+        around = (above - _ONE, above + _ONE, below - _ONE, below + _ONE)
+        if not corners:
+            north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
+            if min(min(north, west), min(east, south)) < _ZERO32:
+                gated = (
+                    (above - _ONE, min(north, west)),
+                    (above + _ONE, min(north, east)),
+                    (below - _ONE, min(south, west)),
+                    (below + _ONE, min(south, east)),
+                )
+                for i, gate in gated:
+                    old = cost[i]
+                    offer = key if gate >= _ZERO32 else INF
+                    cost[i] = min(old, offer)
+                    touched[count] = i
+                    count += np.uint64(old - offer == INF)
+                continue
+        for i in around:
+            old = cost[i]
+            cost[i] = min(old, key)
+            touched[count] = i
+            count += np.uint64(old == INF)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _offer_around(weight, cost, s, corners, batch, n, touched):
+    """As `_offer_straight`, to eight neighbours, all a step of length 1 away."""
+    count = _ZERO
+    for p in range(n):
+        u = np.uint64(batch[p])
+        key = cost[u] + weight[u]
+        above = u - s
+        below = u + s
+        north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
+        for i, old in ((above, north), (u - _ONE, west), (u + _ONE, east), (below, south)):
+            cost[i] = min(old, key)
+            touched[count] = i
+            count += np.uint64(old == INF)
+        around = (above - _ONE, above + _ONE, below - _ONE, below + _ONE)
+        if not corners and min(min(north, west), min(east, south)) < _ZERO32:
+            gated = (
+                (above - _ONE, min(north, west)),
+                (above + _ONE, min(north, east)),
+                (below - _ONE, min(south, west)),
+                (below + _ONE, min(south, east)),
+            )
+            for i, gate in gated:
+                old = cost[i]
+                offer = key if gate >= _ZERO32 else INF
+                cost[i] = min(old, offer)
+                touched[count] = i
+                # inf - inf is no number, and no match: a shut diagonal touches nothing.
+                count += np.uint64(old - offer == INF)
+            continue
+        for i in around:
+            old = cost[i]
+            cost[i] = min(old, key)
+            touched[count] = i
+            count += np.uint64(old == INF)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def flood(weight, active, cost, stride, root, rule, corners, width, ring):
+    """First-touch flood. `cost` is written whole.
 
     active uint8    the cells that take part; empty if all
 
     width  of a bucket, s: below the smallest weight, so that nothing in a bucket leads back into it
-    ring   buckets in the circular queue, a power of two; ring * width exceeds the largest weight by two widths
-    shift  a chunk of the queue holds 2**shift cells
+    ring   buckets in the circular queue, a power of two; ring * width exceeds the dearest step by two widths
     Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
+
+    With octile steps a cell waits twice, under its straight exit key in the first `ring` buckets and under its
+    diagonal one in as many behind them.
     """
+    kinds = 2 if rule == RULE_OCTILE else 1
+    queue = _make_queue(kinds * ring, kinds * weight.size)
+    head, tail = queue[4], queue[5]
+    # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
+    touched = np.empty(weight.size + 1, np.uint32)
+    batch = np.empty(weight.size + 1, np.uint32)
     s = np.uint64(stride)
-    mask = np.uint64(ring - 1)
+    ring = np.uint64(ring)
+    mask = ring - _ONE
+    second = ring if rule == RULE_OCTILE else _ZERO
     inverse = _ONE32 / width
-    size = np.uint64(1) << np.uint64(shift)
-    low = size - _ONE
-    sh = np.uint64(shift)
-    chunks = 2 * ring + 64 + (weight.size >> (shift + 4))
-    pool = np.empty(chunks << shift, np.uint32)
-    following = np.empty(chunks, np.uint32)
-    spare = np.empty(chunks, np.uint32)
-    head = np.empty(ring, np.uint64)
-    tail = np.empty(ring, np.uint64)
-    for b in range(ring):
-        head[b] = np.uint64(b) << sh
-        tail[b] = head[b]
-    spares = 0
-    for c in range(chunks - 1, ring - 1, -1):
-        spare[spares] = c
-        spares += 1
-    touched = np.empty(1024 + 8 * 64, np.uint32)
-    capacity = np.uint64(touched.size - 8)
 
     open_costs(weight, active, cost)
-    root = np.uint64(root)
-    cost[root] = np.float32(0.0)
+    cost[np.uint64(root)] = _ZERO32
     touched[0] = root
     count = _ONE
-    current = 0
-    waiting = 0
+    current = np.int32(0)
+    waiting = _ZERO
     while True:
         # Cells touched from the last bucket join the queue: their cost is final.
-        n = np.int64(count)
-        waiting += n
-        if spares < (n >> shift) + min(n, ring) + 2:
-            more = chunks + (n >> shift) + min(n, ring) + 2
-            new_pool = np.empty((chunks + more) << shift, np.uint32)
-            new_pool[: chunks << shift] = pool
-            pool = new_pool
-            new_following = np.empty(chunks + more, np.uint32)
-            new_following[:chunks] = following
-            following = new_following
-            new_spare = np.empty(chunks + more, np.uint32)
-            new_spare[:spares] = spare[:spares]
-            spare = new_spare
-            for c in range(chunks, chunks + more):
-                spare[spares] = c
-                spares += 1
-            chunks += more
-        for i in range(n):
-            v = np.uint64(touched[i])
-            bucket = max(np.int64((cost[v] + weight[v]) * inverse), current + 1)
-            b = np.uint64(bucket) & mask
-            t = tail[b]
-            pool[t] = v
-            t += _ONE
-            if t & low == _ZERO:
-                spares -= 1
-                c = spare[spares]
-                following[(t - _ONE) >> sh] = c
-                t = np.uint64(c) << sh
-            tail[b] = t
-        if waiting == 0:
+        waiting += count
+        following = np.int32(current + 1)
+        _choose(weight, cost, _ONE32, inverse, following, touched, count, batch)
+        _put(queue, touched, count, batch, ring, _ZERO)
+        if rule == RULE_OCTILE:
+            waiting += count
+            _choose(weight, cost, SQRT2, inverse, following, touched, count, batch)
+            _put(queue, touched, count, batch, ring, ring)
+        if waiting == _ZERO:
             close_costs(cost)
             return current
         if current > 1 << 20:
             return TOO_FINE
-        current += 1
+        current = following
         b = np.uint64(current) & mask
-        while head[b] == tail[b]:
-            current += 1
+        while head[b] == tail[b] and head[b + second] == tail[b + second]:
+            current = np.int32(current + 1)
             b = np.uint64(current) & mask
-        count = _ZERO
-        position = head[b]
-        end = tail[b]
-        while position != end:
-            chunk_end = (position | low) + _ONE
-            stop = end if end >> sh == position >> sh else chunk_end
-            need = count + np.uint64(8) * (stop - position)
-            if need > capacity:
-                new_touched = np.empty(np.int64(2 * need) + 8, np.uint32)
-                new_touched[:count] = touched[:count]
-                touched = new_touched
-                capacity = np.uint64(touched.size - 8)
-            waiting -= np.int64(stop - position)
-            for p in range(position, stop):
-                u = np.uint64(pool[p])
-                key = cost[u] + weight[u]
-                above = u - s
-                below = u + s
-                north = cost[above]
-                east = cost[u + _ONE]
-                south = cost[below]
-                west = cost[u - _ONE]
-                cost[above] = min(north, key)
-                touched[count] = above
-                count += np.uint64(north == INF)
-                cost[u + _ONE] = min(east, key)
-                touched[count] = u + _ONE
-                count += np.uint64(east == INF)
-                cost[below] = min(south, key)
-                touched[count] = below
-                count += np.uint64(south == INF)
-                cost[u - _ONE] = min(west, key)
-                touched[count] = u - _ONE
-                count += np.uint64(west == INF)
-                if not diagonals:
-                    continue
-                ne = above + _ONE
-                se = below + _ONE
-                sw = below - _ONE
-                nw = above - _ONE
-                if not corners and min(min(north, east), min(south, west)) < np.float32(0.0):
-                    # A step past a wall goes to cell 0 instead, which is lethal and takes no offer.
-                    ne = ne if min(north, east) >= np.float32(0.0) else _ZERO
-                    se = se if min(south, east) >= np.float32(0.0) else _ZERO
-                    sw = sw if min(south, west) >= np.float32(0.0) else _ZERO
-                    nw = nw if min(north, west) >= np.float32(0.0) else _ZERO
-                old = cost[ne]
-                cost[ne] = min(old, key)
-                touched[count] = ne
-                count += np.uint64(old == INF)
-                old = cost[se]
-                cost[se] = min(old, key)
-                touched[count] = se
-                count += np.uint64(old == INF)
-                old = cost[sw]
-                cost[sw] = min(old, key)
-                touched[count] = sw
-                count += np.uint64(old == INF)
-                old = cost[nw]
-                cost[nw] = min(old, key)
-                touched[count] = nw
-                count += np.uint64(old == INF)
-            if end >> sh == position >> sh:
-                position = end
-            else:
-                c = following[position >> sh]
-                spare[spares] = position >> sh
-                spares += 1
-                position = np.uint64(c) << sh
-        head[b] = position & ~low
-        tail[b] = head[b]
-
-
-@njit(cache=True, nogil=True)
-def flood_octile(weight, active, cost, stride, root, corners, width, ring, shift):
-    """As `flood_single`, for octile steps: a cell waits twice, under its straight and under its diagonal exit key.
-
-    Buckets 0..ring-1 of the queue hold straight exits, ring..2*ring-1 diagonal ones.
-    """
-    s = np.uint64(stride)
-    mask = np.uint64(ring - 1)
-    diagonal = np.uint64(ring)
-    inverse = _ONE32 / width
-    low = (np.uint64(1) << np.uint64(shift)) - _ONE
-    sh = np.uint64(shift)
-    chunks = 4 * ring + 64 + (weight.size >> (shift + 3))
-    pool = np.empty(chunks << shift, np.uint32)
-    following = np.empty(chunks, np.uint32)
-    spare = np.empty(chunks, np.uint32)
-    head = np.empty(2 * ring, np.uint64)
-    tail = np.empty(2 * ring, np.uint64)
-    for c in range(2 * ring):
-        head[c] = np.uint64(c) << sh
-        tail[c] = head[c]
-    spares = 0
-    for c in range(chunks - 1, 2 * ring - 1, -1):
-        spare[spares] = c
-        spares += 1
-    touched = np.empty(1024 + 4 * 64, np.uint32)
-    capacity = np.uint64(touched.size - 8)
-
-    open_costs(weight, active, cost)
-    root = np.uint64(root)
-    cost[root] = np.float32(0.0)
-    touched[0] = root
-    count = _ONE
-    current = 0
-    waiting = 0
-    while True:
-        n = np.int64(count)
-        waiting += 2 * n
-        need_chunks = 2 * ((n >> shift) + min(n, ring) + 2)
-        if spares < need_chunks:
-            more = chunks + need_chunks
-            new_pool = np.empty((chunks + more) << shift, np.uint32)
-            new_pool[: chunks << shift] = pool
-            pool = new_pool
-            new_following = np.empty(chunks + more, np.uint32)
-            new_following[:chunks] = following
-            following = new_following
-            new_spare = np.empty(chunks + more, np.uint32)
-            new_spare[:spares] = spare[:spares]
-            spare = new_spare
-            for c in range(chunks, chunks + more):
-                spare[spares] = c
-                spares += 1
-            chunks += more
-        for i in range(n):
-            v = np.uint64(touched[i])
-            base = cost[v]
-            w = weight[v]
-            bucket = max(np.int64((base + w) * inverse), current + 1)
-            b = np.uint64(bucket) & mask
-            t = tail[b]
-            pool[t] = v
-            t += _ONE
-            if t & low == _ZERO:
-                spares -= 1
-                c = spare[spares]
-                following[(t - _ONE) >> sh] = c
-                t = np.uint64(c) << sh
-            tail[b] = t
-            bucket = max(np.int64((base + w * SQRT2) * inverse), current + 1)
-            b = (np.uint64(bucket) & mask) + diagonal
-            t = tail[b]
-            pool[t] = v
-            t += _ONE
-            if t & low == _ZERO:
-                spares -= 1
-                c = spare[spares]
-                following[(t - _ONE) >> sh] = c
-                t = np.uint64(c) << sh
-            tail[b] = t
-        if waiting == 0:
-            close_costs(cost)
-            return current
-        if current > 1 << 20:
-            return TOO_FINE
-        current += 1
-        b = np.uint64(current) & mask
-        while head[b] == tail[b] and head[b + diagonal] == tail[b + diagonal]:
-            current += 1
-            b = np.uint64(current) & mask
-        count = _ZERO
-        position = head[b]
-        end = tail[b]
-        while position != end:
-            stop = end if end >> sh == position >> sh else (position | low) + _ONE
-            need = count + np.uint64(4) * (stop - position)
-            if need > capacity:
-                new_touched = np.empty(np.int64(2 * need) + 8, np.uint32)
-                new_touched[:count] = touched[:count]
-                touched = new_touched
-                capacity = np.uint64(touched.size - 8)
-            waiting -= np.int64(stop - position)
-            for p in range(position, stop):
-                u = np.uint64(pool[p])
-                key = cost[u] + weight[u]
-                i = u - s
-                old = cost[i]
-                cost[i] = min(old, key)
-                touched[count] = i
-                count += np.uint64(old == INF)
-                i = u + _ONE
-                old = cost[i]
-                cost[i] = min(old, key)
-                touched[count] = i
-                count += np.uint64(old == INF)
-                i = u + s
-                old = cost[i]
-                cost[i] = min(old, key)
-                touched[count] = i
-                count += np.uint64(old == INF)
-                i = u - _ONE
-                old = cost[i]
-                cost[i] = min(old, key)
-                touched[count] = i
-                count += np.uint64(old == INF)
-            if end >> sh == position >> sh:
-                position = end
-            else:
-                c = following[position >> sh]
-                spare[spares] = position >> sh
-                spares += 1
-                position = np.uint64(c) << sh
-        head[b] = position & ~low
-        tail[b] = head[b]
-
-        b += diagonal
-        position = head[b]
-        end = tail[b]
-        while position != end:
-            stop = end if end >> sh == position >> sh else (position | low) + _ONE
-            need = count + np.uint64(4) * (stop - position)
-            if need > capacity:
-                new_touched = np.empty(np.int64(2 * need) + 8, np.uint32)
-                new_touched[:count] = touched[:count]
-                touched = new_touched
-                capacity = np.uint64(touched.size - 8)
-            waiting -= np.int64(stop - position)
-            for p in range(position, stop):
-                u = np.uint64(pool[p])
-                key = cost[u] + weight[u] * SQRT2
-                above = u - s
-                below = u + s
-                ne = above + _ONE
-                se = below + _ONE
-                sw = below - _ONE
-                nw = above - _ONE
-                if not corners:
-                    north = cost[above]
-                    east = cost[u + _ONE]
-                    south = cost[below]
-                    west = cost[u - _ONE]
-                    if min(min(north, east), min(south, west)) < np.float32(0.0):
-                        ne = ne if min(north, east) >= np.float32(0.0) else _ZERO
-                        se = se if min(south, east) >= np.float32(0.0) else _ZERO
-                        sw = sw if min(south, west) >= np.float32(0.0) else _ZERO
-                        nw = nw if min(north, west) >= np.float32(0.0) else _ZERO
-                old = cost[ne]
-                cost[ne] = min(old, key)
-                touched[count] = ne
-                count += np.uint64(old == INF)
-                old = cost[se]
-                cost[se] = min(old, key)
-                touched[count] = se
-                count += np.uint64(old == INF)
-                old = cost[sw]
-                cost[sw] = min(old, key)
-                touched[count] = sw
-                count += np.uint64(old == INF)
-                old = cost[nw]
-                cost[nw] = min(old, key)
-                touched[count] = nw
-                count += np.uint64(old == INF)
-            if end >> sh == position >> sh:
-                position = end
-            else:
-                c = following[position >> sh]
-                spare[spares] = position >> sh
-                spares += 1
-                position = np.uint64(c) << sh
-        head[b] = position & ~low
-        tail[b] = head[b]
+        n = _take(queue, b, batch)
+        waiting -= n
+        if rule == RULE_PAPER:
+            count = _offer_around(weight, cost, s, corners, batch, n, touched)
+        else:
+            count = _offer_straight(weight, cost, s, batch, n, touched)
+        if rule == RULE_OCTILE:
+            n = _take(queue, b + ring, batch)
+            waiting -= n
+            count = _offer_diagonal(weight, cost, s, corners, batch, n, touched, count)
 
 
 @njit(cache=True, nogil=True)
@@ -470,105 +358,9 @@ def _parents_of_eight(weight, cost, s, first, last, step, limit, parent):
 
 
 @njit(cache=True, nogil=True)
-def _sink(keys, items, size):
-    """Restore a binary heap after its last element, keys[size], was taken from the end to replace the top."""
-    key = keys[size]
-    item = items[size]
-    hole = 0
-    while True:
-        child = 2 * hole + 1
-        if child >= size:
-            break
-        if child + 1 < size and keys[child + 1] < keys[child]:
-            child += 1
-        if keys[child] >= key:
-            break
-        keys[hole] = keys[child]
-        items[hole] = items[child]
-        hole = child
-    keys[hole] = key
-    items[hole] = item
-
-
-@njit(cache=True, nogil=True)
-def _rise(keys, items, size, key, item):
-    hole = size
-    while hole > 0:
-        above = (hole - 1) >> 1
-        if keys[above] <= key:
-            break
-        keys[hole] = keys[above]
-        items[hole] = items[above]
-        hole = above
-    keys[hole] = key
-    items[hole] = item
-
-
-@njit(cache=True, nogil=True)
-def step_offsets(stride):
-    """What each direction code 0..7 adds to a padded cell index."""
-    return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
-
-
-@njit(cache=True, nogil=True)
-def flood_wide(weight, cost, stride, root, rule, corners, parent):
-    """First-touch flood with a heap, for weights of any ratio. Sets parents too: where one weight drowns in the
-    rounding of another, costs cannot tell them. Whole arrays `cost` and `parent` are written. Returns the largest
-    exit key, which no cost exceeds."""
-    offsets = step_offsets(stride)
-    for i in range(weight.size):
-        parent[i] = NONE
-        cost[i] = INF
-    capacity = 1024
-    keys = np.empty(capacity, np.float32)
-    items = np.empty(capacity, np.int64)
-    cost[root] = np.float32(0.0)
-    keys[0] = weight[root]
-    items[0] = root * 2
-    size = 1
-    if rule == RULE_OCTILE:
-        _rise(keys, items, 1, weight[root] * SQRT2, root * 2 + 1)
-        size = 2
-    while size > 0:
-        key = keys[0]
-        u = items[0] >> 1
-        kind = items[0] & 1
-        size -= 1
-        _sink(keys, items, size)
-        if size + 16 > capacity:
-            new_keys = np.empty(2 * capacity, np.float32)
-            new_items = np.empty(2 * capacity, np.int64)
-            new_keys[:size] = keys[:size]
-            new_items[:size] = items[:size]
-            keys = new_keys
-            items = new_items
-            capacity *= 2
-        first = kind if rule == RULE_OCTILE else 0
-        every = 1 if rule == RULE_PAPER else 2
-        for k in range(first, 8, every):
-            v = u + offsets[k]
-            if cost[v] < INF or not weight[v] < INF:
-                continue
-            if k & 1 and not corners:
-                a = weight[u + offsets[k - 1]]
-                b = weight[u + offsets[(k + 1) & 7]]
-                if not max(a, b) < INF:
-                    continue
-            cost[v] = key
-            parent[v] = (k + 4) & 7
-            w = weight[v]
-            _rise(keys, items, size, key + w, v * 2)
-            size += 1
-            if rule == RULE_OCTILE:
-                _rise(keys, items, size, key + w * SQRT2, v * 2 + 1)
-                size += 1
-    return key
-
-
-@njit(cache=True, nogil=True)
 def breadth_first(weight, cost, stride, root):
     """Steps from every cell to the root, whatever they cost: the floor under every growth of a tree."""
-    offsets = step_offsets(stride)
+    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
     for i in range(weight.size):
         cost[i] = INF if weight[i] < INF else LETHAL
     queue = np.empty(weight.size, np.uint32)
