@@ -44,6 +44,7 @@ class LowerBounds:
             ground.corners,
             changes.cells,
             changes.before,
+            *ground.buckets,
             limit,
         )
         if done < 0:

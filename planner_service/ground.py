@@ -53,6 +53,10 @@ def check_pace(grid: GridSpec, pace: NDArray[np.float32]) -> None:
         raise ValueError("pace must be C-contiguous")
 
 
+_FEWEST, _MOST = 1 << 9, 1 << 14
+"""Buckets of a repair."""
+
+
 class Walks(NamedTuple):
     """Routes read off a tree, as `kernels.walk.walk_routes` returns them."""
 
@@ -85,6 +89,12 @@ class Ground:
         self.weight: Floats = np.full(self.size, np.inf, np.float32)
         self.low = math.inf
         self.high = 0.0
+
+    @property
+    def buckets(self) -> tuple[np.float32, int]:
+        """Width of a bucket, s, and how many of them hold all that costs at most a step more: for repairs."""
+        longest = self.high * self.diagonal
+        return np.float32(self.low), min(max(math.ceil(longest / self.low) + 2, _FEWEST), _MOST)
 
     def pad(self, cell: int) -> int:
         row, col = divmod(cell, self.grid.cols)

@@ -1,4 +1,7 @@
-"""Mending a tree after weights changed, without growing it anew. Arrays are laid out as `rules` says."""
+"""Mending a tree after weights changed, without growing it anew. Arrays are laid out as `rules` says; and
+
+first, last  int64  of each row, the cells between which something has changed; last < first where nothing has
+"""
 
 from __future__ import annotations
 
@@ -7,245 +10,361 @@ from numba import njit
 
 from planner_service.kernels.rules import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
 
-
-@njit(cache=True, nogil=True)
-def _sink(keys, items, size):
-    """Restore a binary heap after its last element, keys[size], was taken from the end to replace the top."""
-    key = keys[size]
-    item = items[size]
-    hole = 0
-    while True:
-        child = 2 * hole + 1
-        if child >= size:
-            break
-        if child + 1 < size and keys[child + 1] < keys[child]:
-            child += 1
-        if keys[child] >= key:
-            break
-        keys[hole] = keys[child]
-        items[hole] = items[child]
-        hole = child
-    keys[hole] = key
-    items[hole] = item
+_NOBODY = np.int32(-1)
+_ONE = np.uint64(1)
+_FINE = np.uint64(44)
 
 
 @njit(cache=True, nogil=True)
-def _rise(keys, items, size, key, item):
-    hole = size
-    while hole > 0:
-        above = (hole - 1) >> 1
-        if keys[above] <= key:
-            break
-        keys[hole] = keys[above]
-        items[hole] = items[above]
-        hole = above
-    keys[hole] = key
-    items[hole] = item
+def _rows_of(weight, stride):
+    """`first` and `last` of nothing."""
+    rows = weight.size // stride
+    return np.full(rows, weight.size, np.int64), np.full(rows, -1, np.int64)
 
 
 @njit(cache=True, nogil=True)
-def step_offsets(stride):
-    """What each direction code 0..7 adds to a padded cell index."""
-    return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
-
-
-@njit(cache=True, nogil=True)
-def _offer(weight, cost, offsets, rule, corners, v):
-    """(smallest exit key among the neighbours of v, direction to it)."""
-    best = INF
-    code = NONE
-    for k in (0, 2, 4, 6):
-        u = v + offsets[k]
-        key = cost[u] + weight[u]
-        if key < best:
-            best = key
-            code = np.uint8(k)
-    if rule != RULE_FOUR:
-        for k in (1, 3, 5, 7):
-            if not corners and not max(weight[v + offsets[k - 1]], weight[v + offsets[(k + 1) & 7]]) < INF:
-                continue
-            u = v + offsets[k]
-            key = cost[u] + (weight[u] * SQRT2 if rule == RULE_OCTILE else weight[u])
-            if key < best:
-                best = key
-                code = np.uint8(k)
-    return best, code
-
-
-@njit(cache=True, nogil=True)
-def _wave(weight, cost, offsets, rule, corners, root, candidates, count, limit):
-    """Let better offers spread from `candidates` until no cell is offered less than it costs.
-
-    Returns (cells popped, or -1 beyond `limit`; the largest cost popped; the cells whose cost fell, with
-    repetitions; how many).
-    """
-    capacity = 64 + 2 * count
-    keys = np.empty(capacity, np.float32)
-    items = np.empty(capacity, np.int64)
-    fallen = np.empty(capacity, np.int64)
-    falls = 0
-    size = 0
+def _note(first, last, stride, cells, count):
     for i in range(count):
-        v = candidates[i]
-        if v == root or not weight[v] < INF:
+        row = cells[i] // stride
+        first[row] = min(first[row], cells[i])
+        last[row] = max(last[row], cells[i])
+
+
+@njit(cache=True, nogil=True)
+def _offers(weight, cost, s, begin, end, diagonal, corners, best, code):
+    """The smallest exit key among the neighbours of each cell, and the direction to it; of equals the first of
+    north, east, south, west, then of the diagonals clockwise.
+
+    diagonal  length of such a step, inf where there is none. Free of branches, so that it vectorises
+    """
+    for i in range(begin, end):
+        north = weight[i - s]
+        east = weight[i + _ONE]
+        south = weight[i + s]
+        west = weight[i - _ONE]
+        least = cost[i - s] + north
+        k = np.uint8(0)
+        key = cost[i + _ONE] + east
+        k = np.uint8(2) if key < least else k
+        least = min(least, key)
+        key = cost[i + s] + south
+        k = np.uint8(4) if key < least else k
+        least = min(least, key)
+        key = cost[i - _ONE] + west
+        k = np.uint8(6) if key < least else k
+        least = min(least, key)
+        key = cost[i - s + _ONE] + weight[i - s + _ONE] * diagonal
+        key = key if corners or max(north, east) < INF else INF
+        k = np.uint8(1) if key < least else k
+        least = min(least, key)
+        key = cost[i + s + _ONE] + weight[i + s + _ONE] * diagonal
+        key = key if corners or max(south, east) < INF else INF
+        k = np.uint8(3) if key < least else k
+        least = min(least, key)
+        key = cost[i + s - _ONE] + weight[i + s - _ONE] * diagonal
+        key = key if corners or max(south, west) < INF else INF
+        k = np.uint8(5) if key < least else k
+        least = min(least, key)
+        key = cost[i - s - _ONE] + weight[i - s - _ONE] * diagonal
+        key = key if corners or max(north, west) < INF else INF
+        k = np.uint8(7) if key < least else k
+        least = min(least, key)
+        best[i - begin] = least
+        code[i - begin] = k
+
+
+@njit(cache=True, nogil=True)
+def _diagonal(rule):
+    if rule == RULE_FOUR:
+        return INF
+    return SQRT2 if rule == RULE_OCTILE else np.float32(1.0)
+
+
+@njit(cache=True, nogil=True)
+def _sweep(weight, cost, stride, rule, corners, first, last, floor, lowered, count):
+    """Lower the cells that something changed about, and those next to them, to what they are offered, where they
+    cost `floor` or more and are offered less. Returns lowered (uint32), which it appends them to, and how many."""
+    best = np.empty(stride, np.float32)
+    code = np.empty(stride, np.uint8)
+    capacity = lowered.size
+    for row in range(1, first.size - 1):
+        # Columns, so that three rows can be laid over each other.
+        begin, end = stride, -1
+        for near in range(row - 1, row + 2):
+            if last[near] >= first[near]:
+                begin = min(begin, first[near] - near * stride)
+                end = max(end, last[near] - near * stride)
+        if end < begin:
             continue
-        best, _ = _offer(weight, cost, offsets, rule, corners, v)
-        if best < cost[v]:
-            cost[v] = best
-            _rise(keys, items, size, best, v)
-            size += 1
-            fallen[falls] = v
-            falls += 1
-    popped = 0
-    key = np.float32(0.0)
-    while size > 0:
-        key = keys[0]
-        u = items[0]
-        size -= 1
-        _sink(keys, items, size)
-        if key > cost[u]:
-            continue
-        popped += 1
-        if popped > limit:
-            return -1, key, fallen, falls
-        if max(size, falls) + 16 > capacity:
-            new_keys = np.empty(2 * capacity, np.float32)
-            new_items = np.empty(2 * capacity, np.int64)
-            new_fallen = np.empty(2 * capacity, np.int64)
-            new_keys[:size] = keys[:size]
-            new_items[:size] = items[:size]
-            new_fallen[:falls] = fallen[:falls]
+        begin = row * stride + max(begin - 1, 1)
+        end = row * stride + min(end + 2, stride - 1)
+        _offers(
+            weight, cost, np.uint64(stride), np.uint64(begin), np.uint64(end), _diagonal(rule), corners, best, code
+        )
+        if count + stride > capacity:
+            more = np.empty(2 * capacity + stride, np.uint32)
+            more[:count] = lowered[:count]
+            lowered = more
+            capacity = lowered.size
+        for i in range(begin, end):
+            if best[i - begin] < cost[i] and cost[i] >= floor and weight[i] < INF:
+                cost[i] = best[i - begin]
+                lowered[count] = i
+                count += 1
+    return lowered, count
+
+
+@njit(cache=True, nogil=True)
+def _spread(weight, cost, stride, rule, corners, width, ring, touched, count, first, last, limit):
+    """Let costs that have fallen spread, until no cell is offered less than it costs.
+
+    touched      uint32, the cells whose cost has fallen; `count` of them. Taken over
+    width, ring  of a bucket, s, and how many there are before one that holds the rest. Up to the smallest weight no
+                 cell is taken twice; beyond, costs are right too
+    Notes the cells that have fallen in first and last. Returns (cells taken, or -1 beyond `limit`; the largest
+    cost taken).
+    """
+    across = np.array((-stride, 1, stride, -1)).astype(np.uint64)
+    aslant = np.array((1 - stride, stride + 1, stride - 1, -stride - 1)).astype(np.uint64)
+    # v // stride, by a multiplication: exact while weight.size * stride is below 2**44.
+    per_row = np.uint64((1 << 44) // stride + 1)
+    inverse = np.float32(1.0) / width
+    top = np.float32(ring)
+    heads = np.full(ring + 1, _NOBODY, np.int32)
+    capacity = max(1024, 2 * count)
+    keys = np.empty(capacity, np.float32)
+    items = np.empty(capacity, np.uint32)
+    behind = np.empty(capacity, np.int32)
+    used = 0
+    spare = _NOBODY
+    base = np.float32(0.0)
+    current = ring
+    taken = 0
+    highest = np.float32(0.0)
+    slant = _diagonal(rule)
+    room = np.uint64(touched.size)
+    n = np.uint64(count)
+    while True:
+        if used + np.int64(n) > capacity:
+            capacity = 2 * (used + np.int64(n))
+            new_keys = np.empty(capacity, np.float32)
+            new_items = np.empty(capacity, np.uint32)
+            new_behind = np.empty(capacity, np.int32)
+            new_keys[:used] = keys[:used]
+            new_items[:used] = items[:used]
+            new_behind[:used] = behind[:used]
             keys = new_keys
             items = new_items
-            fallen = new_fallen
-            capacity *= 2
-        straight = key + weight[u]
-        diagonal = key + (weight[u] * SQRT2 if rule == RULE_OCTILE else weight[u])
-        for k in range(0, 8, 2 if rule == RULE_FOUR else 1):
-            v = u + offsets[k]
-            offer = diagonal if k & 1 else straight
-            if not offer < cost[v] or not weight[v] < INF:
+            behind = new_behind
+        for i in range(n):
+            v = touched[i]
+            row = np.int64(np.uint64(v) * per_row >> _FINE)
+            first[row] = min(first[row], np.int64(v))
+            last[row] = max(last[row], np.int64(v))
+            key = cost[v]
+            b = ring if current == ring else max(np.int64(min((key - base) * inverse, top)), current)
+            e = spare
+            if e == _NOBODY:
+                e = used
+                used += 1
+            else:
+                spare = behind[e]
+            keys[e] = key
+            items[e] = v
+            behind[e] = heads[b]
+            heads[b] = e
+        n = np.uint64(0)
+        while current < ring and heads[current] == _NOBODY:
+            current += 1
+        if current == ring:
+            # The buckets begin anew with the lowest cost that waits beyond them.
+            rest = heads[ring]
+            heads[ring] = _NOBODY
+            base = INF
+            e = rest
+            while e != _NOBODY:
+                base = min(base, keys[e])
+                e = behind[e]
+            if base == INF:
+                return taken, highest
+            while rest != _NOBODY:
+                e = rest
+                rest = behind[e]
+                b = np.int64(min((keys[e] - base) * inverse, top))
+                behind[e] = heads[b]
+                heads[b] = e
+            current = 0
+            continue
+        e = heads[current]
+        heads[current] = _NOBODY
+        while e != _NOBODY:
+            u = np.uint64(items[e])
+            key = keys[e]
+            after = behind[e]
+            behind[e] = spare
+            spare = e
+            e = after
+            if key > cost[u]:
                 continue
-            shut = max(weight[u + offsets[k - 1]], weight[u + offsets[(k + 1) & 7]]) == INF
-            if k & 1 and not corners and shut:
-                continue
-            cost[v] = offer
-            _rise(keys, items, size, offer, v)
-            size += 1
-            fallen[falls] = v
-            falls += 1
-    return popped, key, fallen, falls
+            taken += 1
+            highest = max(highest, key)
+            if n + np.uint64(8) > room:
+                more = np.empty(np.int64(2 * room) + 64, np.uint32)
+                more[:n] = touched[:n]
+                touched = more
+                room = np.uint64(touched.size)
+            w = weight[u]
+            straight = key + w
+            diagonal = key + w * slant
+            # No calls in here: of a call's array arguments references are counted, which trebles the time. And
+            # branches, unlike in a flood: few neighbours are offered less, so that these are foretold.
+            for k in range(4):
+                v = u + across[k]
+                if straight < cost[v] and weight[v] < INF:
+                    cost[v] = straight
+                    touched[n] = v
+                    n += _ONE
+                v = u + aslant[k]
+                if (
+                    diagonal < cost[v]
+                    and weight[v] < INF
+                    and (corners or max(weight[u + across[k]], weight[u + across[(k + 1) & 3]]) < INF)
+                ):
+                    cost[v] = diagonal
+                    touched[n] = v
+                    n += _ONE
+        if taken > limit:
+            return -1, highest
 
 
 @njit(cache=True, nogil=True)
-def _eased(weight, offsets, changed, before, out, count):
-    """Append the cells that may be offered less since the weights of `changed` fell. Returns how many there are."""
-    for i in range(changed.size):
-        x = changed[i]
-        if weight[x] < before[i]:
-            out[count] = x
-            count += 1
-            for k in range(8):
-                out[count] = x + offsets[k]
-                count += 1
-    return count
-
-
-@njit(cache=True, nogil=True)
-def lower(weight, cost, stride, rule, corners, changed, before, limit):
+def lower(weight, cost, stride, rule, corners, changed, before, width, ring, limit):
     """After weights fell, let costs fall: no cell costs more than what any neighbour offers, where so before.
 
+    width, ring  as `_spread` says
     Needs no parents, and no root but a cell that costs least. Returns cells visited, or -1 beyond `limit`; then
     cost is of no use any more.
     """
-    offsets = step_offsets(stride)
-    candidates = np.empty(9 * changed.size, np.int64)
-    count = _eased(weight, offsets, changed, before, candidates, 0)
-    popped, _, _, _ = _wave(weight, cost, offsets, rule, corners, -1, candidates, count, limit)
-    return popped
+    first, last = _rows_of(weight, stride)
+    for i in range(changed.size):
+        if weight[changed[i]] < before[i]:
+            _note(first, last, stride, changed[i : i + 1], 1)
+    lowered = np.empty(1024, np.uint32)
+    lowered, count = _sweep(weight, cost, stride, rule, corners, first, last, np.float32(-INF), lowered, 0)
+    taken, _ = _spread(weight, cost, stride, rule, corners, width, ring, lowered, count, first, last, limit)
+    return taken
 
 
 @njit(cache=True, nogil=True)
-def repair(weight, cost, parent, stride, rule, corners, root, changed, before, limit, state):
-    """Bring a tree up to date after the weights of `changed` cells became what they are now.
+def _detach(weight, cost, parent, stride, corners, changed, before, limit):
+    """Take cost and parent from the cells whose way leads over a cell that got dearer.
 
-    changed  int64    padded cells, without repetition; before: float32, their weights when the tree was right
-    state    uint8    scratch, zero; zero again afterwards
-    Cells whose way led through a dearer cell lose their cost and find a new one; the rest only improves. An exact
-    tree is exact afterwards, equal to one grown from scratch. Returns (cells visited, the largest new cost); -1
-    cells if more than `limit` are concerned: then the tree is of no use any more and must be grown.
+    Returns them (int64) and how many; more than `limit` if that is so, and then not all.
     """
-    offsets = step_offsets(stride)
-    capacity = 64 + 12 * changed.size
-    affected = np.empty(capacity, np.int64)
+    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
+    capacity = 64 + 16 * changed.size
+    detached = np.empty(capacity, np.int64)
     count = 0
     for i in range(changed.size):
         x = changed[i]
         if not weight[x] > before[i]:
             continue
         lethal = not weight[x] < INF
-        if lethal and state[x] == 0 and x != root:
-            state[x] = 1
-            affected[count] = x
+        if lethal and parent[x] != NONE:
+            parent[x] = NONE
+            detached[count] = x
             count += 1
         for k in range(8):
             v = x + offsets[k]
             way = parent[v]
-            if way == NONE or state[v] != 0:
+            if way == NONE:
                 continue
             squeezed = False
             if lethal and not corners and way & 1:
                 squeezed = v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x
             if squeezed or way == (k + 4) & 7:
-                state[v] = 1
-                affected[count] = v
+                parent[v] = NONE
+                detached[count] = v
                 count += 1
     done = 0
     while done < count and count <= limit:
-        u = affected[done]
-        done += 1
         if count + 8 > capacity:
-            new_affected = np.empty(2 * capacity, np.int64)
-            new_affected[:count] = affected[:count]
-            affected = new_affected
+            more = np.empty(2 * capacity, np.int64)
+            more[:count] = detached[:count]
+            detached = more
             capacity *= 2
+        u = np.uint64(detached[done])
+        done += 1
+        # A cell has one parent, so that none is found twice.
         for k in range(8):
-            v = u + offsets[k]
-            if state[v] == 0 and parent[v] == (k + 4) & 7:
-                state[v] = 1
-                affected[count] = v
-                count += 1
-    for i in range(count):
-        state[affected[i]] = 0
-    if count > limit:
+            v = np.uint64(np.int64(u) + offsets[k])
+            detached[count] = v
+            count += parent[v] == (k + 4) & 7
+        parent[u] = NONE
+        cost[u] = INF
+    return detached, count
+
+
+@njit(cache=True, nogil=True)
+def repair(weight, cost, parent, stride, rule, corners, root, changed, before, width, ring, most):
+    """Bring a tree up to date after the weights of `changed` cells became what they are now.
+
+    changed      int64    padded cells, without repetition; before: float32, their weights when the tree was right
+    width, ring  as `_spread` says
+    most         (detached, with_eased, taken): how many cells may lose their way, the same where some cells got
+                 cheaper, and how many may find another besides as many as lost theirs
+    Cells whose way led through a dearer cell lose their cost and find a new one; the rest only improves. An exact
+    tree is exact afterwards, equal to one grown from scratch. Returns (cells visited, the largest new cost); -1
+    cells where that is more than `most`: then the tree is of no use any more and must be grown.
+    """
+    eased_first, eased_last = _rows_of(weight, stride)
+    eased = False
+    for i in range(changed.size):
+        if weight[changed[i]] < before[i]:
+            _note(eased_first, eased_last, stride, changed[i : i + 1], 1)
+            eased = True
+    most_detached = most[1] if eased else most[0]
+    detached, many = _detach(weight, cost, parent, stride, corners, changed, before, most_detached)
+    if many > most_detached:
         return -1, INF
-    for i in range(count):
-        cost[affected[i]] = INF
-    candidates = np.empty(count + 9 * changed.size, np.int64)
-    candidates[:count] = affected[:count]
-    total = _eased(weight, offsets, changed, before, candidates, count)
-    popped, highest, fallen, falls = _wave(weight, cost, offsets, rule, corners, root, candidates, total, limit)
-    if popped < 0:
+    first, last = _rows_of(weight, stride)
+    lowered = np.empty(1024, np.uint32)
+    count = 0
+    if many:
+        _note(first, last, stride, detached, many)
+        lowered, count = _sweep(weight, cost, stride, rule, corners, first, last, INF, lowered, count)
+    if eased:
+        floor = np.float32(-INF)
+        lowered, count = _sweep(weight, cost, stride, rule, corners, eased_first, eased_last, floor, lowered, count)
+    taken, highest = _spread(
+        weight, cost, stride, rule, corners, width, ring, lowered, count, first, last, 2 * many + most[2]
+    )
+    if taken < 0:
         return -1, INF
     # Whoever stands beside a cell that changed may have a better neighbour now.
-    for part in range(3):
-        many = (changed.size, count, falls)[part]
-        for i in range(many):
-            x = changed[i] if part == 0 else (affected[i] if part == 1 else fallen[i])
-            if state[x] == 2:
-                continue
-            state[x] = 2
-            for k in range(-1, 8):
-                v = x if k < 0 else x + offsets[k]
-                if weight[v] < INF and v != root:
-                    _, code = _offer(weight, cost, offsets, rule, corners, v)
-                    parent[v] = code if cost[v] < INF else NONE
-                elif v != root:
-                    parent[v] = NONE
-    for i in range(changed.size):
-        state[changed[i]] = 0
-    for i in range(count):
-        state[affected[i]] = 0
-    for i in range(falls):
-        state[fallen[i]] = 0
-    return popped + count, highest
+    _note(first, last, stride, changed, changed.size)
+    _point(weight, cost, parent, stride, rule, corners, first, last)
+    parent[root] = NONE
+    return taken + many, highest
+
+
+@njit(cache=True, nogil=True)
+def _point(weight, cost, parent, stride, rule, corners, first, last):
+    """The best neighbour becomes the parent, of the cells that something changed about and those next to them."""
+    best = np.empty(stride, np.float32)
+    code = np.empty(stride, np.uint8)
+    for row in range(1, first.size - 1):
+        begin, end = stride, -1
+        for near in range(row - 1, row + 2):
+            if last[near] >= first[near]:
+                begin = min(begin, first[near] - near * stride)
+                end = max(end, last[near] - near * stride)
+        if end < begin:
+            continue
+        begin = row * stride + max(begin - 1, 1)
+        end = row * stride + min(end + 2, stride - 1)
+        _offers(
+            weight, cost, np.uint64(stride), np.uint64(begin), np.uint64(end), _diagonal(rule), corners, best, code
+        )
+        for i in range(begin, end):
+            parent[i] = code[i - begin] if max(cost[i], best[i - begin]) < INF else NONE
