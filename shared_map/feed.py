@@ -24,13 +24,13 @@ _JOIN_TIMEOUT_S = 5.0
 _JOIN_TRIES = 5
 _GRACE_NS = NS_PER_S // 10
 """A digest may overtake the sets that it tells of: only what is missing after this is asked for."""
-_RETRY_NS = NS_PER_S // 4
+_RETRY_NS = NS_PER_S * 15 // 100
 _TELL_CHANGES_NS = NS_PER_S // 5
-_RECENT_NS = NS_PER_S
+_RECENT_NS = 2 * NS_PER_S
 _JOIN_RETRY_NS = NS_PER_S // 2
 _NAME_AGAIN_NS = 60 * NS_PER_S
 _ASKS_AT_ONCE = 16
-_TRIES = 6
+_TRIES = 10
 _OFFERS_AT_ONCE = 256
 _QUANTUM = 16_384
 """Marks of one author that are merged before its quota is looked at again."""

@@ -163,6 +163,9 @@ class MapReplica:
             return [received]
         newest: dict[tuple[int, str], MarkSet] = {}
         for each in received:
+            if self._foreign(each):  # it must not stand in the way of an older one that is not
+                self.counts["sets_refused"] += 1
+                continue
             held = newest.setdefault((each.tile, each.author), each)
             if held is not each:
                 self.counts["sets_repeated"] += 1
@@ -213,7 +216,7 @@ class MapReplica:
 
     def _admissible(self, received: MarkSet, held: MarkSet | None) -> bool:
         """Whether a set is part of this map and news; if not, why is counted."""
-        if received.tile >= self._tile_count or (self._ragged and fault(received, self.grid) is not None):
+        if self._foreign(received):
             self.counts["sets_refused"] += 1
             return False
         if received.author != self.author:
@@ -228,6 +231,9 @@ class MapReplica:
             self.counts["sets_repeated"] += 1
             return False
         return True
+
+    def _foreign(self, received: MarkSet) -> bool:
+        return received.tile >= self._tile_count or (self._ragged and fault(received, self.grid) is not None)
 
     def _bury(self, burial: MarkSet, held: MarkSet | None) -> NDArray[np.uint32]:
         """Nothing that an author which is gone said about a tile counts any more: forget that it said anything."""

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import pytest
 
+from shared_map.bulk import packed
 from swarm.bus import (
     Appeared,
     Asked,
@@ -16,6 +17,7 @@ from swarm.bus import (
     Disappeared,
     Event,
     Heard,
+    HeardMany,
     LinkChanged,
     Replied,
 )
@@ -108,6 +110,32 @@ def test_a_process_hears_itself(world: World):
     a.publish(POSE, pose(), target="t0")
     world.until(lambda: box)
     assert [event.message for event in box] == [pose()]
+
+
+def test_samples_that_wait_are_heard_together_in_order_with_their_keys_and_without_garbage(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    box = Box()
+    b.subscribe(MARKS, box, together=True)
+    world.settle()
+    sent = [marks("a0.1", tile) for tile in range(40)]
+    for each in sent:
+        a.publish(MARKS, each, region=0, tile=each.tile, author="a0.1")
+        world.put_bytes(a, MARKS, b"garbage", region="0", tile=str(each.tile), author="a0.1")
+    world.until(lambda: sum(len(event.samples) for event in box) >= 40)
+    heard = [sample for event in box.of(HeardMany) for sample in event.samples]
+    assert heard == [(f"marks/0/{each.tile}/a0.1", each) for each in sent]
+    world.until(lambda: b.counts["payloads_dropped"] == 40)
+    assert len(box.of(HeardMany)) == len(box)
+
+
+def test_an_answer_may_carry_many_values_where_the_topic_says_so(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    [many] = packed([marks("a0.1", tile) for tile in range(3)])
+    a.serve(MARKS, answering((many, {"region": "-", "tile": "-"})), author="a0.1")
+    world.settle()
+    [reply] = asked(world, b, MARKS, MarksRequest(bulk=True)).of(Replied)
+    assert reply.message == many
+    assert reply.fields == {"region": "-", "tile": "-", "author": "a0.1"}
 
 
 def test_an_ended_subscription_hears_nothing_more_and_the_others_go_on(world: World):

@@ -6,7 +6,7 @@ import random
 from collections.abc import Sequence
 
 import numpy as np
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from shared_map.feed import MapFeed
@@ -24,7 +24,9 @@ from swarm.messages import FOLDS, MarkKind, MarkSet
 from swarm.role import RoleSetup
 from swarm.scheduler import Scheduler
 
-settings.register_profile("shared-cores", deadline=None)  # a busy machine is no failed law
+settings.register_profile(
+    "shared-cores", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)  # a busy machine is no failed law
 settings.load_profile("shared-cores")
 
 GRID = GridSpec(40, 70, 10.0)

@@ -109,7 +109,7 @@ def lost_while_coming_and_going(seed: int, marks: int, agents: int = 6) -> dict[
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_after_loss_and_after_a_partition_replicas_are_equal_within_seconds(seed: int) -> None:
-    assert after_loss_s(seed) <= 8
+    assert after_loss_s(seed) <= 3
     assert after_partition_s(seed) <= 2
 
 

@@ -11,19 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from map_strategies import Composite, FeedService, LossyLinks, MapSwarm, set_of
 
+from shared_map.bulk import packed
 from shared_map.feed import MapFeed
 from shared_map.keeper import KeeperStore
 from shared_map.replica import MapReplica
 from shared_map.service import KeeperService
 from shared_map.terrain import terrain_of_pace
-from swarm.bus import Heard
+from swarm.bus import Asked, Heard
 from swarm.clock import MonotonicClock
 from swarm.config import MapConfig, NetworkConfig, Scenario
-from swarm.messages import MarkKind
+from swarm.messages import DIGEST_ROW, Digest, MarkKind, MarksRequest
 from swarm.process import Inbox, Process
 from swarm.role import RoleSetup
 from swarm.stats import Counters
-from swarm.topics import MARKS, NOTE
+from swarm.topics import DIGEST, MARKS, NOTE
 from swarm.zenoh_bus import ZenohBus, open_bus
 
 LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
@@ -121,6 +122,40 @@ def test_nobody_speaks_under_anothers_key() -> None:
     assert listener.replica.counts["sets_refused"] == 2
 
 
+def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
+    swarm = MapSwarm()
+    liar = swarm.network.bus("liar")
+    [lies] = packed([set_of("a1.1", tile, 9, {5: (LETHAL, 0, 1)}) for tile in range(3)])
+    [truth] = packed([set_of("liar", 1, 1, {6: (LETHAL, 0, 1)})])
+
+    def answer(event: object) -> None:
+        assert isinstance(event, Asked)
+        event.answer(lies, region="-", tile="-", author="liar")
+        event.answer(truth, region="-", tile="-", author="liar")
+        event.end()
+
+    liar.serve(MARKS, answer, author="liar")
+    late = swarm.listener("late")
+    swarm.run(0.1)
+    assert [(each.author, each.tile) for each in late.replica.answer(MarksRequest())] == [("liar", 1)]
+    assert late.replica.counts["sets_refused"] == 1
+
+
+def test_digests_without_end_are_held_within_bounds() -> None:
+    swarm = MapSwarm()
+    listener = swarm.listener("p")
+    hostile = swarm.network.bus("hostile")
+    rows = np.array([(tile, 1, 1) for tile in range(6)], DIGEST_ROW).tobytes()
+    for n in range(6000):
+        digest = Digest(author=f"x{n}", role="agent", held={f"x{n}": rows})
+        hostile.publish(DIGEST, digest, author=f"x{n}")
+    swarm.run(0.01)
+    assert len(listener.feed._claims) <= 4096
+    assert listener.feed._claim_bytes == sum(claim.size for claim in listener.feed._claims.values())
+    swarm.run(10)
+    assert listener.feed._claim_bytes == 0
+
+
 def test_events_of_others_are_left_to_others() -> None:
     swarm = MapSwarm()
     listener = swarm.listener("p")
@@ -149,7 +184,7 @@ def test_with_30_percent_dropped_10_percent_doubled_and_500_ms_jitter_replicas_a
         write(authors[author], swarm, [cell], kind)
         swarm.run(pause_s)
     waited_s = 0.0
-    everybody = [*authors, listener, keeper]
+    everybody: list[FeedService | KeeperService] = [*authors, listener, keeper]
     while not all_equal(everybody) and waited_s < 30:
         swarm.run(0.5)
         waited_s += 0.5

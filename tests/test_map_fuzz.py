@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from map_strategies import GRID, Composite, MapSwarm, held_winners, naive_winners, set_of
 
+from shared_map.bulk import packed, unpacked
 from shared_map.keeper import KeeperStore
 from shared_map.marks import fault
 from shared_map.replica import MapReplica
-from swarm.codec import decode, encode
+from swarm.codec import decode, decode_many, encode
 from swarm.errors import ProtocolError
-from swarm.messages import DIGEST_ROW, Digest, MarkKind, MarkSet, MarksRequest
+from swarm.messages import DIGEST_ROW, Digest, MarkKind, MarkSet, MarkSets, MarksRequest
 from swarm.topics import DIGEST, MARKS
 
 MUTATIONS = int(os.environ.get("MAP_MUTATIONS", "20000"))
@@ -25,7 +26,11 @@ FEW = MarksRequest(authors=["a1.1"], tiles=[0, 1])
 
 
 def examples() -> list[MarkSet]:
-    some = {0: (MarkKind.LETHAL, 0.0, 5), 3: (MarkKind.PACE, 2.0, 6), 9: (MarkKind.CLEAR, 0.0, 7)}
+    some: dict[int, tuple[int, float, int]] = {
+        0: (MarkKind.LETHAL, 0.0, 5),
+        3: (MarkKind.PACE, 2.0, 6),
+        9: (MarkKind.CLEAR, 0.0, 7),
+    }
     return [set_of(author, tile, 1, some) for author in ("a1.1", "b2.2") for tile in range(3)]
 
 
@@ -67,6 +72,38 @@ def test_mutated_sets_merge_by_the_rules_or_not_at_all() -> None:
         assert held_winners(replicas[0]) == naive_winners(lasting)
     assert replicas[0].answer(MarksRequest()) == replicas[1].answer(MarksRequest())
     assert held_winners(replicas[0]) == held_winners(replicas[1])
+
+
+def test_mutated_messages_of_many_sets_merge_by_the_rules_or_not_at_all() -> None:
+    chance = random.Random(6)
+    payloads = [encode(message) for message in packed(examples())]
+    through: list[MarkSet] = []
+    for _ in range(MUTATIONS):
+        try:
+            through.extend(unpacked(decode(mutated(chance.choice(payloads), chance), MarkSets)))
+        except ProtocolError:
+            continue
+    assert len(through) > MUTATIONS // 100, "too few came through to say anything"
+    singly, together = MapReplica(GRID, Composite()), MapReplica(GRID, Composite())
+    for each in through:
+        each.check()  # what the columns pass, each set passes by itself
+        singly.merge(each)
+    for first in range(0, len(through), 500):
+        together.merge_many(through[first : first + 500])
+    assert together.answer(MarksRequest()) == singly.answer(MarksRequest())
+    assert held_winners(together) == held_winners(singly)
+
+
+def test_mutated_payloads_that_wait_together_pass_the_door_as_each_would_alone() -> None:
+    chance = random.Random(7)
+    payloads = [encode(each) for each in examples()]
+    for _ in range(MUTATIONS // 1000):
+        some = [mutated(chance.choice(payloads), chance) if n % 3 else payloads[0] for n in range(50)]
+        for payload, found in zip(some, decode_many(some, MarkSet), strict=True):
+            try:
+                assert decode(payload, MarkSet) == found
+            except ProtocolError:
+                assert isinstance(found, ProtocolError)
 
 
 @pytest.mark.parametrize("topic", [MARKS, DIGEST])

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from swarm.bus import Event, Heard, LinkChanged, WorkDone
+from swarm.bus import Event, Heard, HeardMany, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
 from swarm.messages import Note, TargetPose
 from swarm.process import Inbox, Process, ThreadWorker
@@ -97,6 +97,42 @@ def test_many_threads_may_post():
         texts = [e.message.text for e in taken if e.topic is NOTE and e.message.text.startswith(name)]
         assert texts == [f"{name}{n}" for n in range(500)]
         assert [e.message.seq for e in taken if e.fields.get("target") == name] == [499]
+
+
+def batch(n: int) -> HeardMany:
+    return HeardMany(NOTE, [(f"note/agent/a{n}", note(str(n)).message)])
+
+
+def test_who_brings_batches_waits_until_the_owner_has_kept_up():
+    inbox = Inbox()
+    brought: list[int] = []
+
+    def bring() -> None:
+        for n in range(10):
+            inbox.post(batch(n))
+            brought.append(n)
+
+    bringer = threading.Thread(target=bring)
+    bringer.start()
+    taken = []
+    while len(taken) < 10:
+        event = inbox.take(1.0)
+        assert isinstance(event, HeardMany)
+        taken.append(event)
+        assert len(brought) <= len(taken) + 3
+    bringer.join(1.0)
+    assert taken == [batch(n) for n in range(10)]
+
+
+def test_nobody_waits_for_an_owner_that_has_ended():
+    inbox = Inbox()
+    bringer = threading.Thread(target=lambda: [inbox.post(batch(n)) for n in range(5)])
+    bringer.start()
+    bringer.join(0.1)
+    assert bringer.is_alive()
+    inbox.close()
+    bringer.join(1.0)
+    assert not bringer.is_alive()
 
 
 def test_a_take_waits_for_a_post_and_no_longer():
