@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from shared_map.bulk import packed, unpacked
 from shared_map.digest import Held
+from shared_map.marks import region_tiles
 from shared_map.quota import Quota
 from shared_map.replica import MapReplica, Merged, PublishSet
 from swarm.bus import Asked, AskEnded, Bus, Event, Heard, HeardMany, LinkChanged, Post, Replied
@@ -19,6 +20,7 @@ from swarm.topics import DIGEST, MARKS
 log = logging.getLogger(__name__)
 
 _JOIN = "map-join"
+_ENTER = "map-enter"
 _RESYNC = "map-resync:"
 _JOIN_TIMEOUT_S = 5.0
 _JOIN_TRIES = 5
@@ -76,6 +78,7 @@ class MapFeed:
         serves_all: bool = False,
         held: Callable[[], dict[str, bytes]] | None = None,
         on_accepted: Callable[[MarkSet], None] | None = None,
+        near: bool = False,
     ) -> None:
         self.replica = replica
         self.joined = False
@@ -86,6 +89,7 @@ class MapFeed:
         self._serves_all = serves_all
         self._held = held or replica.own_digest
         self._on_accepted = on_accepted
+        self._regions: frozenset[int] | None = frozenset() if near else None
         self._quota = Quota(config.author_marks_per_s, config.total_marks_per_s)
         self._named_ns: dict[str, int] = {}
         self._digest_ns = int(config.digest_s * NS_PER_S)
@@ -104,13 +108,31 @@ class MapFeed:
     def start(self, now_ns: int) -> None:
         """Subscribe, serve, and ask for all that was said before."""
         self._started_ns = now_ns
-        self._bus.subscribe(MARKS, self._post, together=True)
+        if self._regions is None:
+            self._bus.subscribe(MARKS, self._post, together=True)
+            self._join()
         self._bus.subscribe(DIGEST, self._post)
         if self._serves_all:
             self._bus.serve(MARKS, self._post)
         elif self.replica.author is not None:
             self._bus.serve(MARKS, self._post, author=self.replica.author)
-        self._join()
+
+    def look_at(self, regions: frozenset[int]) -> None:
+        """Of a feed that holds only what is `near`: take part in these regions from now on. What was said there
+        before is fetched, what others said elsewhere forgotten; an answer that is lost is noticed by digests."""
+        before = self._regions
+        if before is None or regions == before:
+            return
+        self._regions = regions
+        new, grid = sorted(regions - before), self.replica.grid
+        for region in new:
+            self._bus.subscribe(MARKS, self._post, together=True, region=region)
+        for region in sorted(before - regions):
+            self._bus.unsubscribe(MARKS, region=region)
+        self.replica.limit(regions)
+        tiles = [tile for region in new for tile in region_tiles(grid, region)]
+        if tiles:
+            self._bus.ask(MARKS, MarksRequest(tiles=tiles, bulk=True), self._post, tag=_ENTER)
 
     def handle(self, event: Event, now_ns: int) -> bool:
         """True if the event was about the map and nobody else's business."""
@@ -123,6 +145,10 @@ class MapFeed:
                 self._merge(self._told(event), measured=False)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag.startswith(_RESYNC):
                 self._admit(self._told(event), now_ns)
+            case Replied(tag=tag, topic=topic) if topic is MARKS and tag == _ENTER:
+                self._merge(self._told(event), measured=False)
+            case AskEnded(tag=tag) if tag == _ENTER:
+                self.joined = True
             case AskEnded(tag=tag) if tag == _JOIN:
                 self._join_ended(event, now_ns)
             case AskEnded(tag=tag) if tag.startswith(_RESYNC):

@@ -251,6 +251,21 @@ class MapReplica:
         self.room.free(held)
         return self._apply(held.tile, changed, False)
 
+    def limit(self, regions: frozenset[int]) -> None:
+        """From now on hold what is said about these regions only, besides our own: the rest is forgotten, and its
+        cells are again as the prior map and we ourselves say."""
+        self.reading.limit(regions)
+        for tile in [tile for tile in self._tiles if not self.reading.concerns(tile)]:
+            before = resolve(self.sets(tile), self._now_ns)
+            sets = self._tiles[tile]
+            for each in [each for name, each in sets.items() if name != self.author]:
+                del sets[each.author]
+                self.ledger.drop(each.author, tile)
+                self.room.free(each)
+            if not sets:
+                del self._tiles[tile]
+            self._apply(tile, changes(before, resolve(self.sets(tile), self._now_ns)), False)
+
     def _crowd_out(self, received: MarkSet) -> None:
         self.counts["sets_without_room"] += 1
         self.crowded_out = received.author

@@ -75,7 +75,7 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     rows, cols    size of a synthetic terrain; relief_m from its lowest to its highest cell, rivers across it
     """
 
-    source: str = "jacksboro"
+    source: Annotated[str, Meta(min_length=1)] = "jacksboro"
     photo: str | None = None
     labels: str | None = None
     resolution_m: Positive | None = None
@@ -208,6 +208,8 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
 class MapConfig(Section, frozen=True, kw_only=True):
     """How the shared map is replicated.
 
+    interest            all: agents hold all marks; near: those of the regions within interest_m of their vehicles
+                        only. Planners, keepers and the monitor hold all
     publish_hz          a tile's set is put at most this often by its author
     digest_s            every replica tells this often what it holds
     author_marks_per_s  who changes more cells than this for ten seconds is heard with delay, and named
@@ -217,6 +219,8 @@ class MapConfig(Section, frozen=True, kw_only=True):
     fold_keep_s         what was folded can be put back for so long
     """
 
+    interest: Literal["all", "near"] = "all"
+    interest_m: Positive = 2000.0
     publish_hz: Positive = 10.0
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0

@@ -101,7 +101,8 @@ class AgentService:
             publish_hz=scenario.map.publish_hz,
             reading=Reading(grid, readable),
         )
-        self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role)
+        near = scenario.map.interest == "near"
+        self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role, near=near)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
@@ -110,6 +111,9 @@ class AgentService:
         lead_cells = scenario.vehicles.claim_cells + _GROUND_LEAD_CELLS
         self._plots = Interest(grid, lead_cells, square_cells=PLOT_CELLS)
         self._regions = Interest(grid, lead_cells)
+        # What is written must be in sight of what others say about the place.
+        reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
+        self._map_near = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._listens_to: frozenset[str] = frozenset()
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
         self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, readable)
@@ -290,6 +294,7 @@ class AgentService:
         ground = self._ground
         places = self._agent.places
         ground.wish(self._plots.update(places))
+        self._feed.look_at(self._map_near.update(places))
         regions = self._regions.update(places)
         for region in sorted(regions - self._looks_at):
             self._bus.subscribe(FLEET, self._post, region=region)
