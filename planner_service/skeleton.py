@@ -1,4 +1,4 @@
-"""The coarse strategies' skeleton: the cells that carry the traffic, and how all others reach them."""
+"""The coarse strategies' skeleton: which cells carry how much traffic."""
 
 from __future__ import annotations
 
@@ -7,63 +7,55 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.ground import Ground
-from planner_service.growth import flood
-from planner_service.kernels import coarse, repair
-from planner_service.kernels.flood import point_to_parents
+from planner_service.ground import Changes, Ground
+from planner_service.kernels import coarse
 from planner_service.kernels.rules import NONE
-from shared_map.arrays import Floats
+
+LEAST = 64
+"""The ways of so many cells make a cell part of the skeleton."""
+SAMPLES = 8
+"""Trees that vote. Half as many take half the time to find, and are a third further from the optimum."""
+INNER = 256
+"""The innermost ring, where all of the skeleton takes part, reaches at most so many cells from the target."""
+AROUND = 8
+"""Cells around a change that all take part from then on, so that ways around it are found."""
+EVERYWHERE = 255
+WORN_SHARE = 16
+"""A skeleton is found anew when one cell in so many takes part because of changes."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Skeleton:
-    """The cells that carry the traffic, connected, and how all others reach them. Padded arrays.
+    """Advice, not knowledge: whatever it says, costs and passability are read from the map as it is now. So marks
+    never make it wrong, and only wear it.
 
-    cells   uint8    1 on the skeleton
-    attach  float32  s; what the way to the skeleton costs; inf where there is none
-    parent  uint8    direction of that way; 255 on the skeleton
-    anchor  uint32   the skeleton cell it leads to
-    reach   s; no way there costs more
+    level  uint8, padded: 0 if a cell carries no traffic, 1 from `LEAST` cells on, one more for each four times that
+    worn   cells that take part because the map changed around them
     """
 
-    cells: NDArray[np.uint8]
-    attach: Floats
-    parent: NDArray[np.uint8]
-    anchor: NDArray[np.uint32]
-    reach: float
+    level: NDArray[np.uint8]
+    worn: int = 0
+
+    def learn(self, ground: Ground, changes: Changes) -> bool:
+        """Let all cells around a change take part. False once the skeleton should be found anew."""
+        level = self.level.reshape(-1, ground.stride)
+        rows, cols = np.divmod(changes.cells, ground.stride)
+        for row, col in np.unique(np.stack((rows // AROUND, cols // AROUND), axis=1), axis=0).tolist():
+            part = np.s_[
+                max(AROUND * (row - 1), 0) : AROUND * (row + 2), max(AROUND * (col - 1), 0) : AROUND * (col + 2)
+            ]
+            self.worn += int(np.count_nonzero(level[part] != EVERYWHERE))
+            level[part] = EVERYWHERE
+        return self.worn * WORN_SHARE <= ground.size
 
 
-def find_skeleton(ground: Ground, samples: int = 8) -> Skeleton:
-    """Let exact trees of cells all over the ground vote: where many ways pass in one of them is skeleton."""
-    grid = ground.grid
-    rule, corners, stride = ground.rule, ground.corners, ground.stride
+def find_skeleton(ground: Ground) -> Skeleton:
+    """Let exact trees of cells all over the ground vote: a cell's traffic is the most that passes it in any."""
     passable = np.flatnonzero(ground.weight < np.inf)
-    roots = passable[np.linspace(0, passable.size - 1, samples).astype(np.int64)]
-    roots = np.concatenate((passable[passable.size // 2 :][:1], roots))
-    cells = np.zeros(ground.size, np.uint8)
+    level = np.zeros(ground.size, np.uint8)
     cost = np.empty(ground.size, np.float32)
     parent = np.full(ground.size, NONE, np.uint8)
-    least = max(16, max(grid.rows, grid.cols) // 8)
-    first = int(roots[0])
-    flood(ground.weight, ground.low, ground.high, stride, first, rule, corners, cost, parent)
-    connected = [int(root) for root in roots[1:] if cost[root] < np.inf]
-    cells[first] = 1
-    coarse.mark_traffic(parent, stride, least, cells)
-    for root in connected:
-        # The way between two roots joins what their trees vote for.
-        coarse.mark_way(parent, stride, root, cells)
-    for root in connected:
-        flood(ground.weight, ground.low, ground.high, stride, root, rule, corners, cost, parent)
-        coarse.mark_traffic(parent, stride, least, cells)
-    chosen = np.flatnonzero(cells)
-    attach = np.full(ground.size, np.inf, np.float32)
-    attach[chosen] = 0.0
-    before = np.full(chosen.size, np.inf, np.float32)
-    repair.lower(ground.weight, attach, stride, rule, corners, chosen, before, *ground.buckets, 4 * ground.size)
-    box = (0, 0, grid.rows, grid.cols)
-    point_to_parents(ground.weight, attach, stride, rule, corners, first, box, parent)
-    parent[chosen] = NONE
-    anchor = np.zeros(ground.size, np.uint32)
-    coarse.find_anchors(parent, stride, cells, anchor)
-    finite = attach[attach < np.inf]
-    return Skeleton(cells, attach, parent, anchor, float(finite.max(initial=0.0)))
+    for root in passable[np.linspace(0, passable.size - 1, SAMPLES + 2).astype(np.int64)[1:-1]].tolist():
+        ground.grow(root, cost, parent)
+        coarse.mark_levels(parent, ground.stride, LEAST, level)
+    return Skeleton(level)

@@ -2,11 +2,12 @@
 
     full              the exact tree, every time
     variable_range    the paper's: a window around the target, as wide as its movement asks for
-    rotation          small windows every move, and every `full_every` moves a full growth on a worker
-    multi_resolution  every move: all cells near the target, far away only those that carry the traffic
+    rotation          windows of doubling width, and every `full_every` moves a full growth on a worker
+    multi_resolution  windows near the target; beyond, in rings of doubling width, only cells that carry traffic
     variable_range+multi_resolution
-                      the paper's combination: small windows, and the coarse tree where a window gets wide
-    auto              full while it fits `cpu_budget`, then rotation as often as that allows
+                      the paper's combination: its windows, and the rings where a window would get wide
+    auto              full while it fits `cpu_budget`, then rotation as often as that allows; rings where it is too
+                      seldom
 
 `TargetTree` has no thread, no clock and no bus: `full_job` returns the long work as a closure for a worker, `adopt`
 takes its result. Whatever happened, the tree that `routes` reads has no cycle and crosses no lethal cell.
@@ -22,6 +23,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.auto import Auto
 from planner_service.bounds import LowerBounds
 from planner_service.directed import ground_of
 from planner_service.ground import Changes, check_pace
@@ -60,8 +62,12 @@ MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
 INLINE_NS = 100_000_000
 """A forced range is grown at once where a full growth takes less."""
+REPAIR_SHARE = 100
+"""A repair that concerns more than one cell in so many gives way to a full growth."""
 WIDE_SHARE = 16
-"""A window over one cell in so many gives way to a coarse growth, where there is a skeleton for it."""
+"""A window over one cell in so many gives way to the rings, where there is a skeleton for it."""
+FINE_SHARE = 16
+"""How far the fine windows of `multi_resolution` reach, as a share of the map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +123,12 @@ class TargetTree:
         self._stale = True
         self._moves = 0
         self._job_out = False
-        # Of the coarse strategies. It holds for the map on which it was found, so that a change unmakes it.
         self._skeleton: Skeleton | None = None
         self._full_ns = self.measured_model_ns()
         self._rungs = Rungs(grid, 4 << config.k_min)
         self._full_root = 0
+        self._auto = Auto(config.cpu_budget * 1e9 / config.tick_hz)
+        self._auto.observe(self._full_ns, self._widest)
         self._bounds = LowerBounds(self._ground)
 
     # --- keeping up ---------------------------------------------------------------------------------------------
@@ -159,7 +166,7 @@ class TargetTree:
         serves_it = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if serves_it else None
         self._job_out = True
-        wants_skeleton = self._coarse
+        wants_skeleton = self._coarse and self._skeleton is None
 
         def job() -> GrownTree:
             ground = ground_of(grid, config, climb)
@@ -206,7 +213,7 @@ class TargetTree:
         self._full_at(grown.target_cell)
         self._bounds.take(grown.cost.copy())
         self._stale = False
-        self._skeleton = None if since.cells.size else grown.skeleton
+        self._renew_skeleton(grown.skeleton, since)
         moved = target_cell != tree.root
         if moved and not self._windows:
             return self._grow_full(target_cell)
@@ -237,6 +244,7 @@ class TargetTree:
     def observe_full_ns(self, took_ns: int) -> None:
         """What a full growth really took, for `auto` to choose by. A simulation does not call it."""
         self._full_ns = max(1, took_ns)
+        self._auto.observe(self._full_ns, self._widest)
 
     def measured_model_ns(self) -> int:
         """What one full growth is taken to cost in a simulation: a constant per cell, the same on every machine."""
@@ -266,25 +274,26 @@ class TargetTree:
     @property
     def _windows(self) -> bool:
         """Whether a move is followed by a window rather than by a full growth."""
-        strategy = self._config.strategy
-        if self._ground.directed:
+        if self._ground.directed or self._config.strategy == "full":
             return False
-        if strategy == "auto":
-            return self._full_ns > self._budget_ns
-        return strategy != "full"
+        return self._config.strategy != "auto" or self._auto.stage != "exact"
 
     @property
     def _coarse(self) -> bool:
-        return self._config.strategy in ("multi_resolution", "variable_range+multi_resolution")
+        """Whether far from the target only what carries traffic is grown."""
+        strategy = self._config.strategy
+        return not self._ground.directed and (
+            strategy in ("multi_resolution", "variable_range+multi_resolution")
+            or (strategy == "auto" and self._auto.stage == "coarsen")
+        )
 
     @property
-    def _budget_ns(self) -> float:
-        """CPU time that a tick may take."""
-        return self._config.cpu_budget * 1e9 / self._config.tick_hz
-
-    @property
-    def _rotates(self) -> bool:
-        return self._config.strategy in ("rotation", "auto")
+    def _widest(self) -> int:
+        """How far the widest window reaches that is grown without a worker, in cells."""
+        if self._config.strategy == "multi_resolution":
+            return max(4 << self._config.k_min, max(self._grid.rows, self._grid.cols) // FINE_SHARE)
+        share = INLINE_NS / 2 / self._full_ns
+        return math.isqrt(int(share * self._grid.cells)) // 2
 
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
         """Take the map's changes. None the first time: everything is new."""
@@ -293,7 +302,7 @@ class TargetTree:
             self._loaded = True
             return None
         changes = self._ground.apply(pace, dirty)
-        if changes.cells.size:
+        if changes.cells.size and self._skeleton is not None and not self._skeleton.learn(self._ground, changes):
             self._skeleton = None
         if changes.any_lower:
             self._tree.near = None
@@ -349,48 +358,55 @@ class TargetTree:
             return self._grow_full(target_cell)
         if not tree.precise:
             tree.relabel()
-        half = self._half(target_cell)
+        half, rings = self._reach(target_cell)
         window = self._grid.around(target_cell, half)
         cells = 0
-        wide = self._config.strategy == "multi_resolution" or window.cells * WIDE_SHARE > self._grid.cells
-        if self._skeleton is not None and wide:
-            fine = self._grid.around(target_cell, 2 << self._config.k_min)
-            if tree.grow_coarse(target_cell, self._skeleton, fine):
-                return Update("coarse", self._grid.window, self._grid.cells)
-            return self._grow_full(target_cell)
         while window.cells * 2 < self._grid.cells:
             grown = tree.move(target_cell, window)
+            cells += window.cells
+            if grown and rings is not None:
+                self._rungs.grown(target_cell, max(self._grid.rows, self._grid.cols))
+                return Update("coarse", self._grid.window, cells + tree.grow_rings(window, rings))
             if grown:
                 self._rungs.grown(target_cell, half)
-                return Update("window", window, cells + grown)
-            cells += window.cells
+                return Update("window", window, cells)
             half *= 2
             window = self._grid.around(target_cell, half)
         return self._grow_full(target_cell)
 
-    def _half(self, target_cell: int) -> int:
-        """How far to every side of the target the tree is grown now."""
+    def _reach(self, target_cell: int) -> tuple[int, Skeleton | None]:
+        """How far to every side of the target the tree is grown now, and over which skeleton beyond; None for not
+        at all."""
+        rings = self._skeleton if self._coarse else None
         old = self._tree.root
-        if not self._rotates:
-            return block_half(self._grid, old, target_cell, self._config.k_min)
-        share = INLINE_NS / 2 / self._full_ns
-        widest = math.isqrt(int(share * self._grid.cells)) // 2
-        return max(self._rungs.half(target_cell, widest), 2 * self._grid.distance_cells(old, target_cell))
+        least = 2 * self._grid.distance_cells(old, target_cell)
+        if self._config.strategy.startswith("variable_range"):
+            half = block_half(self._grid, old, target_cell, self._config.k_min)
+            if rings is None or self._grid.around(target_cell, half).cells * WIDE_SHARE <= self._grid.cells:
+                return half, None
+            return max(4 << self._config.k_min, least), rings
+        widest = self._widest
+        if rings is not None and self._rungs.beyond(target_cell, widest):
+            return max(widest, least), rings
+        return max(self._rungs.half(target_cell, widest), least), None
 
     def _with_wish(self, update: Update) -> Update:
         """Ask for a full growth where one is due and none is under way."""
-        wants = False
-        if self._coarse:
-            wants = self._skeleton is None and self._moves >= self._config.full_every
-        elif self._config.strategy == "rotation":
+        wants = self._coarse and self._skeleton is None
+        if self._config.strategy == "rotation":
             wants = self._moves >= self._config.full_every
-        elif self._config.strategy == "auto":
+        elif self._config.strategy == "auto" and self._auto.stage != "exact":
             # As often as the budget allows, but no sooner than the whole map were due as a window.
             come = self._grid.distance_cells(self._full_root, self._tree.root)
             far = 2 * AHEAD * come >= max(self._grid.rows, self._grid.cols)
-            wants = far and self._moves * self._budget_ns >= self._full_ns
+            wants |= far and self._moves * self._auto.budget_ns >= self._full_ns
         wants = wants and update.kind != "full" and not self._job_out
         return Update(update.kind, update.window, update.cells, wants)
+
+    def _renew_skeleton(self, found: Skeleton | None, since: Changes) -> None:
+        """Take what a worker found, and what changed since it looked."""
+        if found is not None:
+            self._skeleton = found if not since.cells.size or found.learn(self._ground, since) else None
 
     def _inside(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         asked = cells.reshape(-1)

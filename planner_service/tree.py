@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from planner_service.ground import Cells, Changes, Ground
 from planner_service.growth import FINE, flood
-from planner_service.kernels import coarse, walk
+from planner_service.kernels import coarse, labels, walk
 from planner_service.kernels.flood import point_to_parents
 from planner_service.kernels.ground import cut_window, find_rim, merge_window
 from planner_service.kernels.repair import repair
 from planner_service.kernels.rules import NONE
-from planner_service.skeleton import Skeleton
+from planner_service.skeleton import INNER, Skeleton
 from shared_map.arrays import Floats
 from swarm.grid import Window
 
@@ -65,6 +65,8 @@ class CostToGoTree:
         self.exact = False
         self.reach = 0.0
         self.near: Surrounding | None = None
+        self._stamps: NDArray[np.uint8] | None = None
+        self._now = 2
 
     def grow(self, root: int) -> None:
         """Grow the whole tree of a passable cell, exactly."""
@@ -84,31 +86,30 @@ class CostToGoTree:
         self.exact = True
         self.reach = reach
 
-    def grow_coarse(self, root: int, skeleton: Skeleton, window: Window) -> bool:
-        """Grow the tree over the skeleton and a window around the root only; all other cells lead to the skeleton.
-        False if that cannot be done: then the tree is of no use any more and must be grown."""
+    def grow_rings(self, window: Window, skeleton: Skeleton) -> int:
+        """After a window around the root was grown: renew what lies beyond, on the cells of a skeleton only, ring
+        by ring of doubling width and four times the traffic. All others keep their parents. Returns cells visited.
+        """
         ground = self.ground
-        start = ground.pad(root)
-        active = skeleton.cells.copy()
-        if not skeleton.attach[start] < np.inf:
-            return False
-        coarse.mark_way(skeleton.parent, ground.stride, start, active)
-        shape = (ground.grid.rows + 2, ground.stride)
-        active.reshape(shape)[window.row0 + 1 : window.row1 + 1, window.col0 + 1 : window.col1 + 1] = 1
-        rule, corners, stride = ground.rule, ground.corners, ground.stride
-        reach = flood(ground.weight, ground.low, ground.high, stride, start, rule, corners, self.cost, None, active)
-        if not reach < math.inf:
-            return False
-        if coarse.fill_in(self.cost, active, skeleton.attach, skeleton.anchor):
-            return False
-        box = (0, 0, ground.grid.rows, ground.grid.cols)
-        point_to_parents(ground.weight, self.cost, stride, rule, corners, start, box, self.parent)
-        self.root = root
-        self.offset = 0.0
-        self.near = None
         self.exact = False
-        self.reach = reach + skeleton.reach
-        return self.fine
+        found = int(
+            coarse.spread(
+                ground.weight,
+                self.cost,
+                self.parent,
+                self._stamps_now(),
+                self._now,
+                skeleton.level,
+                ground.stride,
+                ground.rule,
+                ground.corners,
+                ground.pad(self.root),
+                (window.row0, window.col0, window.row1, window.col1),
+                min(max(window.row1 - window.row0, window.col1 - window.col0), INNER),
+            )
+        )
+        self._stamp()
+        return found
 
     def move(self, root: int, window: Window) -> int:
         """Lead to a new root, by growing only a window that holds it and the old root.
@@ -140,6 +141,7 @@ class CostToGoTree:
         )
         self.exact = self.exact and root == self.root
         self.root = root
+        self._stamp()
         rim = np.empty(2 * (row1 - row0 + col1 - col0), np.int64)
         rim_cost = np.empty(rim.size, np.float64)
         many = find_rim(cost, box, rows, ground.stride, rim, rim_cost)
@@ -168,7 +170,48 @@ class CostToGoTree:
             _most_repaired(ground.grid.cells),
         )
         self.reach = max(self.reach, float(highest))
+        self._stamp()
         return int(visited)
+
+    def tighten(self, cells: Cells) -> None:
+        """Make the costs of padded cells, and of all on their ways, what is really driven. A window raises the
+        costs beyond it by the most that may be, move after move, until a growth comes by or somebody asks."""
+        if self.exact:
+            return
+        ground = self.ground
+        coarse.tighten(
+            ground.weight,
+            self.cost,
+            self.parent,
+            self._stamps_now(),
+            self._now,
+            ground.stride,
+            ground.rule,
+            ground.pad(self.root),
+            cells,
+        )
+
+    def _stamps_now(self) -> NDArray[np.uint8]:
+        """`_now` or one more where a cost was tightened since ways changed last."""
+        if self._stamps is None:
+            self._stamps = np.zeros(self.ground.size, np.uint8)
+        return self._stamps
+
+    def _stamp(self) -> None:
+        """Ways have changed: what was tightened before need not be right any more."""
+        self._now += 2
+        if self._now > 254:
+            self._now = 2
+            self._stamps = None
+
+    def lengths(self) -> Floats:
+        """(rows, cols) float32, m: how long the way of each cell is; inf where there is none."""
+        ground = self.ground
+        straight = ground.grid.resolution_m
+        length = np.empty(ground.size, np.float32)
+        root = ground.pad(self.root)
+        labels.path_lengths(self.parent, ground.stride, straight, straight * ground.diagonal, root, length)
+        return np.ascontiguousarray(self.inner(length), np.float32)
 
     def relabel(self) -> None:
         """Make every cost what is really driven along the parents."""
