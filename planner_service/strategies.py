@@ -62,8 +62,6 @@ MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
 INLINE_NS = 100_000_000
 """A forced range is grown at once where a full growth takes less."""
-REPAIR_SHARE = 100
-"""A repair that concerns more than one cell in so many gives way to a full growth."""
 WIDE_SHARE = 16
 """A window over one cell in so many gives way to the rings, where there is a skeleton for it."""
 FINE_SHARE = 16
@@ -229,7 +227,8 @@ class TargetTree:
 
     def force(self, pace: Floats, cells: Any) -> Update:
         """The range is forced to cover these cells: what they get afterwards is the best there is. Where growing
-        would hold up answers for long, a worker is asked to, and they get it when that is adopted."""
+        the whole tree would hold up answers for long, a worker is asked to, and they get it when that is adopted;
+        until then, the best inside a window that holds them and the target, where that is quick enough."""
         target = self.target_cell
         if not self.ready or target is None:
             return Update("none")
@@ -237,7 +236,15 @@ class TargetTree:
         if wanted.size == 0 or self._tree.exact:
             return Update("none")
         if self._full_ns > INLINE_NS:
-            return Update("none", wants_full=not self._job_out)
+            row, col = self._grid.row_col(target)
+            rows, cols = np.divmod(wanted, self._grid.cols)
+            half = int(max(np.abs(rows - row).max(), np.abs(cols - col).max())) * 5 // 4 + 1
+            window = self._grid.around(target, half)
+            grown_cells = 0
+            if half <= self._widest and self._windows and self._tree.precise:
+                grown_cells = self._tree.move(target, window)
+            kind: Kind = "forced" if grown_cells else "none"
+            return Update(kind, window if grown_cells else EMPTY, grown_cells, wants_full=not self._job_out)
         grown = self._grow_full(target)
         return Update("forced", grown.window, grown.cells)
 
@@ -268,6 +275,13 @@ class TargetTree:
             starts = self._ground.pad_all(asked[inside])
             costs[inside] = np.maximum(self._tree.cost[starts] + np.float32(self._tree.offset), 0)
         return costs
+
+    def lengths(self) -> Floats:
+        """(rows, cols) float32, m: how long the way of each cell is, the least by `length_weight`; inf where there is
+        none, or no target."""
+        if not self.ready:
+            return np.full((self._grid.rows, self._grid.cols), np.inf, np.float32)
+        return self._tree.lengths()
 
     # --- how ----------------------------------------------------------------------------------------------------
 
@@ -394,7 +408,9 @@ class TargetTree:
         """Ask for a full growth where one is due and none is under way."""
         wants = self._coarse and self._skeleton is None
         if self._config.strategy == "rotation":
-            wants = self._moves >= self._config.full_every
+            # On a small map a full growth is due as soon as windows have cost as much.
+            narrowest = (8 << self._config.k_min) ** 2
+            wants = self._moves >= min(self._config.full_every, self._grid.cells // narrowest + 1)
         elif self._config.strategy == "auto" and self._auto.stage != "exact":
             # As often as the budget allows, but no sooner than the whole map were due as a window.
             come = self._grid.distance_cells(self._full_root, self._tree.root)
