@@ -75,6 +75,8 @@ def _read(dataset: Any, grid: GridSpec, crs: Any, target: Any, notes: list[str],
     indexes, palette = _colour_bands(dataset)
     alpha = _alpha_band(dataset)
     low, high = _stretch(dataset, indexes, notes)
+    if len(indexes) == 1 and palette is None:
+        notes.append("the photo is grey: without colour, what covers the ground is a guess")
     rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
     seen = np.empty((grid.rows, grid.cols), np.bool_)
     for row0, row1 in bands(grid.rows, _READ_ROWS):
@@ -82,6 +84,8 @@ def _read(dataset: Any, grid: GridSpec, crs: Any, target: Any, notes: list[str],
         inside = (
             np.ones(raw[0].shape, np.bool_) if target is None else _coverage(dataset, row0, row1, grid, crs, target)
         )
+        if raw[0].dtype.kind == "f":
+            inside &= ~np.any([np.isnan(values) for values in raw], axis=0)
         if dataset.nodata is not None:
             inside &= ~np.all([values == dataset.nodata for values in raw], axis=0)
         if alpha is not None:
@@ -96,6 +100,10 @@ def _read(dataset: Any, grid: GridSpec, crs: Any, target: Any, notes: list[str],
                 values = np.clip(np.nan_to_num(scaled), 0, 255)
             rgb[row0:row1, :, channel] = np.where(inside, values, 0)
         progress("reading photo", row1 / grid.rows)
+    if not seen.any():
+        raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
+    if not seen.all():
+        notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
     return Photo(rgb, seen, tuple(notes))
 
 

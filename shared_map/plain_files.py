@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import zipfile
 from dataclasses import dataclass
@@ -70,6 +71,11 @@ def read_asc(path: Path) -> PlainGrid:
     missing = [key for key in ("ncols", "nrows", "cellsize") if key not in header]
     if missing:
         raise TerrainError(f"terrain {path} is no ESRI ASCII grid: its header lacks {', '.join(missing)}")
+    for key, value in header.items():
+        if key != "nodata_value" and not math.isfinite(value):
+            raise TerrainError(f"terrain {path}: its header says {key} {value:g}; expected a finite number")
+        if key in ("ncols", "nrows") and value % 1:
+            raise TerrainError(f"terrain {path}: its header says {key} {value:g}; expected a whole number")
     rows, cols, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
     check_cells(rows, cols, path)
     if not step > 0:
@@ -207,6 +213,8 @@ def read_ros(path: Path) -> PlainGrid:
         raise TerrainError(
             f"terrain {path}: thresholds free {free:g}, occupied {occupied:g}: 0 <= free <= occupied <= 1"
         )
+    if not image.is_file():
+        raise TerrainError(f"terrain {path} names the image {values['image']}, but there is no file {image}")
     pixels, brightest = read_pgm(image)
     if negate:
         pixels = brightest - pixels
@@ -250,7 +258,9 @@ def read_pgm(path: Path) -> tuple[NDArray[np.int32], int]:
         raise TerrainError(f"image {path} cannot be read: {error.strerror or error}") from error
     magic = data[:2]
     if magic not in (b"P2", b"P5"):
-        raise TerrainError(f"image {path} is no PGM: it begins with {magic!r}, not P2 or P5")
+        raise TerrainError(
+            f"image {path} is no PGM: it begins with {magic!r}, not P2 or P5; convert it (magick map.png map.pgm)"
+        )
     header = re.match(rb"P[25]" + rb"(?:\s|#[^\n]*\n)+(\d{1,9})" * 3 + rb"(?:#[^\n]*\n|\s)", data)
     if header is None:
         raise TerrainError(f"image {path} is no PGM: width, height and brightest value are missing")

@@ -24,8 +24,11 @@ from swarm.grid import GridSpec
 
 MAX_CELLS = 16384 * 16384
 _FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937}
+_SHOWN = ("lat_0", "lat_ts", "lon_0", "zone")
 MAX_SPAN_DEG = 12.0
 """Beyond this, a local projection stretches by more than half a percent at its borders."""
+HIGHEST_DEG = 85.0
+"""Degrees nearer to a pole than this are not put on metres."""
 _READ_ROWS = 512
 
 
@@ -69,8 +72,12 @@ def _check_length(path: Path, dataset: Any, what: str) -> None:
     if path.stat().st_size < promised and not sparse:
         raise TerrainError(
             f"{what} {path} is truncated: its header promises {dataset.height} x {dataset.width} cells,"
-            f" {promised / 1e6:.1f} MB, and it has {path.stat().st_size / 1e6:.1f} MB; fetch it again"
+            f" {_size(promised)}, and it has {_size(path.stat().st_size)}; fetch it again"
         )
+
+
+def _size(length: int) -> str:
+    return f"{length / 1e6:.1f} MB" if length >= 100_000 else f"{length} bytes"
 
 
 def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_progress) -> Raster:
@@ -97,6 +104,8 @@ def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_pr
             notes.append("heights are in feet, put into metres")
         if config.height_scale is not None:
             factor, offset = factor * config.height_scale, offset * config.height_scale
+        if dataset.count == 2:
+            notes.append("the file has two bands; heights are taken from the first")
         elevation_m = np.empty((grid.rows, grid.cols), np.float32)
         straight = target is None
         for row0, row1 in bands(grid.rows, _READ_ROWS):
@@ -196,8 +205,13 @@ def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) ->
     return rasterio.CRS.from_proj4(text)
 
 
-def _name(crs: Any) -> str:
+def crs_name(crs: Any) -> str:
+    """Of a rasterio CRS, for people: EPSG:32632, or +proj=..., or the beginning of what it is."""
     text: str = crs.to_string()
+    if not text.startswith("EPSG:") and crs.to_epsg() is None:
+        known = crs.to_dict()
+        if known.get("proj"):
+            text = " ".join(f"+{key}={known[key]}" for key in ("proj", *_SHOWN) if known.get(key))
     return text if len(text) < 60 else text[:57] + "..."
 
 
@@ -224,7 +238,7 @@ def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any, what:
     if target != crs:
         xs, ys = to_crs(crs, target, xs, ys)
     if not np.isfinite([xs, ys]).all():
-        raise TerrainError(f"{what} reaches where its coordinate system {_name(crs)} is not defined; crop it")
+        raise TerrainError(f"{what} reaches where its coordinate system {crs_name(crs)} is not defined; crop it")
     return min(xs), min(ys), max(xs), max(ys)
 
 
@@ -251,13 +265,18 @@ def plan_grid(
         )
     if not crs.is_geographic and not crs.is_projected:
         raise TerrainError(
-            f"{what} is in a coordinate system without metres or degrees ({_name(crs)});"
+            f"{what} is in a coordinate system without metres or degrees ({crs_name(crs)});"
             " reproject it (gdalwarp -t_srs EPSG:...) or set terrain.crs"
         )
     degrees = rasterio.CRS.from_epsg(4326)
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees, what)
     if crs.is_geographic and not -90.000001 <= south <= north <= 90.000001:
         raise TerrainError(f"{what} reaches from latitude {south:.4g} to {north:.4g}; its georeference is damaged")
+    if crs.is_geographic and not abs(south + north) / 2 < HIGHEST_DEG:
+        raise TerrainError(
+            f"{what} lies around latitude {(south + north) / 2:.4g}, where degrees of longitude have no width;"
+            " reproject it to a polar system (gdalwarp -t_srs EPSG:3413, in the south EPSG:3031)"
+        )
     target = metric_crs(crs, (west + east) / 2, (south + north) / 2, north - south)
     if (
         target != crs
@@ -268,7 +287,7 @@ def plan_grid(
             f" {MAX_SPAN_DEG:g}; crop it, or reproject it to metres yourself"
         )
     width, height = _pixel_m(transform, rows, cols, crs, target)
-    notes = [f"{rows} x {cols} pixels of {width:.4g} x {height:.4g} m in {_name(crs)}"]
+    notes = [f"{rows} x {cols} pixels of {width:.4g} x {height:.4g} m in {crs_name(crs)}"]
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
     if not north_up:
         notes.append("the file is rotated or upside down; resampled north-up, so that its corners may be voids")
@@ -285,7 +304,7 @@ def plan_grid(
             f"{what} is {north - south:.3g} m x {east - west:.3g} m: no cell of {resolution:g} m fits"
         )
     check_size(high, wide, what)
-    notes.append(f"resampled to {high} x {wide} cells of {resolution:g} m in {_name(target)}")
+    notes.append(f"resampled to {high} x {wide} cells of {resolution:g} m in {crs_name(target)}")
     return GridSpec(high, wide, resolution, west, north, target.to_string()), target, notes
 
 

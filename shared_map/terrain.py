@@ -21,12 +21,13 @@ from shared_map.bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.climb import ENTRIES, Climb, climb_of
 from shared_map.layers import (
     TerrainClass,
-    grade,
+    class_factors,
     grade_of_padded,
     inflate,
     inflation_halves,
     paint_zones,
     roughness_of_padded,
+    slope_deg,
     terrain_pace,
 )
 from shared_map.truth import hide
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 FORMAT = 2
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
 _META = "terrain.json"
+_ALL_LETHAL = "every cell of the terrain is lethal, no vehicle could stand anywhere:"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,7 @@ def _built(scenario: Scenario, source: Source, progress: Progress) -> Terrain:
     notes = list(source.notes)
     ground = _ground(source, classes, cost, progress)
     if scenario.terrain.roads:
+        _check_passable(ground, source.elevation_m, classes, cost, grid)
         from shared_map.roads import lay_roads
 
         laid = lay_roads(ground, scenario.terrain.roads, grid, scenario.seed)
@@ -136,11 +139,15 @@ def finished(
     notes: tuple[str, ...],
 ) -> Terrain:
     """A terrain of its ground: inflated, with its digest. Raises TerrainError where nobody could stand."""
-    halves = inflation_halves(cost.vehicle_radius_m, grid.resolution_m)
+    _check_passable(ground, elevation_m, classes, cost, grid)
+    # However wide a vehicle is said to be, wider than the terrain is the same.
+    radius_m = min(cost.vehicle_radius_m, 2 * max(grid.rows, grid.cols) * grid.resolution_m)
+    halves = inflation_halves(radius_m, grid.resolution_m)
     pace = inflate(ground, halves) if halves else ground
     if np.isinf(pace).all():
-        why = _why_lethal(elevation_m, ground, cost, grid)
-        raise TerrainError(f"every cell of the terrain is lethal, no vehicle could stand anywhere: {why}")
+        raise TerrainError(
+            f"{_ALL_LETHAL} cost.vehicle_radius_m = {cost.vehicle_radius_m:g} is too wide for every gap in it"
+        )
     climb = climb_of(grid, elevation_m, cost)
     if climb is not None:
         notes = (*notes, climb.note)
@@ -153,22 +160,26 @@ def finished(
         classes=classes,
         digest=digest,
         ground_s_per_m=ground,
-        vehicle_radius_m=cost.vehicle_radius_m,
+        vehicle_radius_m=radius_m,
         climb=climb,
         notes=notes,
     )
 
 
-def _why_lethal(elevation_m: Floats, ground: Floats, cost: CostConfig, grid: GridSpec) -> str:
-    if np.isnan(elevation_m).all():
-        return "it has no heights at all, only voids"
-    if not np.isinf(ground).all():
-        return f"cost.vehicle_radius_m = {cost.vehicle_radius_m:g} is too wide for every gap in it"
-    steep = grade(elevation_m, grid.resolution_m)
-    steepest = float(np.degrees(np.arctan(np.nanmedian(steep))))
-    return (
-        f"half of it is steeper than {steepest:.1f} degrees, cost.max_slope_deg is {cost.max_slope_deg:g}; "
-        "check it, the zones, the classes and the units of the heights"
+def _check_passable(pace: Floats, elevation_m: Floats, classes: Bytes, cost: CostConfig, grid: GridSpec) -> None:
+    """Raises TerrainError that says why, if a vehicle could stand nowhere."""
+    if not np.isinf(pace).all():
+        return
+    slopes = slope_deg(elevation_m, grid.resolution_m)
+    shares = {
+        "void": np.isnan(elevation_m).mean(),
+        f"steeper than cost.max_slope_deg = {cost.max_slope_deg:g}": (slopes > cost.max_slope_deg).mean(),
+        "of a lethal class": np.isinf(class_factors(cost)[classes]).mean() if cost.classes else 0.0,
+    }
+    said = ", ".join(f"{share:.0%} is {what}" for what, share in shares.items() if share > 0)
+    raise TerrainError(
+        f"{_ALL_LETHAL} {said or 'the file itself or a forbidden zone says so of each'};"
+        " check the units of the heights, the classes and the zones"
     )
 
 

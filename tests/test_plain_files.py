@@ -36,6 +36,9 @@ def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (ASC.replace("ncols 3", "ncols 2.5"), "its header says ncols 2.5; expected a whole number"),
+        (ASC.replace("ncols 3", "ncols nan"), "its header says ncols nan; expected a finite number"),
+        (ASC.replace("cellsize 50", "cellsize inf"), "its header says cellsize inf; expected a finite number"),
         (ASC.replace("1 2 3", "1 2"), r"ragged: line 7 has 2 heights, its header says 3"),
         (ASC.replace("4 -9999 6\n", ""), "has 1 rows of heights; its header says 2"),
         (ASC.replace("4 -9999 6", "4 x 6"), "line 8"),
@@ -198,7 +201,7 @@ def test_a_bad_ros_map_is_refused_with_a_sentence(tmp_path: Path, yaml: str, ima
 
 
 def test_a_missing_image_is_said(tmp_path: Path) -> None:
-    with pytest.raises(TerrainError, match=r"m\.pgm cannot be read"):
+    with pytest.raises(TerrainError, match=r"m.yaml names the image m.pgm, but there is no file"):
         load(tmp_path / "m.yaml", YAML)
 
 

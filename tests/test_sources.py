@@ -277,9 +277,26 @@ def complex_heights(folder: Path) -> dict[str, Any]:
     return {"source": write(folder / "a.tif", heights().astype(np.complex64))}
 
 
+def around_the_pole(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights(), from_origin(10, 90, 0.001, 0.001), "EPSG:4326")}
+
+
+def photo_of_nothing(folder: Path) -> dict[str, Any]:
+    black = np.zeros((3, 40, 50), np.uint8)
+    return {"source": write(folder / "a.tif", heights()), "photo": write(folder / "p.tif", black, nodata=0)}
+
+
+def photo_of_nan(folder: Path) -> dict[str, Any]:
+    nothing = np.full((3, 40, 50), np.nan, np.float32)
+    return {"source": write(folder / "a.tif", heights()), "photo": write(folder / "p.tif", nothing)}
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (around_the_pole, "around latitude 89.98, where degrees of longitude have no width; reproject it"),
+        (photo_of_nothing, "p.tif shows nothing of the terrain"),
+        (photo_of_nan, "p.tif shows nothing of the terrain"),
         (the_whole_world, "no flat grid is true over more than 12; crop it"),
         (beyond_the_pole, "to 91; its georeference is damaged"),
         (complex_heights, "holds complex64 values"),

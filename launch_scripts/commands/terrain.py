@@ -37,12 +37,29 @@ app = typer.Typer(
 console = Console()
 
 Crs = Annotated[str | None, typer.Option(help="Coordinate system, where the file names none: EPSG:32632.")]
-Resolution = Annotated[float | None, typer.Option(help="Cell size in metres to bring everything to.", min=1e-6)]
-Scale = Annotated[float | None, typer.Option(help="Metres per unit of height, for images.", min=1e-9)]
+Resolution = Annotated[
+    float | None, typer.Option(help="Cell size in metres to bring everything to.", min=1e-6, max=1e6)
+]
+Scale = Annotated[
+    float | None, typer.Option(help="Metres per unit of height, where the file does not say it.", min=1e-9, max=1e6)
+]
 Fill = Annotated[
     bool, typer.Option("--fill", help="Fill voids from their surroundings instead of forbidding them.")
 ]
+_TIFF = (".tif", ".tiff")
 PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
+
+
+def _check_target(path: Path | None, option: str, *endings: str) -> None:
+    """Before all the work: a file that cannot be written is refused now. Raises ConfigError."""
+    if path is None:
+        return
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: cannot write a file there, it is a folder")
+    if path.suffix.lower() not in endings:
+        raise ConfigError(f"{option} {path}: write {' or '.join(endings)}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
 
 
 def _scenario(name: str) -> Scenario:
@@ -98,7 +115,7 @@ def _facts(grid: GridSpec, elevation_m: Any) -> dict[str, Any]:
         "resolution_m": grid.resolution_m,
         "width_m": round(grid.cols * grid.resolution_m, 1),
         "height_m": round(grid.rows * grid.resolution_m, 1),
-        "crs": grid.crs if len(grid.crs) < 80 else grid.crs[:77] + "...",
+        "crs": _crs_name(grid),
         "voids": int(np.isnan(elevation_m).sum()),
     }
     known = elevation_m[~np.isnan(elevation_m)]
@@ -111,6 +128,16 @@ def _facts(grid: GridSpec, elevation_m: Any) -> dict[str, Any]:
     return facts
 
 
+def _crs_name(grid: GridSpec) -> str:
+    if len(grid.crs) < 60:
+        return grid.crs
+    import rasterio
+
+    from shared_map.rasters import crs_name
+
+    return crs_name(rasterio.CRS.from_user_input(grid.crs))
+
+
 @app.command()
 def cost(
     scenario: Annotated[str, typer.Argument(help="A scenario file or the name of a built-in one.")],
@@ -120,6 +147,8 @@ def cost(
     """Build the prior cost map of a scenario; write it and a picture of it."""
     from shared_map.terrain import build_terrain
 
+    _check_target(out, "--out", *_TIFF)
+    _check_target(picture, "--picture", ".png")
     loaded = _scenario(scenario)
     with bars() as tell:
         started = time.perf_counter()
@@ -190,7 +219,7 @@ def synth(
     rows: Annotated[int, typer.Option(min=8, max=16384)] = 512,
     cols: Annotated[int, typer.Option(min=8, max=16384)] = 512,
     resolution_m: Annotated[float, typer.Option(min=0.01)] = 30.0,
-    relief_m: Annotated[float, typer.Option(min=0, help="Metres from lowest to highest.")] = 400.0,
+    relief_m: Annotated[float, typer.Option(min=0, max=20_000, help="Metres from lowest to highest.")] = 400.0,
     rivers: Annotated[int, typer.Option(min=0, max=50)] = 2,
     roads: Annotated[int, typer.Option(min=0, max=200)] = 6,
     seed: Annotated[int, typer.Option(min=0)] = 1,
@@ -201,6 +230,9 @@ def synth(
     from shared_map.terrain import build_terrain
     from swarm.grid import GridSpec
 
+    _check_target(out, "--out", *_TIFF, ".npz")
+    _check_target(photo, "--photo", *_TIFF)
+    _check_target(picture, "--picture", ".png")
     config = TerrainConfig(
         source="synthetic",
         rows=rows,
@@ -213,15 +245,13 @@ def synth(
     with bars() as tell:
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
-    if out.suffix == ".npz":
+    if out.suffix.lower() == ".npz":
         try:
             np.savez_compressed(out, elevation=terrain.elevation_m, resolution_m=resolution_m, photo=terrain.photo)
         except OSError as error:
             raise TerrainError(f"cannot write {out}: {error.strerror or error}") from error
-    elif out.suffix in (".tif", ".tiff"):
-        _write(out, [terrain.elevation_m], grid)
     else:
-        raise ConfigError(f"--out {out}: write .tif or .npz")
+        _write(out, [terrain.elevation_m], grid)
     if photo is not None:
         _write(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
     if picture is not None:
@@ -248,6 +278,8 @@ def classify(
     """
     from shared_map.terrain import build_terrain
 
+    _check_target(out, "--out", *_TIFF)
+    _check_target(picture, "--picture", ".png")
     terrain_config = TerrainConfig(
         source=str(elevation),
         photo=str(photo),
