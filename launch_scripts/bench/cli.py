@@ -314,6 +314,28 @@ def directed(
 
 
 @app.command()
+def kernels(
+    size: Annotated[int, typer.Option(min=64, max=8192, help="Cells a side; a file has its own.")] = 512,
+    field: FieldOption = "terrain",
+    repeats: Annotated[int, typer.Option(min=1, help="Roots, each with all that is measured, in turn.")] = 15,
+    side: Annotated[int, typer.Option(min=1, max=32, help="Cells a side of a patch that changes.")] = 17,
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """What a frame is made of: routes by the batch, windows, and repairs beside the growth that they stand for.
+
+    \b
+    swarm bench kernels
+    swarm bench kernels --size 2048 --field maze --json
+    """
+    from launch_scripts.bench.kernels import run, tables
+
+    with _progress("kernels") as progress:
+        report = run(size, field, repeats, side, seed, progress)
+    _show(report, as_json, tables)
+
+
+@app.command()
 def terrain(
     size: Annotated[int, typer.Option(min=64, help="Cells a side.")] = 4096,
     repeats: Annotated[int, typer.Option(min=1, help="Interleaved runs of each pass.")] = 3,
