@@ -277,8 +277,8 @@ class TargetTree:
         return costs
 
     def lengths(self) -> Floats:
-        """(rows, cols) float32, m: how long the way of each cell is, the least by `length_weight`; inf where there is
-        none, or no target."""
+        """(rows, cols) float32, m: how long the way of each cell along its parents is; inf where there is none, or
+        no target."""
         if not self.ready:
             return np.full((self._grid.rows, self._grid.cols), np.inf, np.float32)
         return self._tree.lengths()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.ground import Ground
+from planner_service.skeleton import find_skeleton
 from planner_service.strategies import TargetTree
 from planner_service.tree import CostToGoTree
 from shared_map.climb import climb_of
@@ -41,6 +42,11 @@ def warm_up() -> None:
     tree = CostToGoTree(ground)
     tree.grow(_SIDE)
     tree.relabel()
+    window = grid.around(_SIDE + 1, 4)
+    tree.move(_SIDE + 1, window)
+    tree.grow_rings(window, find_skeleton(ground))
+    tree.tighten(np.array([ground.pad(0)]))
+    tree.lengths()
 
 
 def _live(tree: TargetTree, pace: NDArray[np.float32]) -> None:

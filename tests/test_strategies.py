@@ -35,7 +35,7 @@ class Play:
             "edge": config.edge,
             "corner_cutting": config.corner_cutting,
         }
-        self.tree.update(self.pace, self.target, [], 0)
+        self.last = self.tree.update(self.pace, self.target, [], 0)
 
     def happen(self, event: Move | Marks | Job) -> None:
         if isinstance(event, Move):
@@ -43,7 +43,7 @@ class Play:
             row = min(max(row + event.rows, 0), self.grid.rows - 1)
             col = min(max(col + event.cols, 0), self.grid.cols - 1)
             self.target = row * self.grid.cols + col
-            self.tree.update(self.pace, self.target, [], self.version)
+            self.last = self.tree.update(self.pace, self.target, [], self.version)
         elif isinstance(event, Marks):
             window = self._mark(event)
             self.since.append(window)

@@ -129,7 +129,7 @@ def spread(weight, cost, parent, stamp, now, level, stride, rule, corners, root,
                   twice as far, of 3 up to four times, ...
     box    (row0, col0, row1, col1) of the window, whose costs are new
     stamp, now  as in `tighten`, which a cell is before it is offered anything: an old way from far off is often
-                better than its cost says, and than the way over the skeleton. One more than `now` where that is done
+                better than its cost says, and than the way over the skeleton. One more than `now` where it was
     Only what gets cheaper is rewritten, with its parent, so that costs stay upper bounds and grow strictly along
     every way. Returns cells visited.
     """
