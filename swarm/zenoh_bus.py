@@ -26,7 +26,7 @@ from swarm.codec import (
     encode,
     encode_readable,
 )
-from swarm.config import NetworkConfig
+from swarm.config import NetworkConfig, TlsConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.messages import Message
@@ -90,18 +90,23 @@ def _zenoh_config(network: NetworkConfig, mode: str) -> zenoh.Config:
         "period_increase_factor": 1.5,
     }
     if network.tls is not None:
-        settings["transport/link/tls"] = {
-            "root_ca_certificate": network.tls.ca,
-            "enable_mtls": True,
-            "listen_certificate": network.tls.certificate,
-            "listen_private_key": network.tls.key,
-            "connect_certificate": network.tls.certificate,
-            "connect_private_key": network.tls.key,
-        }
+        settings["transport/link/tls"] = tls_settings(network.tls)
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def tls_settings(tls: TlsConfig) -> dict[str, Any]:
+    """What zenoh calls mutual TLS, both ways with one certificate."""
+    return {
+        "root_ca_certificate": tls.ca,
+        "enable_mtls": True,
+        "listen_certificate": tls.certificate,
+        "listen_private_key": tls.key,
+        "connect_certificate": tls.certificate,
+        "connect_private_key": tls.key,
+    }
 
 
 class ZenohBus:

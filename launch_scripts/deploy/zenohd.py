@@ -8,6 +8,7 @@ from typing import Any
 from swarm.codec import MAX_PAYLOAD_BYTES
 from swarm.config import NetworkConfig
 from swarm.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, STATS
+from swarm.zenoh_bus import tls_settings
 
 PUTS = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
 READS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
@@ -47,14 +48,7 @@ def zenohd_config(
         "timestamping": {"enabled": {"router": True, "peer": False, "client": False}},
     }
     if network.tls is not None:
-        config["transport"]["link"]["tls"] = {
-            "root_ca_certificate": network.tls.ca,
-            "enable_mtls": True,
-            "listen_certificate": network.tls.certificate,
-            "listen_private_key": network.tls.key,
-            "connect_certificate": network.tls.certificate,
-            "connect_private_key": network.tls.key,
-        }
+        config["transport"]["link"]["tls"] = tls_settings(network.tls)
     if plugins is not None:
         config["plugins_loading"] = {"enabled": True, "search_dirs": [plugins]}
         storage = {"key_expr": MARKS.expression(network.namespace), "volume": volume}
