@@ -195,8 +195,8 @@ def _tobler(rise: Floats) -> Floats:
     """Tobler (1993): walking speed 6 exp(-3.5 |rise + 0.05|) km/h, here as pace relative to the level.
 
     Cut off at a hundredfold pace: costly is not lethal."""
-    factor = np.exp(np.float32(3.5) * (np.abs(rise + np.float32(0.05)) - np.float32(0.05)))
-    capped: Floats = np.minimum(factor, np.float32(100))
+    exponent = np.float32(3.5) * (np.abs(rise + np.float32(0.05)) - np.float32(0.05))
+    capped: Floats = np.minimum(np.exp(np.minimum(exponent, np.float32(5))), np.float32(100))
     return capped
 
 

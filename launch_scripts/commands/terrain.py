@@ -27,12 +27,19 @@ if TYPE_CHECKING:
 app = typer.Typer(
     help="""Look at terrains: what a file holds, what it costs, what a photo shows.
 
+    See what a file holds, what a scenario costs on it, what a photo shows;
+    correct the scenario, and look again. Without files: synth, jacksboro.
+
     swarm terrain info dem.tif
-    swarm terrain cost jacksboro --out cost.tif --picture cost.png
-    swarm terrain synth --rows 512 --cols 512 --out dem.tif --photo photo.tif
+    swarm terrain cost jacksboro --picture cost.png
     swarm terrain classify dem.tif photo.tif --picture classes.png
+    swarm terrain synth --out dem.tif --photo photo.tif
+
+    Where to get an elevation model, and the rule for cost: docs/terrain.md.
     """,
     no_args_is_help=True,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 console = Console()
 
@@ -75,9 +82,17 @@ def info(
     resolution_m: Resolution = None,
     height_scale: Scale = None,
     fill: Fill = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for programs.")] = False,
 ) -> None:
-    """Say what a terrain file holds, and what was done to bring it onto a metric grid."""
+    """Say what a terrain file holds, and what was done to bring it onto a metric grid.
+
+    Reads .tif, .hgt, .asc, .npz, MovingAI .map, ROS map_server .yaml, and
+    .png with --resolution-m and --height-scale. The lines after the table say
+    what was done to the file, and what you should know about it.
+
+    swarm terrain info srtm.hgt
+    swarm terrain info dem.tif --resolution-m 20 --fill
+    """
     from shared_map.sources import load_source
 
     if file.endswith(".toml"):
@@ -144,7 +159,15 @@ def cost(
     out: Annotated[Path | None, typer.Option(help="Write seconds per metre as GeoTIFF; lethal is -1.")] = None,
     picture: PictureOption = None,
 ) -> None:
-    """Build the prior cost map of a scenario; write it and a picture of it."""
+    """Build the prior cost map of a scenario; write it and a picture of it.
+
+    Cost is a pace in seconds per metre: 0.1 is 10 m/s. Lethal cells are never
+    entered. What looks wrong is corrected in the scenario: cost.max_slope_deg,
+    cost.class_factor, cost.zones, terrain.labels.
+
+    swarm terrain cost jacksboro --picture cost.png
+    swarm terrain cost mine.toml --out cost.tif
+    """
     from shared_map.terrain import build_terrain
 
     _check_target(out, "--out", *_TIFF)
@@ -216,17 +239,21 @@ def _print_shares(classes: Bytes) -> None:
 @app.command()
 def synth(
     out: Annotated[Path, typer.Option(help="Write the heights: .tif (in UTM 32) or .npz.")],
-    rows: Annotated[int, typer.Option(min=8, max=16384)] = 512,
-    cols: Annotated[int, typer.Option(min=8, max=16384)] = 512,
-    resolution_m: Annotated[float, typer.Option(min=0.01)] = 30.0,
+    rows: Annotated[int, typer.Option(min=8, max=16384, help="Cells from north to south.")] = 512,
+    cols: Annotated[int, typer.Option(min=8, max=16384, help="Cells from west to east.")] = 512,
+    resolution_m: Annotated[float, typer.Option(min=0.01, max=1e6, help="Metres a cell.")] = 30.0,
     relief_m: Annotated[float, typer.Option(min=0, max=20_000, help="Metres from lowest to highest.")] = 400.0,
-    rivers: Annotated[int, typer.Option(min=0, max=50)] = 2,
-    roads: Annotated[int, typer.Option(min=0, max=200)] = 6,
-    seed: Annotated[int, typer.Option(min=0)] = 1,
+    rivers: Annotated[int, typer.Option(min=0, max=50, help="From border to border, with fords.")] = 2,
+    roads: Annotated[int, typer.Option(min=0, max=200, help="Between seeded places.")] = 6,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed makes the same landscape.")] = 1,
     photo: Annotated[Path | None, typer.Option(help="Write a photo of it (.tif) too.")] = None,
     picture: PictureOption = None,
 ) -> None:
-    """Make a synthetic landscape: mountains, valleys, rivers, forest, roads. A seed makes the same again."""
+    """Make a synthetic landscape: mountains, valleys, rivers, forest, roads. A seed makes the same again.
+
+    swarm terrain synth --out dem.tif --photo photo.tif --picture look.png
+    swarm terrain info dem.tif
+    """
     from shared_map.terrain import build_terrain
     from swarm.grid import GridSpec
 
@@ -266,15 +293,27 @@ def classify(
     labels: Annotated[
         Path | None, typer.Option(help="Learn from these labels (TOML), and compare with them.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the classes as GeoTIFF.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Write a GeoTIFF: 0 unknown, 1 water, 2 forest, 3 rock, 4 grass, 5 soil, ..."),
+    ] = None,
     picture: PictureOption = None,
     crs: Crs = None,
     resolution_m: Resolution = None,
 ) -> None:
     """Say what a photo shows: water, forest, rock, grass, soil, road, built, snow.
 
-    Without labels by rules. With labels learnt from them; printed is what a model that has not seen a polygon says
-    about it, beside what the rules say.
+    Without --labels by rules. With labels the classes are learnt from them,
+    and two tables show what the labelled cells were taken for: by the rules,
+    and by a model that had not seen the polygon it was asked about.
+    A file of labels, in metres east and south of the north-west corner:
+
+    [\\[labels]]
+    class = "water"        # forest, rock, grass, soil, road, built, snow
+    polygon_m = [[4300, 1750], [4900, 1700], [4600, 2400]]
+    [\\[labels]]
+    class = "forest"
+    points_m = [[4700, 4200], [5300, 2900]]
     """
     from shared_map.terrain import build_terrain
 
