@@ -14,7 +14,7 @@ from launch_scripts.commands.roles import TlsCa, TlsCert, TlsKey
 
 if TYPE_CHECKING:
     from swarm.config import NetworkConfig
-    from swarm.messages import PlannerStatus, RouteReply, RunInfo, Stats
+    from swarm.messages import CostReply, PlannerStatus, RouteReply, RunInfo, Stats
 
 app = typer.Typer()
 
@@ -45,6 +45,8 @@ def route(
     col: Annotated[int, typer.Option(help="From this column, counted from the west.")],
     connect: Connect = "tcp/127.0.0.1:7447",
     namespace: Namespace = "swarm",
+    steps: Annotated[int, typer.Option(min=0, help="At most so many steps, 1 for the next; 0 is all.")] = 0,
+    cost: Annotated[bool, typer.Option("--cost", help="Only what it costs, or that there is no way.")] = False,
     tls_ca: TlsCa = None,
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
@@ -54,27 +56,30 @@ def route(
 
     swarm route --target t3 --row 40 --col 200
 
+    swarm route --target t3 --row 40 --col 200 --steps 1
+
     swarm route --target t3 --row 40 --col 200 --json | jq .routes[0].cost_s
     """
     from swarm.bus import AskEnded, Replied
     from swarm.codec import encode_readable
     from swarm.errors import BusError, ConfigError
-    from swarm.messages import RouteReply, RouteRequest
+    from swarm.messages import CostReply, CostRequest, RouteReply, RouteRequest
     from swarm.process import Inbox
-    from swarm.topics import ROUTE
+    from swarm.topics import COST, ROUTE
     from swarm.zenoh_bus import open_bus
 
     network = _network(connect, namespace, (tls_ca, tls_cert, tls_key))
     inbox = Inbox()
-    reply: RouteReply | None = None
+    reply: RouteReply | CostReply | None = None
     failure: str | None = None
     began_s = time.monotonic()
     with open_bus(network) as bus:
-        request = RouteRequest(row=row, col=col)
-        bus.ask(ROUTE, request, inbox.post, tag="route", timeout_s=_ROUTE_TIMEOUT_S, target=target)
+        topic = COST if cost else ROUTE
+        request = CostRequest(row=row, col=col) if cost else RouteRequest(row=row, col=col, max_cells=steps)
+        bus.ask(topic, request, inbox.post, tag="route", timeout_s=_ROUTE_TIMEOUT_S, target=target)
         while time.monotonic() < began_s + _ROUTE_TIMEOUT_S + 2.0:
             match inbox.take(0.5):
-                case Replied(message=RouteReply() as found):
+                case Replied(message=(RouteReply() | CostReply()) as found):
                     reply = found
                 case AskEnded(failure=failure):
                     break
@@ -86,7 +91,22 @@ def route(
     if as_json:
         typer.echo(encode_readable(reply).decode())
         return
-    _print_route(reply, took_ms)
+    if isinstance(reply, CostReply):
+        _print_cost(reply, row, col)
+    else:
+        _print_route(reply, took_ms)
+
+
+def _print_cost(reply: CostReply, row: int, col: int) -> None:
+    from swarm.messages import column
+
+    cost_s = float(column(reply.cost_to_go_s, "<f4")[0])
+    if reply.target_cell is None:
+        typer.echo("no_target: the planner does not know where its target is")
+    elif math.isfinite(cost_s):
+        typer.echo(f"from row {row}, col {col} to {reply.target} in {cost_s:.1f} s")
+    else:
+        typer.echo(f"unreachable: there is no way from row {row}, col {col} to {reply.target}")
 
 
 def _print_route(reply: RouteReply, took_ms: float) -> None:
@@ -104,10 +124,10 @@ def _print_route(reply: RouteReply, took_ms: float) -> None:
         typer.echo(f"{found.status.value}: {meaning}")
         return
     gap = f"proven within {100 * (found.gap - 1):.2f} % of the best" if math.isfinite(found.gap) else "gap unknown"
-    typer.echo(
-        f"from row {row}, col {col} to {reply.target} in {found.cost_s:.1f} s, {found.length_m:.0f} m, {gap}"
-    )
-    typer.echo(f"{len(found.directions)} steps: {_strides(found.directions)}")
+    typer.echo(f"from row {row}, col {col} to {reply.target} in {found.cost_s:.1f} s, {gap}")
+    rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
+    many = len(found.directions)
+    typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
     typer.echo(
         f"tree {reply.tree_age_ms:.0f} ms old, map version {reply.map_version}, answered in {took_ms:.1f} ms"
     )
