@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -29,9 +30,9 @@ class Changes:
     before: Floats
     weight_now: Floats
 
-    @property
+    @cached_property
     def any_lower(self) -> bool:
-        return bool((self.weight_now < self.before).any())
+        return self.cells.size > 0 and bool((self.weight_now < self.before).any())
 
 
 NO_CHANGES = Changes(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
@@ -135,7 +136,7 @@ class Ground:
             room = (row1 - row0) * (col1 - col0)
             cells = np.empty(room, np.int64)
             before = np.empty(room, np.float32)
-            count, bad = kernels.changed_cells(
+            count, bad, low, high = kernels.changed_cells(
                 pace,
                 self._metres,
                 np.float32(self.length_weight_s),
@@ -148,6 +149,8 @@ class Ground:
             if bad:
                 raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
             if count:
+                self.low = min(self.low, float(low))
+                self.high = max(self.high, float(high))
                 found.append(Changes(cells[:count], before[:count], self.weight[cells[:count]]))
         if not found:
             return NO_CHANGES
@@ -159,10 +162,6 @@ class Ground:
                 np.concatenate([part.before for part in found]),
                 np.concatenate([part.weight_now for part in found]),
             )
-        finite = changes.weight_now[np.isfinite(changes.weight_now)]
-        if finite.size:
-            self.low = min(self.low, float(finite.min()))
-            self.high = max(self.high, float(finite.max()))
         return changes
 
     def difference(self, older: Floats, dirty: Sequence[Window]) -> Changes:

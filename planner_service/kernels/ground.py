@@ -30,11 +30,13 @@ def changed_cells(pace, resolution, extra, box, stride, weight, cells, before):
     """The padded cells of a window whose weight differs from their pace, and their weight before; updates weight.
 
     box = (row0, col0, row1, col1); cells, before have room for the whole window. Returns (count, cells whose pace
-    is NaN, zero or negative: these are not applied).
+    is NaN, zero or negative: these are not applied; smallest, largest finite new weight: inf, 0 if there is none).
     """
     row0, col0, row1, col1 = box
     count = 0
     bad = 0
+    low = INF
+    high = np.float32(0.0)
     for row in range(row0, row1):
         base = (row + 1) * stride + 1
         for col in range(col0, col1):
@@ -49,7 +51,9 @@ def changed_cells(pace, resolution, extra, box, stride, weight, cells, before):
                 before[count] = old
                 count += 1
                 weight[base + col] = new
-    return count, bad
+                low = min(low, new)
+                high = max(high, new if new < INF else high)
+    return count, bad, low, high
 
 
 @njit(cache=True, nogil=True)
