@@ -85,9 +85,9 @@ FOLDS = 1 << 16
 class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks")):
     """All that one author says about one tile. Replaces the author's set with a lower (epoch, seq).
 
-    An author counts `seq` in steps of 65536. The numbers between are for keepers, which fold what the dead have left
-    behind: drop from it what others overrule. Such a set without statements is a burial: readers forget the tile of
-    that author.
+    An author counts `seq` in steps of 65536. The numbers between are for keepers, which fold what the dead have
+    left behind: drop from it what others overrule. Such a set without statements is a burial: readers forget the
+    tile of that author.
 
     cells      uint16  index inside the tile, row-major over 32 x 32, strictly increasing
     kinds      uint8   MarkKind
