@@ -10,8 +10,10 @@ import pytest
 import rasterio
 from typer.testing import CliRunner
 
+from launch_scripts.commands import terrain_picture
 from launch_scripts.commands.terrain import app
 from shared_map.sources import load_source
+from shared_map.terrain import terrain_of_pace
 from swarm.config import TerrainConfig
 from swarm.errors import SwarmError
 
@@ -58,6 +60,20 @@ def test_cost_writes_a_geotiff_with_overviews_and_a_picture(made: Path, tmp_path
         assert (file.nodata, file.crs.to_epsg(), file.overviews(1)) == (-1, 32632, [2])
     assert ((pace == -1) | (pace > 0)).all()
     assert (tmp_path / "cost.png").stat().st_size > 50_000
+
+
+@pytest.mark.parametrize("shape", [(70, 90), (1, 1), (9, 400), (400, 9)])
+def test_a_picture_of_any_shape_with_voids_and_coarsened(
+    shape: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terrain_picture, "MOST_CELLS", 1000)
+    heights = np.random.default_rng(1).uniform(0, 50, shape).astype(np.float32)
+    pace = np.ones(shape, np.float32)
+    if heights.size > 1:
+        heights[:, 0] = np.nan
+        pace[0] = np.inf
+    terrain_picture.draw(terrain_of_pace(pace, 10.0, heights), tmp_path / "look.png", "any shape")
+    assert (tmp_path / "look.png").stat().st_size > 10_000
 
 
 def test_classify_prints_what_it_found_and_how_well(made: Path, tmp_path: Path) -> None:
