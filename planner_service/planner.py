@@ -199,7 +199,7 @@ class Planner:
         )
         self._told = news
         self._wants_full = False  # all that happened until now is in what `adopt` says
-        self._grown(took_ns)
+        self._grown(took_ns, usual=grown.skeleton is None)
         if grown.map_version == news[1] and grown.target_cell == news[0]:
             self._exact_ns = now_ns
         else:
@@ -235,11 +235,11 @@ class Planner:
             self.counters.count("window_growths")
             self.counters.observe("window_ms", took_ns / 1e6)
 
-    def _grown(self, took_ns: int) -> None:
+    def _grown(self, took_ns: int, usual: bool = True) -> None:
         self.counters.count("growths")
         self._growth_ms = took_ns / 1e6
         self.counters.observe("growth_ms", self._growth_ms)
-        if self._stopwatch is not None:
+        if self._stopwatch is not None and usual:
             self._took_ns.append(took_ns)
             self.tree.observe_full_ns(sorted(self._took_ns)[len(self._took_ns) // 2])
 

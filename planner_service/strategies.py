@@ -249,7 +249,8 @@ class TargetTree:
         return Update("forced", grown.window, grown.cells)
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """What a full growth really took, for `auto` to choose by. A simulation does not call it."""
+        """What a full growth really took, for `auto` to choose by; not one that found a skeleton too. A simulation
+        does not call it."""
         self._full_ns = max(1, took_ns)
         self._auto.observe(self._full_ns, self._widest)
 
@@ -273,6 +274,7 @@ class TargetTree:
         if self.ready:
             inside = (asked >= 0) & (asked < self._grid.cells)
             starts = self._ground.pad_all(asked[inside])
+            self._tree.tighten(starts)
             costs[inside] = np.maximum(self._tree.cost[starts] + np.float32(self._tree.offset), 0)
         return costs
 
