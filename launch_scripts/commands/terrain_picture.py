@@ -87,7 +87,7 @@ def _facts(terrain: Terrain, level: Level) -> str:
     unit, name = _unit(level)
     facts = (
         f"{grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m,"
-        f" {grid.cols * grid.resolution_m / unit:.3g} x {grid.rows * grid.resolution_m / unit:.3g} {name}"
+        f" {grid.cols * grid.resolution_m / unit:.4g} x {grid.rows * grid.resolution_m / unit:.4g} {name}"
     )
     return facts if level.side == 1 else f"{facts}; a pixel shows {level.side} x {level.side} cells"
 
@@ -145,8 +145,9 @@ def _photo(panel: Axes, key: Axes, level: Level) -> None:
     _show(panel, level, level.photo)
     _named(panel, "photo")
     _scale_bar(panel, level)
+    tail = 1 - 0.6 / _inches_high(key)
     key.annotate(
-        "N", xy=(0.14, 0.985), xytext=(0.14, 0.88), xycoords="axes fraction", ha="center", va="center",
+        "N", xy=(0.14, 1.0), xytext=(0.14, tail), xycoords="axes fraction", ha="center", va="center",
         fontsize=12, arrowprops={"arrowstyle": "-|>", "color": "#333"},
     )  # fmt: skip
 
@@ -189,13 +190,19 @@ def _cost(panel: Axes, key: Axes, terrain: Terrain, level: Level, shade: Floats)
 def _bar(
     key: Axes, colours: Colormap, scale: Normalize, label: str, patches: list[Patch], extend: str = "neither"
 ) -> None:
-    bar = key.inset_axes((0.06, 0.0, 0.15, 0.9 if patches else 1.0))
+    bar = key.inset_axes((0.06, 0.0, 0.15, 1 - 0.55 / _inches_high(key) if patches else 1.0))
     colour_bar = key.figure.colorbar(ScalarMappable(scale, colours), cax=bar, extend=extend)
     colour_bar.set_label(label, fontsize=10)
     colour_bar.ax.tick_params(labelsize=9)
     colour_bar.outline.set_edgecolor("#888")
     if patches:
         _legend(key, patches, 1.0)
+
+
+def _inches_high(key: Axes) -> float:
+    figure = key.get_figure(root=True)
+    assert figure is not None
+    return float(key.get_window_extent().height / figure.get_dpi())
 
 
 def _legend(key: Axes, patches: list[Patch], top: float) -> None:
