@@ -56,6 +56,7 @@ _SETTLE_NS = NS_PER_S // 5
 wait for its word before they enter anything."""
 _RESUME_TIMEOUT_S = 2.0
 _ASK_AGAIN_NS = NS_PER_S // 10
+_ASK_AGAIN_AT_LAST_NS = NS_PER_S
 _MOURN_NS = NS_PER_S // 2
 """An agent whose token fell is waited for a little longer: if our own link is cut, word of that may come later."""
 _NEAR_CELLS = 4
@@ -131,6 +132,7 @@ class AgentService:
         self._fleet = FleetReport(grid, self._author, group)
         self._resumption: Resumption | None = Resumption(plan.id)
         self._resume_due_ns: int | None = None
+        self._resume_tries = 0
         self._roster = Roster()
         self._mourned_ns: dict[str, int] = {}
         self._link_up = True
@@ -274,7 +276,9 @@ class AgentService:
         agents = self._roster.alive("agent")
         cut_off = not agents and self._expects_others and now_ns < self._alone_ns
         if cut_off or not known.complete(agents):
-            self._resume_due_ns = now_ns + _ASK_AGAIN_NS
+            # Where many agents start at once on a slow machine, each asks all the others again and again.
+            self._resume_due_ns = now_ns + min(_ASK_AGAIN_NS << self._resume_tries, _ASK_AGAIN_AT_LAST_NS)
+            self._resume_tries += 1
             return
         self._resumption = None
         self._ground.set_alive(agents)
