@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import naive
@@ -13,13 +14,13 @@ import pytest
 from strategies import RULES, random_pace
 
 from planner_service.ground import Ground
-from planner_service.growth import ALL_CELLS
+from planner_service.growth import ALL_CELLS, MAX_RATIO, flood
 from planner_service.kernels.wide import flood_wide
 from planner_service.tree import CostToGoTree
 from swarm.config import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
-RATIOS = (1.0, 2.0, 10.0, 100.0, 1e4)
+RATIOS = (1.0, 2.0, 10.0, 100.0, 1e4, 1e6, 1e9)
 WALLS = (0.0, 0.1, 0.25, 0.45)
 
 
@@ -52,9 +53,9 @@ def random_grids(count: int, seed: int, most: int) -> None:
     rng = np.random.default_rng(seed)
     for n in range(count):
         rows, cols = (int(side) for side in rng.integers(1, most, 2))
-        pace = random_pace(rng, rows, cols, RATIOS[n % 5], WALLS[n // 5 % 4])
+        pace = random_pace(rng, rows, cols, RATIOS[n % 7], WALLS[n // 7 % 4])
         target = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-        assert_equals_dijkstra(pace, target, RULES[n // 20 % 5])
+        assert_equals_dijkstra(pace, target, RULES[n // 28 % 5])
 
 
 def test_a_thousand_random_grids_equal_dijkstra() -> None:
@@ -69,7 +70,7 @@ def test_ten_thousand_random_grids_equal_dijkstra() -> None:
 def test_scipy_equals_twelve_lines_that_can_be_read() -> None:
     rng = np.random.default_rng(3)
     for n in range(20):
-        pace = random_pace(rng, 9, 8, RATIOS[n % 5], 0.25)
+        pace = random_pace(rng, 9, 8, RATIOS[n % 7], 0.25)
         rules = RULES[n % 5]
         target = int(np.flatnonzero(np.isfinite(pace))[0])
         by_hand = naive.cost_to_go_by_hand(pace, target, **rules)
@@ -82,18 +83,43 @@ def test_the_smallest_grids_equal_dijkstra(shape: tuple[int, int], rules: dict) 
     assert_equals_dijkstra(np.full(shape, 0.5, np.float32), 0, rules)
 
 
-def test_buckets_and_heap_give_the_same_costs_to_the_last_bit() -> None:
+@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_ring_and_radix_heap_give_the_same_costs_to_the_last_bit_of_a_grid_and_of_part_of_it(
+    rules: dict, share: float
+) -> None:
     rng = np.random.default_rng(4)
-    for rules in RULES:
-        pace = random_pace(rng, 60, 61, 50.0, 0.2)
+    for ratio in (1.0, 50.0, 2000.0):
+        pace = random_pace(rng, 260, 259, ratio, 0.2)
         target = int(np.flatnonzero(np.isfinite(pace))[0])
-        tree = grown(pace, target, rules)
-        ground = tree.ground
-        cost, parent = np.empty_like(tree.cost), np.empty_like(tree.parent)
+        ground = Ground(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules))
+        ground.load(pace)
         root = ground.pad(target)
+        active = ALL_CELLS if share == 1.0 else (rng.random(ground.size) < share).astype(np.uint8)
+        part = np.ones(ground.size, bool) if share == 1.0 else active == 1
+        part[root] = True
+        by_ring, by_heap = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
+        parent = np.empty(ground.size, np.uint8)
+        settings = (ground.stride, root, ground.rule, ground.corners)
+        longest = ground.high * ground.diagonal
+        assert longest <= MAX_RATIO * ground.low  # so that it is the ring that grows it
+        flood(ground.weight, ground.low, ground.high, *settings, by_ring, None, active)
         low = np.float32(ground.low)
-        flood_wide(ground.weight, ALL_CELLS, cost, ground.stride, root, ground.rule, ground.corners, low, parent)
-        np.testing.assert_array_equal(cost, tree.cost)
+        flood_wide(ground.weight, active, by_heap, *settings, low, parent)
+        np.testing.assert_array_equal(by_heap[part], by_ring[part])
+
+
+@pytest.mark.parametrize("ratio", [1e4, 1e6, 1e9, 1e30])
+def test_no_ratio_of_paces_breaks_or_crawls(ratio: float) -> None:
+    rng = np.random.default_rng(6)
+    for walls in (0.0, 0.2):
+        pace = random_pace(rng, 120, 120, ratio, walls)
+        target = int(np.flatnonzero(np.isfinite(pace))[77])
+        for rules in RULES:
+            assert_equals_dijkstra(pace, target, rules)
+            begin = time.thread_time()
+            grown(pace, target, rules)
+            assert time.thread_time() - begin < 0.5  # 14,400 cells: 5 ms where nothing else runs
 
 
 def test_large_fields_of_every_kind_equal_dijkstra() -> None:
