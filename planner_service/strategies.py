@@ -308,7 +308,8 @@ class TargetTree:
         """How far the widest window reaches that is grown without a worker, in cells."""
         if self._config.strategy == "multi_resolution":
             return max(4 << self._config.k_min, max(self._grid.rows, self._grid.cols) // FINE_SHARE)
-        share = INLINE_NS / 2 / self._full_ns
+        # Over half of the map, a full growth costs as much: that is the worker's.
+        share = min(INLINE_NS / self._full_ns, 1.0) / 2
         return math.isqrt(int(share * self._grid.cells)) // 2
 
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
@@ -410,9 +411,9 @@ class TargetTree:
         """Ask for a full growth where one is due and none is under way."""
         wants = self._coarse and self._skeleton is None
         if self._config.strategy == "rotation":
-            # On a small map a full growth is due as soon as windows have cost as much.
-            narrowest = (8 << self._config.k_min) ** 2
-            wants = self._moves >= min(self._config.full_every, self._grid.cells // narrowest + 1)
+            # On a small map a full growth is due as soon as windows have cost half as much.
+            twice = 2 * (8 << self._config.k_min) ** 2
+            wants = self._moves >= min(self._config.full_every, self._grid.cells // twice + 1)
         elif self._config.strategy == "auto" and self._auto.stage != "exact":
             # As often as the budget allows, but no sooner than the whole map were due as a window.
             come = self._grid.distance_cells(self._full_root, self._tree.root)
