@@ -384,3 +384,14 @@ def test_where_somebody_died_of_whom_nobody_heard_anything_the_plot_stays_closed
     rights.ask("u", [63])
     assert rights.wants("u") == [63]
     assert rights.holder(30) == "v"
+
+
+def test_one_that_is_said_to_be_dead_is_still_listened_to() -> None:
+    a, b, c = three()
+    b.wish(frozenset({0}))
+    tell(b, a, c)
+    a.wish(frozenset({0}))
+    tell(a, b, c)
+    a.set_alive({"a": 1, "c": 1})
+    assert "b" in a.heard_from
+    assert "b" not in a.echoed_by

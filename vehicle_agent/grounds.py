@@ -40,7 +40,7 @@ class SharedGround:
     agents     all of the run, in the order by which witnesses are found
     witnesses  how many there are of each
 
-    heard_from  the live agents whose claims concern us: neighbours, our witnesses, and those whose witness we are
+    heard_from  whose claims concern us: neighbours, dead or alive, our witnesses, and those whose witness we are
     echoed_by   those who must have echoed a want of ours: neighbours and witnesses
     """
 
@@ -135,7 +135,9 @@ class SharedGround:
         self._settled = frozenset(plot for plot, since in self._since.items() if since <= agreed)
         neighbours = {id for id in self._alive if self._is_neighbour(id)}
         self.echoed_by = frozenset(neighbours.union(self._next_placed(1)))
-        self.heard_from = self.echoed_by.union(self._next_placed(-1))
+        # Of those who are said to be dead: should one live all the same, we had better know where it drives.
+        dead = (id for id in self._dead if self._others[id].plots & self.plots)
+        self.heard_from = self.echoed_by.union(self._next_placed(-1), dead)
 
     def _agreed_seq(self, agent: str, incarnation: int) -> int:
         known, seq = self._agreed.get(agent, (incarnation, -1))

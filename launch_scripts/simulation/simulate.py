@@ -248,7 +248,8 @@ class Simulation:
             if self.links.noticed(partition):
                 lost_s = partition.from_s + self.scenario.network.lease_s
                 self._at(lost_s, lambda nodes=nodes: self.network.relink(nodes, False))  # type: ignore[misc]
-                found_s = partition.until_s + RELINK_S
+                # Not a rounding too early: the links would still be cut, and nobody would ever look again.
+                found_s = partition.until_s + RELINK_S + 1e-6
                 self._at(found_s, lambda nodes=nodes: self.network.relink(nodes, True))  # type: ignore[misc]
 
     def _at(self, seconds: float, action: Callable[[], None]) -> None:
