@@ -34,7 +34,8 @@ class FoldPlan:
         self._started_ns = started_ns
         self._heard_ns: dict[str, int] = {}
         self._gone: set[str] = set()  # those whose tiles have been looked at
-        self._due: dict[int, None] = {}
+        self._due: dict[int, bool] = {}  # tile -> whether what was dropped there may count again
+        self._begun = False
         self._ends_ns: dict[int, int] = {}  # tile -> when the next statement of a dead author has ended
 
     def heard(self, author: str, now_ns: int) -> None:
@@ -47,31 +48,32 @@ class FoldPlan:
     def accepted(self, mark_set: MarkSet) -> None:
         """A set came: of a dead author, it may be one to fold, or take back what had overruled others."""
         if mark_set.author not in self._heard_ns:
-            self._due[mark_set.tile] = None
+            self._due[mark_set.tile] = True
 
     def update(self, ledger: Ledger, now_ns: int) -> None:
         """Notice who is gone since the last time."""
         self._heard_ns = {a: when for a, when in self._heard_ns.items() if now_ns - when <= self._after_ns}
         gone = {author for author in ledger.authors if self.is_gone(author, now_ns)}
         for rows in ledger.held(sorted(gone - self._gone)).values():
-            self._due.update(dict.fromkeys(np.frombuffer(rows, DIGEST_ROW)["tile"].tolist()))
+            for tile in np.frombuffer(rows, DIGEST_ROW)["tile"].tolist():
+                # One more that is dead overrules more, and never less; only what came before we began is not known.
+                self._due[tile] = self._due.get(tile, not self._begun)
+        self._begun = self._begun or now_ns - self._started_ns > self._after_ns
         self._gone = gone
         for tile in [tile for tile, end_ns in self._ends_ns.items() if now_ns > end_ns]:
             del self._ends_ns[tile]
-            self._due[tile] = None
+            self._due[tile] = True
 
-    def take_due(self, at_most: int, now_ns: int) -> list[int]:
-        """Tiles to look at now."""
+    def take_due(self, at_most: int, now_ns: int) -> dict[int, bool]:
+        """Tiles to look at now, and whether also at what was dropped there before."""
         if now_ns - self._started_ns <= self._after_ns:
-            return []  # we have not listened for long enough to take anybody for dead
-        tiles = list(self._due)[:at_most]
-        for tile in tiles:
-            del self._due[tile]
-        return tiles
+            return {}  # we have not listened for long enough to take anybody for dead
+        return {tile: self._due.pop(tile) for tile in list(self._due)[:at_most]}
 
-    def put_off(self, tiles: Iterable[int]) -> None:
+    def put_off(self, tiles: Mapping[int, bool]) -> None:
         """These could not be folded now."""
-        self._due.update(dict.fromkeys(tiles))
+        for tile, dropped_too in tiles.items():
+            self._due[tile] = dropped_too or self._due.get(tile, False)
 
     def folded(self, tile: int, left: Iterable[MarkSet], now_ns: int) -> None:
         """What is left of a tile's dead authors; statements that end by themselves are dropped when they have."""

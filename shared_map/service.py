@@ -29,7 +29,7 @@ _RETRY_NS = NS_PER_S
 _NOTE_AGAIN_NS = 60 * NS_PER_S
 _NAME_AT_MOST = 16
 _FOLD_EVERY_NS = NS_PER_S
-_FOLD_TILES = 64
+_FOLD_TILES = 16
 _SWEEP_EVERY_NS = 600 * NS_PER_S
 
 
@@ -150,8 +150,9 @@ class KeeperService:
         tiles = plan.take_due(_FOLD_TILES, now_ns)
         folded: list[MarkSet] = []
         try:
-            for tile in tiles:
-                sets, dropped = self.replica.sets(tile), self._store.folded(tile)
+            for tile, dropped_too in tiles.items():
+                sets = self.replica.sets(tile)
+                dropped = self._store.folded(tile) if dropped_too else {}
                 names = {*dropped, *(each.author for each in sets)}
                 gone = {name for name in names if plan.is_gone(name, now_ns)}
                 new = fold(sets, dropped, gone, now_ns - self._fold_after_ns)

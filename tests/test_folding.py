@@ -254,12 +254,15 @@ def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> 
     plan.update(replica.ledger, 105)
     plan.heard("a", 108)
     plan.update(replica.ledger, 110)
-    assert plan.take_due(9, 110) == []
+    assert plan.take_due(9, 110) == {}
     plan.update(replica.ledger, 111)
-    assert plan.take_due(9, 111) == [3]
+    assert plan.take_due(9, 111) == {3: True}  # we do not know what happened before we began
     plan.update(replica.ledger, 119)
-    assert plan.take_due(9, 119) == [0]
-    assert plan.take_due(9, 119) == []
+    assert plan.take_due(9, 119) == {0: False}
+    assert plan.take_due(9, 119) == {}
+    plan.accepted(set_of("b", 3, 2, {}))
+    plan.put_off({0: False, 3: False})
+    assert plan.take_due(9, 119) == {3: True, 0: False}
 
 
 # --- services -----------------------------------------------------------------------------------------------

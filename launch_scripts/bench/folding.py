@@ -45,7 +45,7 @@ def after_lives(lives: int, folds: bool, seed: int = 1) -> dict[str, float]:
             if folds:
                 gone = set(keeper.ledger.authors)
                 tiles = {each.tile for each in said}
-                new = [each for t in tiles for each in fold(keeper.sets(t), store.folded(t), gone, -(1 << 62))]
+                new = [each for t in tiles for each in fold(keeper.sets(t), {}, gone, -(1 << 62))]
                 store.save(new)
                 keeper.merge_many(new)
         store.forget_folded(1)  # as when the time to keep it is over
