@@ -211,7 +211,7 @@ class AgentService:
                 event.end()
             case Appeared(peer):
                 self._roster.appeared(peer)
-                if self._resume_due_ns is not None and peer.role == "agent":
+                if self._resume_due_ns is not None and self._resume_tries and peer.role == "agent":
                     self._resume_tries = 0
                     self._resume_due_ns = min(self._resume_due_ns, now_ns + _ASK_AGAIN_NS)
                 self._mourned_ns.pop(peer.id if peer.role == "agent" else "", None)
