@@ -7,7 +7,7 @@ from typing import Any
 
 from swarm.codec import MAX_PAYLOAD_BYTES
 from swarm.config import NetworkConfig
-from swarm.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, STATS
+from swarm.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, SIGHTED, STATS
 from swarm.zenoh_bus import tls_settings
 
 PUTS = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
@@ -90,7 +90,8 @@ def own_keys(name: str) -> list[str]:
         MARKS.key.format(region="*", tile="*", author=author),
         DIGEST.key.format(author=author),
         FLEET.key.format(region="*", author=author),
-        CLAIMS.key.format(**dict.fromkeys(CLAIMS.fields, "*") | {"agent": agent}),
+        SIGHTED.key.format(target="*", author=author),
+        CLAIMS.key.format(agent=agent),
         GROUNDS.key.format(agent=agent),
         FOLLOWED.key.format(agent=agent, vehicle="*"),
         STATS.key.format(role="agent", id=agent),
