@@ -21,8 +21,6 @@ SMALL_RATIO = 64
 FINE = float(1 << 20)
 """While no cost exceeds so many smallest weights, float32 tells any cell's cost from its parent's."""
 
-ALL_CELLS = np.empty(0, np.uint8)
-
 
 def flood(
     weight: Floats,
@@ -34,25 +32,23 @@ def flood(
     corners: bool,
     cost: Floats,
     parent: NDArray[np.uint8] | None,
-    active: NDArray[np.uint8] = ALL_CELLS,
 ) -> float:
     """Grow the exact tree of a padded root. Returns a bound that no cost exceeds.
 
     low, high  bounds of the finite weights, s
-    active     cells that take part; the cost of others is without meaning, and so are all parents
     """
     box = (0, 0, weight.size // stride - 2, stride - 2)
     longest = high * (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
     if longest <= min(MAX_RATIO, max(SMALL_RATIO, weight.size // CELLS_PER_BUCKET)) * low:
         width = np.float32(low * 0.98)
         ring = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
-        last = kernels.flood(weight, active, cost, stride, root, rule, corners, width, ring)
+        last = kernels.flood(weight, cost, stride, root, rule, corners, width, ring)
         if last != TOO_FINE:
             if parent is not None:
                 kernels.point_to_parents(weight, cost, stride, rule, corners, root, box, parent)
             return float((last + 1) * width)
     parents = np.empty(weight.size, np.uint8) if parent is None else parent
-    reach = float(flood_wide(weight, active, cost, stride, root, rule, corners, np.float32(low), parents))
+    reach = float(flood_wide(weight, cost, stride, root, rule, corners, np.float32(low), parents))
     if parent is not None and reach <= FINE * low:
         kernels.point_to_parents(weight, cost, stride, rule, corners, root, box, parent)
     return reach

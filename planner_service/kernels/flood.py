@@ -41,19 +41,14 @@ _AHEAD = 8
 
 
 @njit(cache=True, nogil=True)
-def open_costs(weight, active, cost):
-    """Before a flood: inf on passable cells, LETHAL on the others; 0 on passable ones that are not to take part,
-    which is below every key too. `active` is empty if all take part."""
-    if active.size == 0:
-        for i in range(weight.size):
-            cost[i] = INF if weight[i] < INF else LETHAL
-        return
+def _open_costs(weight, cost):
+    """Before a flood: inf on passable cells, LETHAL on the others."""
     for i in range(weight.size):
-        cost[i] = (INF if active[i] else _ZERO32) if weight[i] < INF else LETHAL
+        cost[i] = INF if weight[i] < INF else LETHAL
 
 
 @njit(cache=True, nogil=True)
-def close_costs(cost):
+def _close_costs(cost):
     """After a flood: inf on lethal cells too."""
     for i in range(cost.size):
         c = cost[i]
@@ -238,10 +233,8 @@ def _offer_around(weight, cost, s, corners, batch, n, touched):
 
 
 @njit(cache=True, nogil=True)
-def flood(weight, active, cost, stride, root, rule, corners, width, ring):
+def flood(weight, cost, stride, root, rule, corners, width, ring):
     """First-touch flood. `cost` is written whole.
-
-    active uint8    the cells that take part; empty if all
 
     width  of a bucket, s: below the smallest weight, so that nothing in a bucket leads back into it
     ring   buckets in the circular queue, a power of two; ring * width exceeds the dearest step by two widths
@@ -262,7 +255,7 @@ def flood(weight, active, cost, stride, root, rule, corners, width, ring):
     second = ring if rule == RULE_OCTILE else _ZERO
     inverse = _ONE32 / width
 
-    open_costs(weight, active, cost)
+    _open_costs(weight, cost)
     cost[np.uint64(root)] = _ZERO32
     touched[0] = root
     count = _ONE
@@ -279,7 +272,7 @@ def flood(weight, active, cost, stride, root, rule, corners, width, ring):
             _choose(weight, cost, SQRT2, inverse, following, touched, count, batch)
             _put(queue, touched, count, batch, ring, ring)
         if waiting == _ZERO:
-            close_costs(cost)
+            _close_costs(cost)
             return current
         if current > 1 << 20:
             return TOO_FINE

@@ -39,11 +39,10 @@ def _enter(heads, links, waiting, item, key, served):
 
 
 @njit(cache=True, nogil=True)
-def flood_wide(weight, active, cost, stride, root, rule, corners, width, parent):
+def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
     """First-touch flood for weights of any ratio. `cost` and `parent` are written whole: where one weight drowns in
     the rounding of another, costs do not tell the parents.
 
-    active uint8    the cells that take part; empty if all
     width  s; the smallest weight, or less
 
     Returns the largest exit key, which no cost exceeds.
@@ -53,7 +52,7 @@ def flood_wide(weight, active, cost, stride, root, rule, corners, width, parent)
     kinds = 2 if rule == RULE_OCTILE else 1
     for i in range(weight.size):
         parent[i] = NONE
-        cost[i] = INF if weight[i] < INF and (active.size == 0 or active[i]) else LETHAL
+        cost[i] = INF if weight[i] < INF else LETHAL
     # With octile steps item 2 * v waits under the straight key of v, 2 * v + 1 under its diagonal one. None is 0.
     heads = np.zeros(_LEVELS * _SLOTS, np.uint32)
     links = np.empty(kinds * weight.size, np.uint32)
