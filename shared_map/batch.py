@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from shared_map.marks import NO_STATEMENT
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.messages import FOREVER, TILE_AREA, MarkKind, MarkSet, column
+from swarm.messages import FOREVER, TILE_AREA, MarkKind, MarkSet, MarkSets, column
 
 
 class Arrival(NamedTuple):
@@ -56,6 +56,25 @@ def difference_of_many(arrivals: Sequence[Arrival], now_ns: int) -> Said:
         lonely = set(alone)
         found.append(_disputed(arrivals, [at for at in range(len(arrivals)) if at not in lonely], now_ns))
     return found[0] if len(found) == 1 else _together(found)
+
+
+def said_in(bulk: MarkSets, which: NDArray[np.bool_]) -> Said:
+    """What these sets of a message say of tiles that nobody has spoken of; each set's number is its place there.
+
+    which  bool (sets,)  sets of which no statement ends by itself
+    """
+    counts = column(bulk.counts, "<u2")
+    kinds = column(bulk.kinds, "<u1")
+    places = np.repeat(np.arange(len(counts), dtype=np.int32) << _AREA_BITS, counts)
+    places += column(bulk.cells, "<u2")
+    paces = column(bulk.paces, "<f4")
+    if kinds.any():
+        paces = np.where(kinds == _PACE, paces, np.float32(0))
+    said = Said(places, kinds, paces, column(bulk.stamps_ns, "<i8"))
+    heard = kinds != _CLEAR
+    if not which.all():
+        heard &= np.repeat(which, counts)
+    return said if heard.all() else said.taken(heard)
 
 
 def cells_of(grid: GridSpec, tiles: NDArray[np.int64], places: NDArray[np.int32]) -> NDArray[np.uint32]:

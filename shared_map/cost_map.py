@@ -67,17 +67,18 @@ class CostMap:
             raise OutsideGridError(f"a mark is on cell {int(where.max())} of {self.grid.rows} x {self.grid.cols}")
         where, values = self._last_of_each(where, np.asarray(kinds), np.asarray(paces, np.float32))
         ground = self.ground_s_per_m.reshape(-1)
-        changed = ground[where] != values
-        if not changed.any():
+        was = ground[where]
+        changed = was != values
+        if not changed.all():
+            where, values, was = where[changed], values[changed], was[changed]
+        if not len(where):
             return
-        where, values = where[changed], values[changed]
-        lethality = np.isinf(ground[where]) != np.isinf(values)
         ground[where] = values
         self.version += 1
-        if not self._halves:
+        if self._halves:
+            self._compose(where, where[np.isinf(was) != np.isinf(values)])
+        else:
             self._note_dirty(where)
-            return
-        self._compose(where, where[lethality])
 
     def _apply_few(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
         """As `apply` of the handful of cells that a set changes as a rule: an array of one cell costs as much as
@@ -120,8 +121,9 @@ class CostMap:
         self, where: NDArray[np.int64], kinds: NDArray[np.uint8], paces: Floats
     ) -> tuple[NDArray[np.int64], Floats]:
         values = np.where(kinds == MarkKind.PACE, paces, LETHAL)
-        clear = kinds == MarkKind.CLEAR
-        values[clear] = self._prior[where[clear]]
+        clear = np.flatnonzero(kinds == MarkKind.CLEAR)
+        if len(clear):
+            values[clear] = self._prior[where[clear]]
         if len(where) > 1:
             ordered = np.sort(where)
             if (ordered[1:] == ordered[:-1]).any():
@@ -167,12 +169,14 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
     very many."""
     if len(cells) == 0:
         return []
-    rows, columns = np.divmod(cells, cols)
+    rows = cells // cols  # with the next line half the time of divmod
+    columns = cells - rows * cols
     tiles = (rows // TILE_CELLS) * (cols // TILE_CELLS + 1) + columns // TILE_CELLS
+    if len(tiles) > _MANY_BOXES and np.count_nonzero(np.bincount(tiles)) > _MANY_BOXES:
+        # A late join: to look which of thousands touch would take longer than to join.
+        return [Window(int(rows.min()), int(columns.min()), int(rows.max()) + 1, int(columns.max()) + 1)]
     order = np.argsort(tiles, kind="stable")
     starts = np.flatnonzero(np.diff(tiles[order], prepend=-1))
-    if len(starts) > _MANY_BOXES:  # a late join: to look which of thousands touch would take longer than to join
-        return [Window(int(rows.min()), int(columns.min()), int(rows.max()) + 1, int(columns.max()) + 1)]
     rows, columns = rows[order], columns[order]
     tops, bottoms = np.minimum.reduceat(rows, starts), np.maximum.reduceat(rows, starts)
     lefts, rights = np.minimum.reduceat(columns, starts), np.maximum.reduceat(columns, starts)

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from swarm.messages import DIGEST_ROW, MarkSet
 
@@ -32,10 +32,16 @@ class Ledger:
         for each in sets:
             of_author.setdefault(each.author, []).append(each)
         for author, theirs in of_author.items():
-            rows = self._authors.setdefault(author, _Rows())
-            rows.record_many(
-                [each.tile for each in theirs], [each.epoch for each in theirs], [each.seq for each in theirs]
+            self.record_rows(
+                author,
+                [each.tile for each in theirs],
+                [each.epoch for each in theirs],
+                [each.seq for each in theirs],
             )
+
+    def record_rows(self, author: str, tiles: list[int], epochs: ArrayLike, seqs: ArrayLike) -> None:
+        """As `record` of each of an author's sets, given as columns; no tile occurs twice."""
+        self._authors.setdefault(author, _Rows()).record_many(tiles, epochs, seqs)
 
     def drop(self, author: str, tile: int) -> None:
         """Nothing is held any more of this tile of an author."""
@@ -103,7 +109,7 @@ class _Rows:
             self._ordered = self._ordered and (place == 0 or int(self._rows["tile"][place - 1]) < tile)
         self._rows[place] = (tile, epoch, seq)
 
-    def record_many(self, tiles: list[int], epochs: list[int], seqs: list[int]) -> None:
+    def record_many(self, tiles: list[int], epochs: ArrayLike, seqs: ArrayLike) -> None:
         """Tiles are all different."""
         new = [tile for tile in tiles if tile not in self._place]
         if new:
@@ -114,8 +120,7 @@ class _Rows:
             self._ordered = False
         place = self._place
         at = [place[tile] for tile in tiles]
-        for name, values in (("tile", tiles), ("epoch", epochs), ("seq", seqs)):
-            self._rows[name][at] = values
+        self._rows["tile"][at], self._rows["epoch"][at], self._rows["seq"][at] = tiles, epochs, seqs
 
     def drop(self, tile: int) -> int:
         """Returns how many are left."""

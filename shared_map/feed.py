@@ -141,12 +141,14 @@ class MapFeed:
                 self._hear(samples, now_ns)
             case Heard(topic=topic, message=Digest() as digest) if topic is DIGEST:
                 self._hear_digest(digest, now_ns)
-            case Replied(tag=tag, topic=topic) if topic is MARKS and tag == _JOIN:
-                self._merge(self._told(event), measured=False)
+            case Replied(tag=tag, topic=topic) if topic is MARKS and tag in (_JOIN, _ENTER):
+                self._take_in(event)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag.startswith(_RESYNC):
-                self._admit(self._told(event), now_ns)
-            case Replied(tag=tag, topic=topic) if topic is MARKS and tag == _ENTER:
-                self._merge(self._told(event), measured=False)
+                match self._told(event):
+                    case MarkSets() as many:
+                        self._admit(unpacked(many), now_ns)
+                    case MarkSet() as one:
+                        self._admit([one], now_ns)
             case AskEnded(tag=tag) if tag == _ENTER:
                 self.joined = True
             case AskEnded(tag=tag) if tag == _JOIN:
@@ -226,19 +228,23 @@ class MapFeed:
             self._quota.charge(heard.author, 0 if changed is None else len(changed), now_ns)
             self._name_crowded_out(now_ns)
 
-    def _told(self, event: Replied) -> list[MarkSet]:
-        """The sets in a reply. Nobody speaks for another there either, whether of one tile or of many."""
-        match event.message:
-            case MarkSet() as one if event.fields.get("tile") == str(one.tile):
-                sets = [one]
-            case MarkSets() as many if event.fields.get("tile") == _MANY:
-                sets = unpacked(many)
-            case _:
-                sets = []
-        if sets and event.fields.get("author") == sets[0].author:
-            return sets
+    def _told(self, event: Replied) -> MarkSet | MarkSets | None:
+        """What a reply says. Nobody speaks for another there either, whether of one tile or of many."""
+        message = event.message
+        if isinstance(message, MarkSet | MarkSets) and event.fields.get("author") == message.author:
+            tile = str(message.tile) if isinstance(message, MarkSet) else _MANY
+            if event.fields.get("tile") == tile:
+                return message
         self.replica.counts["sets_refused"] += 1
-        return []
+        return None
+
+    def _take_in(self, event: Replied) -> None:
+        """Sets of a late join, or of where our interest turned to: what was said before, so at once."""
+        match self._told(event):
+            case MarkSets() as many:
+                self._note_accepted(self.replica.merge_bulk(many, measured=False))
+            case MarkSet() as one:
+                self._merge([one], measured=False)
 
     def _admit(self, sets: Sequence[MarkSet], now_ns: int) -> None:
         """Merge sets now, or later if their author says too much."""
@@ -273,7 +279,9 @@ class MapFeed:
         self._quota.forget(now_ns)
 
     def _merge(self, sets: Sequence[MarkSet], *, measured: bool) -> Merged:
-        merged = self.replica.merge_many(sets, measured=measured)
+        return self._note_accepted(self.replica.merge_many(sets, measured=measured))
+
+    def _note_accepted(self, merged: Merged) -> Merged:
         if self._on_accepted is not None:
             for each in merged.sets:
                 self._on_accepted(each)

@@ -53,6 +53,21 @@ class Room:
         self.marks += marks
         return True
 
+    def take_new(self, author: str, sets: int, marks: int) -> bool:
+        """As `take` of so many sets that replace none; False, and nothing taken, unless there is room for all."""
+        held = self._authors.get(author, (0, 0))
+        if (
+            self.sets + sets > self._max_sets
+            or held[0] + sets > self._max_sets // _SHARE
+            or self.marks + marks > self._max_marks
+            or held[1] + marks > self._max_marks // _SHARE
+        ):
+            return False
+        self._authors[author] = [held[0] + sets, held[1] + marks]
+        self.sets += sets
+        self.marks += marks
+        return True
+
     def free(self, old: MarkSet) -> None:
         """`old` is held no more."""
         held = self._authors[old.author]

@@ -176,3 +176,40 @@ def test_a_tombstone_gives_the_marks_back_but_not_the_set() -> None:
     bounded.merge(set_of("a", 0, 1, {0: (LETHAL, 0, 1), 1: (CLEAR, 0, 1)}))
     bounded.merge(set_of("a", 0, 2, {}))
     assert (bounded.room.sets, bounded.room.marks) == (1, 0)
+
+
+@given(st.lists(mark_sets() | ending_sets(), max_size=30), st.integers(0, 30), st.data())
+def test_messages_of_many_sets_merge_as_these_one_by_one(
+    sets: list[MarkSet], cut: int, data: st.DataObject
+) -> None:
+    """Also after other sets and burials were heard, in any order of the messages."""
+    singly, single = replica()
+    together, many = replica()
+    singly.tick(3)
+    together.tick(3)
+    for each in sets[:cut]:
+        singly.merge(each)
+        together.merge(each)
+    one_each = list({(each.tile, each.author): each for each in sets[cut:]}.values())
+    for message in data.draw(st.permutations(list(packed(one_each)))):
+        merged = together.merge_bulk(message)
+        changed = [(each, singly.merge(each)) for each in unpacked(message)]
+        taken = {(each.tile, each.author): len(cells) for each, cells in changed if cells is not None}
+        assert {(e.tile, e.author): n for e, n in zip(merged.sets, merged.changed, strict=True)} == taken
+    assert many.same(single)
+    assert together.digest() == singly.digest()
+    assert together.counts == singly.counts
+    assert together.answer(MarksRequest()) == singly.answer(MarksRequest())
+    assert (together.room.sets, together.room.marks) == (singly.room.sets, singly.room.marks)
+    for now_ns in (5, 9):
+        singly.tick(now_ns)
+        together.tick(now_ns)
+        assert many.same(single)
+
+
+def test_what_has_no_room_for_all_is_taken_in_as_far_as_there_is_room() -> None:
+    sets = [set_of("b", tile, 1, {3: (LETHAL, 0, 1)}) for tile in range(4)]
+    crowded = MapReplica(GRID, Composite(), room=Room(max_sets=8, max_marks=1 << 20))
+    [message] = packed(sets)
+    assert len(crowded.merge_bulk(message).sets) == 2
+    assert (crowded.room.sets, crowded.counts["sets_without_room"]) == (2, 2)
