@@ -22,7 +22,7 @@ class Sightings:
         self._newest: dict[tuple[str, str], Sighted] = {}
 
     def hear(self, sighted: Sighted) -> bool:
-        """Take in what was seen. False of what is not read, not news, or too much to keep."""
+        """Take in what was seen, also what has ended by now. False of what is not read, no news, or too much."""
         key = (sighted.target, sighted.author)
         known = self._newest.get(key)
         if known is not None and (sighted.stamp_ns, sighted.seq) <= (known.stamp_ns, known.seq):

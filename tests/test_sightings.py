@@ -118,3 +118,14 @@ def test_targets_that_nobody_tracks_are_chased_by_what_vehicles_see() -> None:
     store = simulation.nodes["keeper-0"].store
     assert store is not None
     assert {each.target for each in store.sightings()} <= {"lost0", "lost1"} != set()
+
+
+def test_a_sighting_that_ended_on_its_way_tells_nobody_anything() -> None:
+    blind = msgspec.structs.replace(UNTRACKED.vehicles, sense_range_m=0.1)
+    simulation = Simulation(msgspec.structs.replace(UNTRACKED, vehicles=blind))
+    simulation.run_until(1)
+    stranger = simulation.network.bus("stranger")
+    late = sighted(0, target="lost0", author="all.a9.1", until_ns=1)
+    stranger.publish(SIGHTED, late, target="lost0", author="all.a9.1")
+    simulation.run_until(2)
+    assert simulation.report(2)["payloads_dropped"] == 0

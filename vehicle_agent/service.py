@@ -359,8 +359,11 @@ class AgentService:
             self._hear_sighted(sighted, now_ns)
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
-        if sighted.target in self._untracked and self._sightings.hear(sighted):
-            self._agent.hear_pose(pose_of(self._sightings.best(now_ns)[sighted.target]), now_ns)
+        if sighted.target not in self._untracked or not self._sightings.hear(sighted):
+            return
+        best = self._sightings.best(now_ns).get(sighted.target)  # None where what came late has ended already
+        if best is not None:
+            self._agent.hear_pose(pose_of(best), now_ns)
 
     # --- doing what was decided -----------------------------------------------------------------------------
 
