@@ -23,8 +23,8 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class HeardMany:
-    """Samples that waited together on a topic subscribed to with `together`, in the order of their coming: (end of
-    the key from the topic's first field on, message)."""
+    """Samples that waited together on a topic subscribed to with `together`, in the order of their coming: (key
+    below the namespace, message)."""
 
     topic: Topic
     samples: Sequence[tuple[str, Message]]
@@ -126,9 +126,11 @@ class Bus(Protocol):
         ...
 
     def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
-        """Post `Heard` for every sample; what does not parse is counted, logged and dropped.
+        """Post `Heard` for every sample; what does not parse, or says that it is another's than its key says, is
+        counted, logged and dropped.
 
-        together  post `HeardMany` of all samples that wait, for a topic of many small messages
+        together  post `HeardMany` of all samples that wait, for a topic of many small messages: whether each is
+                  under its own key is then for the reader to see
         """
         ...
 

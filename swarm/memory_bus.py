@@ -180,6 +180,21 @@ def _as_many(post: Post) -> Post:
     return together
 
 
+def _as_keyed(post: Post, counts: dict[str, int]) -> Post:
+    """Drop what says that it is another's than its key says."""
+
+    def alone(event: Event) -> None:
+        if isinstance(event, Heard):
+            try:
+                event.topic.check_key(event.fields, event.message)
+            except ProtocolError:
+                counts["payloads_dropped"] += 1
+                return
+        post(event)
+
+    return alone
+
+
 def _meet(narrow: Mapping[str, str], fields: Mapping[str, str]) -> bool:
     for name, chunk in narrow.items():
         other = fields[name]
@@ -218,7 +233,7 @@ class MemoryBus:
                 network.scheduler.at(when_ns, _Arrival(self, interest, sample))
 
     def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
-        interest = _interest(self, topic, fields, _as_many(post) if together else post)
+        interest = _interest(self, topic, fields, _as_many(post) if together else _as_keyed(post, self.counts))
         index = self.network.subscriptions.setdefault((self.namespace, topic.name), _Index())
         index.add(interest, topic)
 

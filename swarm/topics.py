@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from swarm.codec import prime
+from swarm.errors import ProtocolError
 from swarm.messages import (
     BaseMap,
     BaseMapRequest,
@@ -70,6 +71,7 @@ class Topic:
     buffer: int = 1024
     fields: tuple[str, ...] = field(init=False, repr=False, compare=False)
     _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
+    _said_twice: tuple[str, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.key))
@@ -78,6 +80,8 @@ class Topic:
             if message_type is not None:
                 prime(message_type)  # before there are threads to meet it half described
         object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
+        said_twice = tuple(name for name in self.fields if name in self.message.__struct_fields__)
+        object.__setattr__(self, "_said_twice", said_twice)
 
     def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
         """All fields as chunks of a key; those not given become `*`.
@@ -112,6 +116,14 @@ class Topic:
             return None
         match = self._pattern.fullmatch(key, len(namespace) + 1)
         return match.groupdict() if match else None
+
+    def check_key(self, fields: Mapping[str, str], message: Message) -> None:
+        """Raise ProtocolError where a message that was put says it is another's than its key says: access is
+        granted by key, so nobody may speak for somebody else under its own."""
+        for name in self._said_twice:
+            said = str(getattr(message, name))
+            if said != fields[name]:
+                raise ProtocolError(f"{name} is {said[:80]!r} in the message and {fields[name]!r} in its key")
 
 
 _CHUNK = re.compile(r"[^/*$?#\s]+|\*")

@@ -161,6 +161,7 @@ class ZenohBus:
             try:
                 named = self._fields(topic, key)
                 message = decode(sample.payload.to_bytes(), topic.message)
+                topic.check_key(named, message)
             except ProtocolError as error:
                 self._drop(key, error)
                 return
@@ -191,6 +192,7 @@ class ZenohBus:
         for subscriber in self._subscribers.pop(topic.expression(self._namespace, **fields), ()):
             self._entities.remove(subscriber)
             subscriber.undeclare()  # which ends the thread that reads its channel
+        self._threads = [thread for thread in self._threads if thread.is_alive()]  # those of earlier ones
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         request_type = topic.request

@@ -166,7 +166,7 @@ def test_a_subscription_with_a_field_hears_only_that_key(world: World):
     world.settle()
     for target in ("t0", "t1", "t10"):
         a.publish(POSE, pose(target), target=target)
-    world.until(lambda: len(every) == 3)
+    world.until(lambda: len(every) == 3 and one)
     assert [event.fields["target"] for event in every] == ["t0", "t1", "t10"]
     assert [event.fields["target"] for event in one] == ["t1"]
 
@@ -204,6 +204,17 @@ def test_garbage_is_counted_and_dropped_and_what_follows_is_heard(world: World):
     world.until(lambda: box)
     assert len(box) == 1
     assert b.counts["payloads_dropped"] == 4
+
+
+def test_what_says_that_it_is_anothers_than_its_key_says_is_dropped(world: World):
+    a, b, box = world.bus("a"), world.bus("b"), Box()
+    b.subscribe(POSE, box)
+    world.settle()
+    a.publish(POSE, pose("t1"), target="t0")
+    a.publish(POSE, pose("t0"), target="t0")
+    world.until(lambda: box)
+    assert [event.message for event in box] == [pose("t0")]
+    assert b.counts["payloads_dropped"] == 1
 
 
 def test_a_key_that_is_not_one_value_is_a_bug_that_raises(world: World):
