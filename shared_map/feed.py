@@ -98,6 +98,8 @@ class MapFeed:
         self._join_tries = 0
         self._claims: dict[tuple[str, bool], _Claim] = {}  # (sender, whether it is whole)
         self._claim_bytes = 0
+        self._digest_seq = 0
+        self._heard_seqs: dict[tuple[str, bool], int] = {}  # of the newest digest of a sender
         self._recent: dict[int, int | None] = {}  # own tile that was put -> until when that is told of
         self._changes_due_ns = 0
         self._asking: dict[str, int] = {}  # author -> when asked for
@@ -336,11 +338,16 @@ class MapFeed:
     def _hear_digest(self, digest: Digest, now_ns: int) -> None:
         if digest.author == self._name:
             return
+        sender = (digest.author, digest.whole)
+        if digest.seq:
+            if digest.seq <= self._heard_seqs.get(sender, 0):
+                return  # it was overtaken on its way
+            if sender in self._heard_seqs or len(self._heard_seqs) < _MAX_NAMES:
+                self._heard_seqs[sender] = digest.seq
         if digest.author in self._heard_ns or len(self._heard_ns) < _MAX_NAMES:
             self._heard_ns[digest.author] = now_ns
         if digest.role == "keeper" and digest.whole:
             self._kept = digest.held
-        sender = (digest.author, digest.whole)
         waiting = self._claims.pop(sender, None)
         if waiting is not None:
             self._claim_bytes -= waiting.size
@@ -369,9 +376,9 @@ class MapFeed:
                 self._recent[tile] = now_ns + _RECENT_NS
             elif now_ns >= until_ns:
                 del self._recent[tile]
-        self._bus.publish(
-            DIGEST, Digest(author=self._name, role=self._role, held=held, whole=whole), author=self._name
-        )
+        self._digest_seq += 1
+        digest = Digest(author=self._name, role=self._role, held=held, whole=whole, seq=self._digest_seq)
+        self._bus.publish(DIGEST, digest, author=self._name)
 
     def _compare(self, sender: tuple[str, bool], claim: _Claim, now_ns: int) -> None:
         """Ask for what they hold and we miss; give a keeper what we hold and it misses of those who are gone."""

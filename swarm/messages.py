@@ -172,12 +172,14 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
 
     whole  false: only tiles that changed lately, told between the whole digests
+    seq    counts this sender's digests, so that one that comes late replaces no newer one; 0 if it does not count
     """
 
     author: str
     role: str
     held: dict[str, bytes]
     whole: bool = True
+    seq: Natural = 0
 
     def __post_init__(self) -> None:
         check_id("author", self.author)

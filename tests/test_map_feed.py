@@ -156,6 +156,23 @@ def test_digests_without_end_are_held_within_bounds() -> None:
     assert listener.feed._claim_bytes == 0
 
 
+def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
+    swarm = MapSwarm()
+    keeper_says = swarm.network.bus("k")
+    listener = swarm.listener("p")
+    kept = {seq: np.array([(3, 1, seq)], DIGEST_ROW).tobytes() for seq in (1, 2, 3)}
+    for seq in (2, 1):
+        digest = Digest(author="k.1", role="keeper", held={"a1.1": kept[seq]}, seq=seq)
+        keeper_says.publish(DIGEST, digest, author="k.1")
+        swarm.run(0.01)
+    [claim] = listener.feed._claims.values()
+    assert claim.digest.held == listener.feed._kept == {"a1.1": kept[2]}
+    uncounted = Digest(author="k.1", role="keeper", held={"a1.1": kept[3]})
+    keeper_says.publish(DIGEST, uncounted, author="k.1")
+    swarm.run(0.01)
+    assert listener.feed._kept == {"a1.1": kept[3]}
+
+
 def test_events_of_others_are_left_to_others() -> None:
     swarm = MapSwarm()
     listener = swarm.listener("p")

@@ -105,7 +105,7 @@ def digests(draw: st.DrawFn) -> Digest:
     rows = st.lists(st.tuples(st.integers(0, (1 << 32) - 1), naturals, naturals), max_size=5)
     held = draw(st.dictionaries(ids, rows, max_size=3))
     packed = {author: np.array(given, DIGEST_ROW).tobytes() for author, given in held.items()}
-    return Digest(author=draw(ids), role=draw(texts), held=packed)
+    return Digest(author=draw(ids), role=draw(texts), held=packed, seq=draw(naturals))
 
 
 @st.composite
