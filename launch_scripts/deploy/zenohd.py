@@ -10,7 +10,8 @@ from swarm.config import NetworkConfig
 from swarm.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, SIGHTED, STATS
 from swarm.zenoh_bus import tls_settings
 
-PUTS = ("put", "delete", "declare_queryable", "reply", "liveliness_token")
+ANSWERS = ("declare_queryable", "reply")
+PUTS = ("put", "delete", *ANSWERS, "liveliness_token")
 READS = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
 
 
@@ -61,19 +62,22 @@ def zenohd_config(
 def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]) -> dict[str, Any]:
     """Zenoh's rules, by the common name of the certificate at the other end of a link.
 
-    An agent hears everything and writes under its own name only: authors are called `GROUP.ID.INCARNATION`.
+    An agent hears everything and writes under its own name only: authors are called `GROUP.ID.INCARNATION`. It
+    answers for others, too, where it is asked for the last claims of those that are gone.
     """
     whole = [f"{namespace}/**"]
     rules = [_rule("all", (*PUTS, *READS), whole), _rule("hear", READS, whole)]
     # What others said must reach those that may hear it: the way out to them is a matter of its own.
     rules.append(_rule("told", PUTS, whole, flows=["egress"]))
     rules.append(_rule("asked", READS, whole, flows=["egress"]))
+    # Where the vehicles of an agent stand that is gone, only those that heard it last can tell.
+    rules.append(_rule("words", ANSWERS, [CLAIMS.expression(namespace)]))
     policies = [{"rules": ["all"], "subjects": ["trusted"]}] if trusted else []
     subjects = [{"id": "trusted", "cert_common_names": list(trusted)}] if trusted else []
     for agent in agents:
         rules.append(_rule(f"own-{agent}", PUTS, [f"{namespace}/{key}" for key in own_keys(agent)]))
         subjects.append({"id": agent, "cert_common_names": [agent]})
-        policies.append({"rules": ["hear", "told", "asked", f"own-{agent}"], "subjects": [agent]})
+        policies.append({"rules": ["hear", "told", "asked", "words", f"own-{agent}"], "subjects": [agent]})
     return {
         "enabled": True,
         "default_permission": "deny",
