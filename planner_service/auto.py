@@ -14,7 +14,7 @@ make the stage flap."""
 
 class Auto:
     """Exact trees while one fits into a tick; then windows, with full growths in turn; and where these come so
-    seldom that the target leaves what the widest window can make up for, a coarse tree beyond that.
+    seldom that the target leaves what the widest window can make up for, rings beyond that.
 
     budget_ns  CPU time that a tick may take
     stage      what to do now; a function of the times observed alone, so that a model decides alike everywhere

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -111,10 +111,6 @@ class Ground:
         cells: Cells = (rows - 1) * self.grid.cols + cols - 1
         return cells
 
-    def unpad(self, padded: int) -> int:
-        row, col = divmod(padded, self.stride)
-        return (row - 1) * self.grid.cols + col - 1
-
     def load(self, pace: Floats) -> None:
         """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative."""
         check_pace(self.grid, pace)
@@ -128,11 +124,8 @@ class Ground:
         """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative."""
         check_pace(self.grid, pace)
         found: list[Changes] = []
-        for window in dirty:
-            row0, col0 = max(window.row0, 0), max(window.col0, 0)
-            row1, col1 = min(window.row1, self.grid.rows), min(window.col1, self.grid.cols)
-            if row1 <= row0 or col1 <= col0:
-                continue
+        for box in self._boxes(dirty):
+            row0, col0, row1, col1 = box
             room = (row1 - row0) * (col1 - col0)
             cells = np.empty(room, np.int64)
             before = np.empty(room, np.float32)
@@ -140,7 +133,7 @@ class Ground:
                 pace,
                 self._metres,
                 np.float32(self.length_weight_s),
-                (row0, col0, row1, col1),
+                box,
                 self.stride,
                 self.weight,
                 cells,
@@ -167,19 +160,23 @@ class Ground:
     def difference(self, older: Floats, dirty: Sequence[Window]) -> Changes:
         """What changed inside the dirty windows since `older` weights."""
         parts: list[Cells] = []
-        for window in dirty:
-            row0, col0 = max(window.row0, 0), max(window.col0, 0)
-            row1, col1 = min(window.row1, self.grid.rows), min(window.col1, self.grid.cols)
-            if row1 <= row0 or col1 <= col0:
-                continue
-            shape = (self.grid.rows + 2, self.stride)
-            box = (slice(row0 + 1, row1 + 1), slice(col0 + 1, col1 + 1))
-            rows, cols = np.nonzero(self.weight.reshape(shape)[box] != older.reshape(shape)[box])
+        shape = (self.grid.rows + 2, self.stride)
+        for row0, col0, row1, col1 in self._boxes(dirty):
+            part = np.s_[row0 + 1 : row1 + 1, col0 + 1 : col1 + 1]
+            rows, cols = np.nonzero(self.weight.reshape(shape)[part] != older.reshape(shape)[part])
             parts.append((rows + row0 + 1) * self.stride + cols + col0 + 1)
         if not parts:
             return NO_CHANGES
         cells = np.unique(np.concatenate(parts))
         return Changes(cells, older[cells], self.weight[cells])
+
+    def _boxes(self, windows: Sequence[Window]) -> Iterator[tuple[int, int, int, int]]:
+        """(row0, col0, row1, col1) of what of each window lies on the grid, where anything does."""
+        for window in windows:
+            row0, col0 = max(window.row0, 0), max(window.col0, 0)
+            row1, col1 = min(window.row1, self.grid.rows), min(window.col1, self.grid.cols)
+            if row0 < row1 and col0 < col1:
+                yield row0, col0, row1, col1
 
     def grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
         """The exact tree of a padded, passable root. Arrays are written whole; no cost exceeds what is returned."""
@@ -194,17 +191,3 @@ class Ground:
 
     def passable(self, cell: int) -> bool:
         return bool(self.weight[self.pad(cell)] < np.inf)
-
-    def is_step(self, a: int, b: int) -> bool:
-        """Whether a vehicle may go from padded cell a to its neighbour b."""
-        gap = b - a
-        row_step = round(gap / self.stride)
-        col_step = gap - row_step * self.stride
-        if max(abs(row_step), abs(col_step)) != 1 or not self.weight[a] < np.inf or not self.weight[b] < np.inf:
-            return False
-        if row_step == 0 or col_step == 0:
-            return True
-        if self.rule == RULE_FOUR:
-            return False
-        corners = self.weight[a + row_step * self.stride], self.weight[a + col_step]
-        return self.corners or bool(max(corners) < np.inf)

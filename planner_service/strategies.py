@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from planner_service.auto import Auto
 from planner_service.bounds import LowerBounds
 from planner_service.directed import ground_of
-from planner_service.ground import Changes, check_pace
+from planner_service.ground import Changes, Ground, check_pace
 from planner_service.kernels.rules import NONE
 from planner_service.routes import read_routes
 from planner_service.skeleton import Skeleton, find_skeleton
@@ -72,8 +72,11 @@ FINE_SHARE = 16
 class GrownTree:
     """An exact tree, grown by a worker on a snapshot.
 
+    target_cell           the root, wherever the target was
     cost, parent, weight  padded, as `kernels.rules` says
+    reach                 s; no cost exceeds it. Negative where nothing was grown, as no tree can lead there
     offered               padded parents of the tree that was served when the snapshot was taken; None before any
+    skeleton              None unless it was wanted
     """
 
     target_cell: int
@@ -83,18 +86,7 @@ class GrownTree:
     weight: Floats
     reach: float
     offered: NDArray[np.uint8] | None
-    stride: int
     skeleton: Skeleton | None = None
-
-    @property
-    def cost_to_go(self) -> Floats:
-        """(rows, cols) float32, s; inf where there is no way."""
-        return np.ascontiguousarray(self.cost.reshape(-1, self.stride)[1:-1, 1:-1])
-
-    @property
-    def parents(self) -> NDArray[np.uint8]:
-        """(rows, cols) uint8, direction 0..7; NO_DIRECTION at the target and where there is no way."""
-        return np.ascontiguousarray(self.parent.reshape(-1, self.stride)[1:-1, 1:-1])
 
 
 class TargetTree:
@@ -171,14 +163,12 @@ class TargetTree:
             ground.load(pace_snapshot)
             cost = np.full(ground.size, np.inf, np.float32)
             parent = np.full(ground.size, NONE, np.uint8)
-            reach = 0.0
+            reach = -1.0
             skeleton = None
-            if grid.inside(*divmod(target_cell, grid.cols)) and ground.passable(target_cell):
+            if _can_stand(ground, target_cell):
                 reach = ground.grow(ground.pad(target_cell), cost, parent)
                 skeleton = find_skeleton(ground) if wants_skeleton else None
-            return GrownTree(
-                target_cell, map_version, cost, parent, ground.weight, reach, offered, ground.stride, skeleton
-            )
+            return GrownTree(target_cell, map_version, cost, parent, ground.weight, reach, offered, skeleton)
 
         return job
 
@@ -205,7 +195,7 @@ class TargetTree:
             return Update("none")
         since = self._ground.difference(grown.weight, [self._grid.window] if fresh else dirty)
         tree = self._tree
-        if grown.cost[self._ground.pad(grown.target_cell)] != 0.0:
+        if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
             return self._grow_full(target_cell)
         tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
         self._full_at(grown.target_cell)
@@ -245,8 +235,7 @@ class TargetTree:
                 grown_cells = self._tree.move(target, window)
             kind: Kind = "forced" if grown_cells else "none"
             return Update(kind, window if grown_cells else EMPTY, grown_cells, wants_full=not self._job_out)
-        grown = self._grow_full(target)
-        return Update("forced", grown.window, grown.cells)
+        return self._grow_full(target)
 
     def observe_full_ns(self, took_ns: int) -> None:
         """What a full growth really took, for `auto` to choose by; not one that found a skeleton too. A simulation
@@ -328,11 +317,7 @@ class TargetTree:
 
     def _aim(self, target_cell: int, changes: Changes | None) -> bool:
         """Whether the target stands where a tree can lead. If not, the tree is stale as soon as the map changes."""
-        self.ready = (
-            self._grid.inside(*divmod(target_cell, self._grid.cols))
-            and target_cell >= 0
-            and self._ground.passable(target_cell)
-        )
+        self.ready = _can_stand(self._ground, target_cell)
         self.target_cell = target_cell if self.ready else None
         if not self.ready and (changes is None or changes.cells.size):
             self._stale = True
@@ -443,3 +428,8 @@ class TargetTree:
         whole = walks.ends >= 0
         optimum = grown.cost[starts[whole]].astype(np.float64)
         self.last_gaps = np.maximum(walks.driven[whole] / optimum, 1.0)
+
+
+def _can_stand(ground: Ground, cell: int) -> bool:
+    """Whether a tree can lead to a cell: it is one of the grid, and not lethal."""
+    return ground.grid.inside(*divmod(cell, ground.grid.cols)) and ground.passable(cell)

@@ -1,8 +1,8 @@
-"""How wide a window a move asks for: rungs of doubling width; the paper's variable range, mended and as printed."""
+"""How wide a window a move asks for: rungs of doubling width; the paper's variable range, mended."""
 
 from __future__ import annotations
 
-from swarm.grid import GridSpec, Window
+from swarm.grid import GridSpec
 
 AHEAD = 16
 """A window reaches so many times as far as the target has come since one so wide was grown last."""
@@ -58,20 +58,3 @@ def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
     # Of numbers that differ, the highest bit in which they do is the largest block that has changed.
     k = max(k_min, ((row ^ old_row) | (col ^ old_col)).bit_length() - 1)
     return max(2 << k, 2 * grid.distance_cells(old, new))
-
-
-def block_window(grid: GridSpec, old: int, new: int, k_min: int) -> Window:
-    """The window of `block_half` around the new cell."""
-    return grid.around(new, block_half(grid, old, new, k_min))
-
-
-def literal_window(grid: GridSpec, old: int, new: int) -> Window:
-    """The paper's rule as it is printed: a block must be crossed in row and column at once, so that it never widens
-    for a move along an axis. For comparison only."""
-    row, col = grid.row_col(new)
-    old_row, old_col = grid.row_col(old)
-    k = 1
-    for exponent in range(1, max(grid.rows, grid.cols).bit_length() + 1):
-        if row >> exponent != old_row >> exponent and col >> exponent != old_col >> exponent:
-            k = exponent
-    return grid.around(new, 2 << k)

@@ -404,7 +404,7 @@ def _check_directional(planner: PlannerConfig, source: str) -> None:
     if planner.strategy not in ("auto", "full"):
         raise ConfigError(
             f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
-            " and coarse trees know one cost per cell; expected 'auto' or 'full', which grow whole trees"
+            " and rings know one cost per cell; expected 'auto' or 'full', which grow whole trees"
         )
     if planner.length_weight:
         raise ConfigError(

@@ -75,7 +75,7 @@ class ScriptedTree(TargetTree):
     ) -> Callable[[], GrownTree]:
         self.calls.append(("full_job", target_cell, map_version))
         cost, parent = np.zeros(1, np.float32), np.zeros(1, np.uint8)
-        return lambda: GrownTree(target_cell, map_version, cost, parent, cost, True, None, COLS + 2)
+        return lambda: GrownTree(target_cell, map_version, cost, parent, cost, 1.0, None)
 
     def adopt(
         self,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from strategies import RULES, STRATEGIES, Job, Marks, Move, happenings, paces, planner_configs, random_pace
 
 from planner_service.strategies import GrownTree, TargetTree
-from planner_service.windows import block_window, literal_window
+from planner_service.windows import block_half
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.messages import RouteStatus
@@ -146,18 +146,45 @@ def test_after_a_jump_every_route_arrives(strategy: str, jump: int) -> None:
         play.check()
 
 
+def printed_half(grid: GridSpec, old: int, new: int) -> int:
+    """The paper's rule as it is printed: a block must be crossed in row and column at once."""
+    (row, col), (old_row, old_col) = grid.row_col(new), grid.row_col(old)
+    crossed = [k for k in range(1, 10) if row >> k != old_row >> k and col >> k != old_col >> k]
+    return 2 << max(crossed, default=1)
+
+
 def test_the_printed_rule_never_widens_for_a_move_along_an_axis() -> None:
     grid = GridSpec(512, 512, 1.0)
     old, new = grid.cell(256, 255), grid.cell(256, 256)
-    assert literal_window(grid, old, new).cells == 9 * 9
-    assert block_window(grid, old, new, 1) == grid.window
-    assert literal_window(grid, grid.cell(255, 255), new) == grid.window
+    assert printed_half(grid, old, new) == 4
+    assert block_half(grid, old, new, 1) == 512
+    assert printed_half(grid, grid.cell(255, 255), new) == 512
+
+
+@pytest.mark.parametrize("outside", [-1, 10**6])
+def test_a_growth_for_a_target_that_was_outside_is_made_up_for_once_it_is_back(outside: int) -> None:
+    play = Play(random_pace(np.random.default_rng(3), 20, 20, 5.0, 0.1), PlannerConfig(strategy="rotation"))
+    play.tree.update(play.pace, outside, [], 0)
+    grown = play.tree.full_job(play.pace, outside, 0)()
+    assert play.tree.adopt(grown, play.pace, play.target, [], 0, np.arange(400)).kind == "full"
+    play.check()
+
+
+def test_a_forced_full_growth_is_a_full_growth() -> None:
+    play = Play(
+        random_pace(np.random.default_rng(4), 40, 40, 5.0, 0.1), PlannerConfig(strategy="rotation", k_min=0)
+    )
+    while play.last.kind != "window":
+        play.happen(Move(1, 1))
+    assert play.tree.force(play.pace, [0]).kind == "full"
+    assert play.tree.force(play.pace, [0]).kind == "none", "there is nothing better to be had"
 
 
 @given(st.integers(0, 63), st.integers(0, 63), st.integers(0, 63), st.integers(0, 63), st.integers(0, 5))
 def test_a_window_reaches_at_least_as_far_as_the_target_moved(a: int, b: int, c: int, d: int, k: int) -> None:
     grid = GridSpec(64, 64, 1.0)
-    window = block_window(grid, grid.cell(a, b), grid.cell(c, d), k)
+    old, new = grid.cell(a, b), grid.cell(c, d)
+    window = grid.around(new, block_half(grid, old, new, k))
     assert window.contains(a, b)
     assert window.contains(c, d)
 

@@ -1,4 +1,4 @@
-"""Kernels of the coarse tree: which cells carry the traffic, and new costs spreading along them.
+"""Kernels of the skeleton and the rings: which cells carry the traffic, and new costs spreading along them.
 
 Arrays are laid out as `rules` says.
 """

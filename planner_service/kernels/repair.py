@@ -81,6 +81,19 @@ def _diagonal(rule):
 
 
 @njit(cache=True, nogil=True)
+def _span(first, last, stride, row):
+    """The cells of a row that something has changed about, or next to whom, in it and in the rows beside it:
+    begin <= cell < end, empty if there are none."""
+    # Columns, so that three rows can be laid over each other.
+    begin, end = stride, -1
+    for near in range(row - 1, row + 2):
+        if last[near] >= first[near]:
+            begin = min(begin, first[near] - near * stride)
+            end = max(end, last[near] - near * stride)
+    return row * stride + max(begin - 1, 1), row * stride + min(end + 2, stride - 1)
+
+
+@njit(cache=True, nogil=True)
 def _sweep(weight, cost, stride, rule, corners, first, last, floor, lowered, count):
     """Lower the cells that something changed about, and those next to them, to what they are offered, where they
     cost `floor` or more and are offered less. Returns lowered (uint32), which it appends them to, and how many."""
@@ -88,16 +101,9 @@ def _sweep(weight, cost, stride, rule, corners, first, last, floor, lowered, cou
     code = np.empty(stride, np.uint8)
     capacity = lowered.size
     for row in range(1, first.size - 1):
-        # Columns, so that three rows can be laid over each other.
-        begin, end = stride, -1
-        for near in range(row - 1, row + 2):
-            if last[near] >= first[near]:
-                begin = min(begin, first[near] - near * stride)
-                end = max(end, last[near] - near * stride)
-        if end < begin:
+        begin, end = _span(first, last, stride, row)
+        if end <= begin:
             continue
-        begin = row * stride + max(begin - 1, 1)
-        end = row * stride + min(end + 2, stride - 1)
         _offers(
             weight, cost, np.uint64(stride), np.uint64(begin), np.uint64(end), _diagonal(rule), corners, best, code
         )
@@ -354,15 +360,9 @@ def _point(weight, cost, parent, stride, rule, corners, first, last):
     best = np.empty(stride, np.float32)
     code = np.empty(stride, np.uint8)
     for row in range(1, first.size - 1):
-        begin, end = stride, -1
-        for near in range(row - 1, row + 2):
-            if last[near] >= first[near]:
-                begin = min(begin, first[near] - near * stride)
-                end = max(end, last[near] - near * stride)
-        if end < begin:
+        begin, end = _span(first, last, stride, row)
+        if end <= begin:
             continue
-        begin = row * stride + max(begin - 1, 1)
-        end = row * stride + min(end + 2, stride - 1)
         _offers(
             weight, cost, np.uint64(stride), np.uint64(begin), np.uint64(end), _diagonal(rule), corners, best, code
         )
