@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.bench.fields import Field
 from launch_scripts.bench.machine import memory_free
+from launch_scripts.bench.tables import Progress
 from launch_scripts.world.walks import Budget, Walk, Walker
 from planner_service.strategies import TargetTree
 from swarm.config import PlannerConfig, Strategy
@@ -28,7 +29,6 @@ from swarm.grid import walk
 from swarm.routes import OK, RouteBatch
 
 Cells = NDArray[np.int64]
-Progress = Callable[[int, int], None]
 
 TREE_BYTES_PER_CELL = 40
 """Of one target's tree with all that a strategy keeps beside it, and a job's snapshot; measured, rounded up."""

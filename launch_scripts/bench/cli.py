@@ -65,9 +65,11 @@ def _show(
 
 
 def _plain_tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    """Every list of rows as a table, then what is left as lines."""
+    """Every list of rows as a table, then what is left as lines, but for the machine, of which `_show` tells."""
     plain = {}
     for name, value in report.items():
+        if name in ("cores", "machine", "python", "load"):
+            continue
         rows = value if isinstance(value, list) and value and isinstance(value[0], dict) else None
         if rows is None:
             plain[name] = value
@@ -310,7 +312,7 @@ def directed(
     """A full tree where uphill is not downhill (cost.directional), beside one where it is."""
     from launch_scripts.bench.directed import run
 
-    _show(run(_numbers(sizes, "sizes"), repeats, seed), as_json)
+    _show(run(_numbers(sizes, "sizes", 16), repeats, seed), as_json)
 
 
 @app.command()

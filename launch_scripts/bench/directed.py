@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from launch_scripts.bench.machine import machine
 from planner_service.strategies import TargetTree
 from shared_map.terrain import Terrain, build_terrain
 from swarm.config import CostConfig, PlannerConfig, Scenario, TerrainConfig
@@ -21,7 +22,7 @@ def run(sizes: tuple[int, ...], repeats: int, seed: int) -> dict[str, Any]:
             source="synthetic", rows=size, cols=size, resolution_m=30, relief_m=2.0 * size, roads=6
         )
         rows.append(_row(f"synthetic {size} x {size}", terrain, repeats, seed))
-    return {"slope_rule": "energy", "repeats": repeats, "rows": rows}
+    return {"slope_rule": "energy", "repeats": repeats, "rows": rows, **machine()}
 
 
 def _row(name: str, source: TerrainConfig, repeats: int, seed: int) -> dict[str, Any]:

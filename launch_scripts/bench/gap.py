@@ -8,10 +8,10 @@ from typing import Any
 
 from rich.table import Table
 
-from launch_scripts.bench.chase import Plan, Progress, Tally, chase
+from launch_scripts.bench.chase import Plan, Tally, chase
 from launch_scripts.bench.fields import Field, make_field
 from launch_scripts.bench.machine import machine
-from launch_scripts.bench.tables import LABELS, number, percent, table
+from launch_scripts.bench.tables import LABELS, Progress, number, percent, table
 from launch_scripts.world.walks import Walk
 from planner_service.warm import warm_up
 from swarm.config import PlannerConfig, Strategy

@@ -13,15 +13,13 @@ from rich.table import Table
 
 from launch_scripts.bench.fields import Field, make_field
 from launch_scripts.bench.machine import machine
-from launch_scripts.bench.tables import number, table, times
+from launch_scripts.bench.tables import Progress, number, table, times
 from planner_service.bounds import LowerBounds
 from planner_service.ground import Ground
 from planner_service.routes import read_routes
 from planner_service.tree import CostToGoTree
 from swarm.config import PlannerConfig
 from swarm.grid import GridSpec, Window
-
-Progress = Callable[[int, int], None]
 
 CHANGES: dict[str, float] = {"x 0.7": 0.7, "x 1.5": 1.5, "x 3": 3.0, "lethal": np.inf}
 """What happens to all paces of a patch."""

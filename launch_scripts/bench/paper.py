@@ -7,20 +7,18 @@ hand, so none stand beside ours.
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Iterator
 from typing import Any
 
 from rich.table import Table
 
-from launch_scripts.bench.chase import Plan, Progress, chase
+from launch_scripts.bench.chase import Plan, chase
 from launch_scripts.bench.fields import Field, make_field
 from launch_scripts.bench.machine import machine
-from launch_scripts.bench.tables import LABELS, number, percent, table, times
+from launch_scripts.bench.tables import LABELS, Progress, number, percent, table, times
 from planner_service.warm import warm_up
 from swarm.config import PlannerConfig, Strategy
 
-STRATEGIES: tuple[Strategy, ...] = typing.get_args(Strategy)
 PAPERS: Strategy = "variable_range+multi_resolution"
 COMPARED: tuple[Strategy, ...] = ("full", PAPERS, "rotation")
 TABLE_1 = [(targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)]

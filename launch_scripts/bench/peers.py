@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,7 @@ from launch_scripts.bench.alone import measure
 from launch_scripts.bench.fields import Field, make_field
 from launch_scripts.bench.machine import machine
 from launch_scripts.bench.rivals import MAKERS, PEERS, Costs, Edge, missing_packages, present_peers, versions
-from launch_scripts.bench.tables import number, table
-
-Progress = Callable[[int, int], None]
+from launch_scripts.bench.tables import Progress, number, table
 
 
 def run(

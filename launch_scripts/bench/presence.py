@@ -77,12 +77,18 @@ def measure(count: int, rounds: int = 50) -> dict[str, float]:
         for east, south in zip(east_m.tolist(), south_m.tolist(), strict=True):
             presence.near(east, south, 100.0)
 
+    def hear_one() -> None:
+        """After which the next to ask has to look at everybody."""
+        nonlocal seq
+        seq += 1
+        presence.hear(_again(mine, seq), seq)
+
     def index() -> None:
-        presence._forget_index()
+        hear_one()
         presence.near(0.0, 0.0, 100.0)
 
     def parked() -> None:
-        presence._forget_index()
+        hear_one()
         presence.parked_on(5)
 
     hear()

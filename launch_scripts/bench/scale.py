@@ -9,10 +9,10 @@ from typing import Any
 
 from rich.table import Table
 
-from launch_scripts.bench.chase import Plan, Progress, chase
+from launch_scripts.bench.chase import Plan, chase
 from launch_scripts.bench.fields import Field, make_field
 from launch_scripts.bench.machine import machine
-from launch_scripts.bench.tables import NARROW, number, percent, table
+from launch_scripts.bench.tables import NARROW, Progress, number, percent, table
 from planner_service.warm import warm_up
 from swarm.config import PlannerConfig, Strategy
 

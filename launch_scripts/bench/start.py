@@ -11,9 +11,8 @@ from typing import Any
 from rich.table import Table
 
 from launch_scripts.bench.alone import measure
-from launch_scripts.bench.chase import Progress
 from launch_scripts.bench.machine import machine
-from launch_scripts.bench.tables import number, table
+from launch_scripts.bench.tables import Progress, number, table
 
 STAGES = {"tree": "a first tree is grown", "kernels": "a planner has called every kernel"}
 

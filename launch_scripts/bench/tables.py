@@ -1,13 +1,17 @@
-"""Tables of figures that fit into 80 columns, and how a figure is written in them."""
+"""Tables of figures that fit into 80 columns, how a figure is written in them, and how progress is told."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from rich import box
 from rich.table import Table
 
 from swarm.config import Strategy
+
+Progress = Callable[[int, int], None]
+"""Told how many steps are done, of how many."""
 
 LABELS: dict[Strategy, str] = {
     "full": "full",

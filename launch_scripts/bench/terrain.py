@@ -8,19 +8,23 @@ Each pass is a process of its own, so that its peak memory is its own; they take
 from __future__ import annotations
 
 import json
-import os
-import platform
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from launch_scripts.bench.machine import machine
+from swarm.errors import SwarmError
+
+if TYPE_CHECKING:
+    from launch_scripts.bench.tables import Progress
 
 RESOLUTION_M = 10.0
 RESOLUTION_DEG = 0.0001
+_LONGEST_S = 600
 PASSES = ("plain", "swarm", "swarm without photo", "swarm with wide vehicles")
 WIDE_M = 2.5 * RESOLUTION_M
 """Radius of vehicles that do not fit into their cell: lethal ground is inflated by three cells for them."""
@@ -31,7 +35,7 @@ def run(
     repeats: int = 3,
     *,
     degrees: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> dict[str, Any]:
     """Seconds and peak memory of our passes and of the plain one.
 
@@ -44,13 +48,7 @@ def run(
             for number, (name, results) in enumerate(passes.items(), 1):
                 results.append(_alone(name, Path(folder)))
                 progress(turn * len(passes) + number, repeats * len(passes))
-    report: dict[str, Any] = {
-        "size": size,
-        "degrees": degrees,
-        "cores": os.cpu_count(),
-        "machine": platform.processor() or platform.machine(),
-        "python": platform.python_version(),
-    }
+    report: dict[str, Any] = {"size": size, "degrees": degrees, **machine()}
     report["passes"] = [
         {
             "pass": name,
@@ -69,7 +67,13 @@ def run(
 
 def _alone(name: str, folder: Path) -> dict[str, float]:
     command = [sys.executable, "-m", "launch_scripts.bench.terrain", name, str(folder)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=600)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise SwarmError(f"pass {name!r} took more than {_LONGEST_S} s") from error
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["nothing was said"])[-1]
+        raise SwarmError(f"pass {name!r} failed with exit code {done.returncode}: {last}")
     result: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return result
 

@@ -15,10 +15,8 @@ from rich.table import Table
 
 from launch_scripts.bench import wire_asks, wire_far, wire_marks
 from launch_scripts.bench.machine import machine
-from launch_scripts.bench.tables import number, table
+from launch_scripts.bench.tables import Progress, number, table
 from launch_scripts.bench.wire_far import Far
-
-Progress = Callable[[int, int], None]
 
 PARTS = ("latency", "flood", "join", "route", "positions", "replica")
 WANTED = {"latency p50": 1.5, "latency p99": 2.0, "flood": 0.3, "late join": 1.5, "digest_ms": 50, "memory": 40}

@@ -194,8 +194,7 @@ def _run(
         raise StoreError(f"cannot make {run_dir}: {error.strerror or error}") from error
     if role != "router":
         with bars() as progress:
-            # A keeper hands on what it fetched, the photo too.
-            fetch_if_missing(scenario, run_dir, found, looks=role in ("monitor", "keeper"), progress=progress)
+            fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=progress)
     now_ns = time.time_ns()
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir.resolve())

@@ -24,12 +24,15 @@ _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 @dataclass(frozen=True, slots=True)
 class Authority:
+    """Who signs: its own certificate, and the key that never leaves its folder."""
+
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
 
 def authority(folder: Path) -> Authority:
-    """The authority whose `ca.pem` and `ca.key` lie in the folder; made there if there is none."""
+    """The authority whose `ca.pem` and `ca.key` lie in the folder; made there if there is none. Raises
+    StoreError where they cannot be read or written, or do not belong together."""
     path = folder / f"{CA}.pem"
     if path.exists():
         return _read_authority(folder)
@@ -60,7 +63,7 @@ def authority(folder: Path) -> Authority:
 def issue(folder: Path, name: str, hosts: Sequence[str], days: int, *, renew: bool = False) -> Path:
     """Write `NAME.pem` and `NAME.key`, which nobody else may read. Returns the certificate's path.
 
-    name   what access control knows its bearer by (the common name): a machine, or an agent such as a0
+    name   what access control knows its bearer by (the common name): a machine, or an agent such as all.a0
     hosts  names and addresses under which others connect to it; none for those that only connect
     Raises ConfigError on a name that cannot be one, StoreError where files cannot be written or are there already.
     """

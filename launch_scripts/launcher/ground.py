@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 from shared_map.bands import Progress, no_progress
@@ -18,6 +18,9 @@ from swarm.messages import RunInfo
 from swarm.zenoh_bus import open_bus
 
 log = logging.getLogger(__name__)
+
+_LOOK = frozenset(("monitor", "keeper"))
+"""Roles that want the photo, too: a keeper hands on what it fetched."""
 
 
 def missing_files(scenario: Scenario) -> list[str]:
@@ -34,14 +37,14 @@ def fetch_if_missing(
     run_dir: Path,
     found: Sequence[RunInfo],
     *,
-    looks: bool,
+    roles: Collection[str],
     progress: Progress = no_progress,
 ) -> bool:
     """Where files of the terrain are missing, get it from a keeper and leave it prepared in the run's folder, where
     every process of this machine finds it. True if the run's folder has a terrain so.
 
     found  who is in the namespace; the run's terrain is theirs
-    looks  the photo is wanted, too
+    roles  for whom
     Raises TerrainError with one sentence if no keeper gives the run's terrain.
     """
     missing = missing_files(scenario)
@@ -51,6 +54,7 @@ def fetch_if_missing(
     if not found:
         raise TerrainError(f"{why}, and nobody in the namespace could send the base map: start the keeper first")
     key = scenario_key(scenario)
+    looks = not _LOOK.isdisjoint(roles)
     with _alone(run_dir):
         here = load_prepared(run_dir, key)
         if here is not None and (here.photo.any() or not looks):

@@ -160,9 +160,8 @@ class _Run:
         if self._options.joins and missing_files(self._scenario):
             with open_bus(self._scenario.network) as bus:
                 found = ask_run(bus)
-            looks = bool({"monitor", "keeper"} & set(self._options.roles))
             with bars() as progress:
-                fetch_if_missing(self._scenario, self._run_dir, found, looks=looks, progress=progress)
+                fetch_if_missing(self._scenario, self._run_dir, found, roles=self._options.roles, progress=progress)
             setup = self._setup_of(ProcessSpec("launcher", "0", ""))
             terrain = load_terrain(setup)
             return terrain, load_truth(setup, terrain)
