@@ -22,13 +22,13 @@ from planner_service.kernels.prefetch import prefetch
 from planner_service.kernels.rules import (
     HUGE,
     INF,
-    LETHAL,
     NONE,
     RULE_FOUR,
     RULE_OCTILE,
     RULE_PAPER,
     SQRT2,
     TOO_FINE,
+    WALL,
 )
 
 _ONE = np.uint64(1)
@@ -42,9 +42,9 @@ _AHEAD = 8
 
 @njit(cache=True, nogil=True)
 def _open_costs(weight, cost):
-    """Before a flood: inf on passable cells, LETHAL on the others."""
+    """Before a flood: inf on passable cells, WALL on the others."""
     for i in range(weight.size):
-        cost[i] = INF if weight[i] < INF else LETHAL
+        cost[i] = INF if weight[i] < INF else WALL
 
 
 @njit(cache=True, nogil=True)
@@ -151,8 +151,8 @@ def _offer_straight(weight, cost, s, batch, n, touched):
         _ask_for(weight, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
         u = np.uint64(batch[p])
         key = cost[u] + weight[u]
-        for i in (u - s, u - _ONE, u + _ONE, u + s):
-            old = cost[i]
+        north, west, east, south = cost[u - s], cost[u - _ONE], cost[u + _ONE], cost[u + s]
+        for i, old in ((u - s, north), (u - _ONE, west), (u + _ONE, east), (u + s, south)):
             cost[i] = min(old, key)
             touched[count] = i
             count += np.uint64(old == INF)
@@ -168,25 +168,22 @@ def _offer_diagonal(weight, cost, s, corners, batch, n, touched, count):
         key = cost[u] + weight[u] * SQRT2
         above = u - s
         below = u + s
-        around = (above - _ONE, above + _ONE, below - _ONE, below + _ONE)
+        north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
+        around = (
+            (above - _ONE, cost[above - _ONE], min(north, west)),
+            (above + _ONE, cost[above + _ONE], min(north, east)),
+            (below - _ONE, cost[below - _ONE], min(south, west)),
+            (below + _ONE, cost[below + _ONE], min(south, east)),
+        )
         if not corners:
-            north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
-            if min(min(north, west), min(east, south)) < _ZERO32:
-                gated = (
-                    (above - _ONE, min(north, west)),
-                    (above + _ONE, min(north, east)),
-                    (below - _ONE, min(south, west)),
-                    (below + _ONE, min(south, east)),
-                )
-                for i, gate in gated:
-                    old = cost[i]
-                    offer = key if gate >= _ZERO32 else INF
-                    cost[i] = min(old, offer)
-                    touched[count] = i
-                    count += np.uint64(old - offer == INF)
-                continue
-        for i in around:
-            old = cost[i]
+            # inf past a wall. inf - inf is no number, and no match: a shut diagonal touches nothing.
+            for i, old, gate in around:
+                offer = max(key, -gate)
+                cost[i] = min(old, offer)
+                touched[count] = i
+                count += np.uint64(old - offer == INF)
+            continue
+        for i, old, _ in around:
             cost[i] = min(old, key)
             touched[count] = i
             count += np.uint64(old == INF)
@@ -204,28 +201,24 @@ def _offer_around(weight, cost, s, corners, batch, n, touched):
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
+        around = (
+            (above - _ONE, cost[above - _ONE], min(north, west)),
+            (above + _ONE, cost[above + _ONE], min(north, east)),
+            (below - _ONE, cost[below - _ONE], min(south, west)),
+            (below + _ONE, cost[below + _ONE], min(south, east)),
+        )
         for i, old in ((above, north), (u - _ONE, west), (u + _ONE, east), (below, south)):
             cost[i] = min(old, key)
             touched[count] = i
             count += np.uint64(old == INF)
-        around = (above - _ONE, above + _ONE, below - _ONE, below + _ONE)
-        if not corners and min(min(north, west), min(east, south)) < _ZERO32:
-            gated = (
-                (above - _ONE, min(north, west)),
-                (above + _ONE, min(north, east)),
-                (below - _ONE, min(south, west)),
-                (below + _ONE, min(south, east)),
-            )
-            for i, gate in gated:
-                old = cost[i]
-                offer = key if gate >= _ZERO32 else INF
+        if not corners:
+            for i, old, gate in around:
+                offer = max(key, -gate)
                 cost[i] = min(old, offer)
                 touched[count] = i
-                # inf - inf is no number, and no match: a shut diagonal touches nothing.
                 count += np.uint64(old - offer == INF)
             continue
-        for i in around:
-            old = cost[i]
+        for i, old, _ in around:
             cost[i] = min(old, key)
             touched[count] = i
             count += np.uint64(old == INF)
@@ -369,7 +362,7 @@ def breadth_first(weight, cost, stride, root):
     """Steps from every cell to the root, whatever they cost: the floor under every growth of a tree."""
     offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
     for i in range(weight.size):
-        cost[i] = INF if weight[i] < INF else LETHAL
+        cost[i] = INF if weight[i] < INF else WALL
     queue = np.empty(weight.size, np.uint32)
     cost[root] = np.float32(0.0)
     queue[0] = root

@@ -28,8 +28,9 @@ SQRT2 = np.float32(1.4142135623730951)
 SQRT2_EXACT = 1.4142135623730951
 INF = np.float32(np.inf)
 HUGE = np.float32(3.4028235e38)
-LETHAL = np.float32(-1.0)
-"""While growing, the cost of a lethal cell: below every key, so that a minimum leaves it alone."""
+WALL = np.float32(-np.inf)
+"""While growing, the cost of a lethal cell. No minimum lifts it; and max(key, -WALL) is inf, an offer that nobody
+takes, without a branch."""
 
 TOO_FINE = -1
 """Returned by a flood whose keys grew so large, in smallest weights, that float32 could not tell them apart."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from planner_service.kernels.rules import INF, LETHAL, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
+from planner_service.kernels.rules import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, WALL
 
 _ONE = np.uint64(1)
 _DIGIT = np.uint64(6)
@@ -52,7 +52,7 @@ def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
     kinds = 2 if rule == RULE_OCTILE else 1
     for i in range(weight.size):
         parent[i] = NONE
-        cost[i] = INF if weight[i] < INF else LETHAL
+        cost[i] = INF if weight[i] < INF else WALL
     # With octile steps item 2 * v waits under the straight key of v, 2 * v + 1 under its diagonal one. None is 0.
     heads = np.zeros(_LEVELS * _SLOTS, np.uint32)
     links = np.empty(kinds * weight.size, np.uint32)
