@@ -86,9 +86,13 @@ class Disappeared:
 
 @dataclass(frozen=True, slots=True)
 class LinkChanged:
-    """A transport came up or went down: whoever replicates compares what it has with the others."""
+    """A transport came up or went down: whoever replicates compares what it has with the others.
+
+    beyond  it is one between routers, of which only they are told; our own link is as it was
+    """
 
     up: bool
+    beyond: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,8 +54,7 @@ class Member:
             case AskEnded(tag=tag) if tag == _TAG:
                 return True
             case Appeared(peer=Peer(role=role)) if role == ROUTER:
-                self._ask()
-                self._post(LinkChanged(up=True))  # of a link between routers only they are told
+                self._post(LinkChanged(up=True, beyond=True))
                 return True
             case Disappeared(peer=Peer(role=role)) if role == ROUTER:
                 return True

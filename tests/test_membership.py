@@ -8,6 +8,7 @@ from memory_world import MemoryWorld
 
 from swarm.bus import Event, Heard, LinkChanged
 from swarm.errors import RunMismatchError
+from swarm.liveness import Peer
 from swarm.membership import Member, check_same_run
 from swarm.messages import RunInfo
 from swarm.topics import NOTE, STATS
@@ -93,6 +94,18 @@ def test_who_meets_only_after_a_cut_heals_is_checked_then():
     world.settle()
     assert other.failure is not None
     assert LinkChanged(True) in other.rest
+
+
+def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_to_be_up():
+    world = MemoryWorld()
+    node = Node(world)
+    node.member.join()
+    world.settle()
+    asked = node.bus.counts["messages_out"]
+    world.bus("r").declare_alive(Peer("router", "0", 1))
+    world.settle()
+    assert node.rest == [LinkChanged(up=True, beyond=True)]
+    assert node.bus.counts["messages_out"] == asked + 2  # one question to all, and our own answer
 
 
 def test_counters_are_told_once_a_second_and_at_the_end():

@@ -221,9 +221,10 @@ class AgentService:
                 if peer.role == "agent" and not self._roster.is_alive("agent", peer.id):
                     self._mourned_ns[peer.id] = now_ns + _MOURN_NS
                 self._roster_changed(now_ns)
-            case LinkChanged(up=up):
-                # Cut off, we hear no wants: nobody enters anything new before the others are heard of again.
-                self._link_up = up
+            case LinkChanged(up=up, beyond=beyond):
+                # Cut off, we hear no wants: nobody enters anything new before the others are heard of again. That a
+                # router appeared may be read after our own link has gone, and does not bring it back.
+                self._link_up = self._link_up if beyond else up
                 self._trust_roster_ns = now_ns + self._lease_ns
                 self._ground.ask_anew()
             case _:
