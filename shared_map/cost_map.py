@@ -7,6 +7,7 @@ After any sequence of `apply`, the composite equals one made from scratch of the
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -107,7 +108,7 @@ class CostMap:
             tile = (row // TILE_CELLS, col // TILE_CELLS)
             box = Window(row, col, row + 1, col + 1)
             boxes[tile] = boxes[tile].union(box) if tile in boxes else box
-        self._dirty = merged([*self._dirty, *boxes.values()])
+        self._dirty = merged(boxes.values(), self._dirty)
 
     def take_dirty(self) -> list[Window]:
         """Windows that cover every cell whose pace changed since the last call; they do not touch each other."""
@@ -161,7 +162,7 @@ class CostMap:
         )
 
     def _note_dirty(self, where: NDArray[np.int64]) -> None:
-        self._dirty = merged([*self._dirty, *cluster(where, self.grid.cols)])
+        self._dirty = merged(cluster(where, self.grid.cols), self._dirty)
 
 
 def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
@@ -184,9 +185,12 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
     return merged([Window(top, left, bottom + 1, right + 1) for top, left, bottom, right in boxes])
 
 
-def merged(windows: list[Window]) -> list[Window]:
-    """Windows that touch made one, until none touch; one window for all beyond MAX_WINDOWS."""
-    apart: list[Window] = []
+def merged(windows: Iterable[Window], others: Iterable[Window] = ()) -> list[Window]:
+    """Windows that touch made one, until none touch; one window for all beyond MAX_WINDOWS.
+
+    others  windows of which none touch each other: they need not be compared again
+    """
+    apart = list(others)
     for window in windows:
         if window.empty:
             continue
