@@ -200,6 +200,7 @@ class TargetTree:
         tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
         self._full_at(grown.target_cell)
         self._bounds.take(grown.cost.copy())
+        self._bounds.learn(since)
         self._stale = False
         self._renew_skeleton(grown.skeleton, since)
         moved = target_cell != tree.root

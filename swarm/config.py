@@ -185,10 +185,10 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
 
     edge           octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
     length_weight  lambda of the paper's length-aware key, seconds per metre
-    k_min          smallest block exponent of the variable range: windows are 2**(k+2)+1 cells wide
-    full_every     rotation: a full growth every so many moves
+    k_min          smallest block exponent: the paper's windows are 2**(k+2)+1 cells wide, others twice as wide
+    full_every     rotation: a full growth every so many moves, on small maps sooner
     cpu_budget     auto: share of one core that this planner may use
-    max_gap        the range is forced over a vehicle whose certified gap exceeds this
+    max_gap        rotation, auto: a served route whose certified gap exceeds this asks for a full growth
     push_s         newer routes are pushed to a vehicle at most this often
     """
 

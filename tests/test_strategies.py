@@ -170,6 +170,27 @@ def test_a_growth_for_a_target_that_was_outside_is_made_up_for_once_it_is_back(o
     play.check()
 
 
+def test_what_got_cheaper_while_a_worker_grew_lowers_the_bounds_that_its_tree_gives() -> None:
+    """A ring road: the target in the west drives on south, so that the way around the south becomes the better one
+    for those in the east, of which the tree does not know. Their road gets cheaper while a worker grows."""
+    pace = np.full((41, 41), np.inf, np.float32)
+    pace[[10, 30], 5:36] = 10.0
+    pace[10:31, [5, 35]] = 10.0
+    play = Play(pace, PlannerConfig(strategy="rotation", k_min=0))
+    play.target = play.grid.cell(20, 5)
+    play.happen(Move(0, 0))
+    play.happen(Job("begin"))
+    pace[14:27, 35] = 1.0
+    play.since.append(Window(14, 35, 27, 36))
+    play.version += 1
+    play.tree.update(pace, play.target, play.since, play.version)
+    play.happen(Job("end"))
+    for _ in range(3):
+        play.happen(Move(1, 0))
+    assert play.last.kind == "window"
+    play.check()
+
+
 def test_a_forced_full_growth_is_a_full_growth() -> None:
     play = Play(
         random_pace(np.random.default_rng(4), 40, 40, 5.0, 0.1), PlannerConfig(strategy="rotation", k_min=0)
