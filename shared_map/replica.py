@@ -194,7 +194,7 @@ class MapReplica:
             news &= (tiles // self.grid.tile_cols + 1 < self.grid.tile_rows) & (
                 tiles % self.grid.tile_cols + 1 < self.grid.tile_cols
             )
-        if not self.room.take_new(bulk.author, int(np.count_nonzero(news)), int(counts[news].sum())):
+        if news.any() and not self.room.take_new(bulk.author, int(np.count_nonzero(news)), int(counts[news].sum())):
             news[:] = False
         return news
 

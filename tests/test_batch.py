@@ -213,3 +213,11 @@ def test_what_has_no_room_for_all_is_taken_in_as_far_as_there_is_room() -> None:
     [message] = packed(sets)
     assert len(crowded.merge_bulk(message).sets) == 2
     assert (crowded.room.sets, crowded.counts["sets_without_room"]) == (2, 2)
+
+
+def test_an_author_of_whom_nothing_is_taken_in_has_no_place_in_the_books() -> None:
+    listener = MapReplica(GRID, Composite())
+    [message] = packed([set_of("b", 9999, 1, {3: (LETHAL, 0, 1)})])
+    assert listener.merge_bulk(message).sets == []
+    assert listener.room._authors == {}
+    assert listener.digest() == {}
