@@ -99,7 +99,7 @@ def fold(
         if complete is not None and max(complete.kinds, default=0) <= MarkKind.CLEAR:
             whole[author] = complete
     folded = []
-    for group in {each.group for each in whole.values()}:
+    for group in sorted({each.group for each in whole.values()}):
         of_group = {author: each for author, each in whole.items() if each.group == group}
         best_ns, best_rank = _newest_lasting(of_group)
         for rank, (author, complete) in enumerate(of_group.items()):

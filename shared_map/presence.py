@@ -6,12 +6,12 @@ again for the length of a lease is forgotten. So presence needs no merging, and 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.reading import Reading
 from swarm.grid import GridSpec
 from swarm.liveness import Leases
 from swarm.messages import Fleet, VehicleState
@@ -55,14 +55,14 @@ class Vehicles:
 class Presence:
     """The newest word of each (author, region), for as long as its lease lasts.
 
-    groups     whose vehicles count; None for everybody's
     bucket_m   side of the squares by which neighbours are looked up: about the radius that is asked for most
+    reading    whose vehicles count; None for everybody's
     """
 
-    def __init__(self, grid: GridSpec, lease_ns: int, bucket_m: float, groups: Iterable[str] | None = None) -> None:
+    def __init__(self, grid: GridSpec, lease_ns: int, bucket_m: float, reading: Reading | None = None) -> None:
         self._grid = grid
         self._bucket_m = bucket_m
-        self._groups = None if groups is None else frozenset(groups)
+        self._reading = reading
         self._leases = Leases(lease_ns)
         self._newest: dict[str, Fleet] = {}
         self._index: _Index | None = None
@@ -70,7 +70,7 @@ class Presence:
 
     def hear(self, fleet: Fleet, now_ns: int) -> None:
         """Take in where an author's vehicles of one region are; late and repeated messages change nothing."""
-        if self._groups is not None and fleet.group not in self._groups:
+        if self._reading is not None and not self._reading.hears(fleet.author, fleet.group):
             return
         key = f"{fleet.author}/{fleet.region}"
         known = self._newest.get(key)
@@ -105,11 +105,6 @@ class Presence:
         distance_m = np.hypot(index.vehicles.east_m[found] - east_m, index.vehicles.south_m[found] - south_m)
         inside = distance_m <= radius_m
         return index.vehicles.taken(found[inside][np.argsort(distance_m[inside], kind="stable")])
-
-    def crowds(self, east_m: NDArray[np.floating], south_m: NDArray[np.floating]) -> NDArray[np.int64]:
-        """How many vehicles are in the square of the lookup around each of many places and in the eight beside it:
-        int64 per place, for the price of one look at all of them."""
-        return self._indexed().crowds(np.asarray(east_m), np.asarray(south_m))
 
     def parked_on(self, cell: int) -> str | None:
         """Who stands on a cell and will not leave it by itself."""
@@ -160,34 +155,25 @@ class _Index:
     def __init__(self, vehicles: Vehicles, grid: GridSpec, bucket_m: float) -> None:
         self.vehicles = vehicles
         self._bucket_m = bucket_m
-        self._across = int(grid.cols * grid.resolution_m // bucket_m) + 3  # a column to spare on either side
+        self._across = int(grid.cols * grid.resolution_m // bucket_m) + 1
         squares = self._squares(vehicles.east_m, vehicles.south_m)
         self._order: NDArray[np.intp] = np.argsort(squares, kind="stable")
         self._sorted: NDArray[np.int64] = squares[self._order]
 
     def _squares(self, east_m: NDArray[np.floating], south_m: NDArray[np.floating]) -> NDArray[np.int64]:
-        cols = np.clip((east_m // self._bucket_m).astype(np.int64), 0, self._across - 3) + 1
+        cols = np.clip((east_m // self._bucket_m).astype(np.int64), 0, self._across - 1)
         return (south_m // self._bucket_m).astype(np.int64) * self._across + cols
 
     def candidates(self, east_m: float, south_m: float, radius_m: float) -> NDArray[np.intp]:
         """The vehicles of all squares that a circle touches."""
-        size_m, last = self._bucket_m, self._across - 3
+        size_m, last = self._bucket_m, self._across - 1
         west = min(max(int((east_m - radius_m) // size_m), 0), last)
         east = min(max(int((east_m + radius_m) // size_m), 0), last)
         rows = np.arange((south_m - radius_m) // size_m, (south_m + radius_m) // size_m + 1).astype(np.int64)
-        firsts = np.searchsorted(self._sorted, rows * self._across + west + 1, side="left")
-        lasts = np.searchsorted(self._sorted, rows * self._across + east + 1, side="right")
+        firsts = np.searchsorted(self._sorted, rows * self._across + west, side="left")
+        lasts = np.searchsorted(self._sorted, rows * self._across + east, side="right")
         parts = [self._order[a:b] for a, b in zip(firsts.tolist(), lasts.tolist(), strict=True) if b > a]
         return np.concatenate(parts) if parts else _NOBODY
-
-    def crowds(self, east_m: NDArray[np.floating], south_m: NDArray[np.floating]) -> NDArray[np.int64]:
-        squares = self._squares(east_m, south_m)
-        count = np.zeros(len(squares), np.int64)
-        for row in (-1, 0, 1):
-            middle = squares + row * self._across
-            count += np.searchsorted(self._sorted, middle + 1, side="right")
-            count -= np.searchsorted(self._sorted, middle - 1, side="left")
-        return count
 
 
 _NOBODY: NDArray[np.intp] = np.empty(0, np.intp)

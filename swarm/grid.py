@@ -19,8 +19,6 @@ REGION_TILES = 8
 STEP_ROW = (-1, -1, 0, 1, 1, 1, 0, -1)
 STEP_COL = (0, 1, 1, 1, 0, -1, -1, -1)
 """Direction codes 0..7, clockwise from north. Odd codes are diagonal."""
-NO_DIRECTION = 255
-"""In a parent array: the target itself, or a cell from which there is no way."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared_map.presence import Presence
+from shared_map.reading import Reading
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.messages import NO_TARGET, Fleet, VehicleState, pack_column
@@ -79,9 +79,10 @@ def test_a_vehicle_between_two_regions_is_where_it_was_last_seen() -> None:
 
 
 def test_only_the_groups_that_are_read_are_there() -> None:
-    here = presence(groups=["blue"])
-    here.hear(fleet(("u", 5, 5), group="red"), 0)
-    here.hear(fleet(("v", 5, 5), group="blue", author="a1.1"), 0)
+    here = presence(reading=Reading(GRID, frozenset({"blue"})))
+    here.hear(fleet(("u", 5, 5), group="red", author="red.a0.1"), 0)
+    here.hear(fleet(("w", 5, 5), group="blue", author="red.a0.1"), 0)  # says so
+    here.hear(fleet(("v", 5, 5), group="blue", author="blue.a1.1"), 0)
     assert here.vehicles.ids == ["v"]
     assert here.vehicles.groups == ["blue"]
 
@@ -109,22 +110,6 @@ def test_near_is_what_looking_at_everybody_finds(
     assert set(near.ids) <= {f"v{n}" for n, d in enumerate(distances) if d < radius_m + 0.01}
     order = [distances[int(id[1:])] for id in near.ids]
     assert order == pytest.approx(sorted(order), abs=0.01)
-
-
-@given(places, st.integers(0, 2**32))
-def test_a_crowd_is_who_is_in_the_square_and_the_eight_beside_it(
-    found: list[tuple[float, float]], seed: int
-) -> None:
-    here = Presence(GRID, LEASE_NS, 100.0)
-    here.hear(fleet(*((f"v{n}", east, south) for n, (east, south) in enumerate(found))), 0)
-    chance = random.Random(seed)
-    asked = [(chance.uniform(0, 5999), chance.uniform(0, 5999)) for _ in range(5)]
-    expected = [
-        sum(abs(e // 100 - east // 100) <= 1 and abs(s // 100 - south // 100) <= 1 for e, s in found)
-        for east, south in asked
-    ]
-    east_m, south_m = np.array(asked).T
-    assert here.crowds(east_m, south_m).tolist() == expected
 
 
 # --- what vehicles make of it -------------------------------------------------------------------------------

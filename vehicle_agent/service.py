@@ -93,14 +93,13 @@ class AgentService:
         self._cost_map = CostMap(terrain)
         group = plan.group.name
         self._author = author_of(group, setup.author)
-        readable = readable_groups(scenario, group)
         self._replica = MapReplica(
             grid,
             self._cost_map,
             author=self._author,
             group=group,
             publish_hz=scenario.map.publish_hz,
-            reading=Reading(grid, readable),
+            reading=Reading(grid, readable_groups(scenario, group)),
         )
         near = scenario.map.interest == "near"
         self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role, near=near)
@@ -117,7 +116,7 @@ class AgentService:
         self._map_near = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._listens_to: frozenset[str] = frozenset()
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
-        self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, readable)
+        self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.reading)
         self._looks_at: frozenset[int] = frozenset()
         self._untracked = scenario.untracked
         self._sightings = Sightings(self._replica.reading)
