@@ -1,6 +1,7 @@
 """The weights of a map: padded, changed, their range; a window cut out of them, and merged back.
 
-Arrays are flat and padded as `rules` says.
+Arrays are flat and padded as `rules` says. Positive float32 numbers sort as their bits do, read as integers: the
+least of integers is found by vectors, the least of floats one by one, in 4 times the time.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ import numpy as np
 from numba import njit
 
 INF = np.float32(np.inf)
+_INF_BITS = np.int32(0x7F800000)
+_ONE = np.uint64(1)
 
 
 @njit(cache=True, nogil=True)
@@ -16,8 +19,8 @@ def pad_weights(pace, resolution, extra, stride, weight):
     """weight := pace * resolution + extra, everywhere. Returns cells whose pace is NaN, zero or negative."""
     bad = 0
     for row in range(pace.shape[0]):
-        base = (row + 1) * stride + 1
-        for col in range(pace.shape[1]):
+        base = np.uint64((row + 1) * stride + 1)
+        for col in range(np.uint64(pace.shape[1])):
             p = pace[row, col]
             w = p * resolution + extra
             bad += not (p > 0 and w > 0)
@@ -59,13 +62,15 @@ def changed_cells(pace, resolution, extra, box, stride, weight, cells, before):
 @njit(cache=True, nogil=True)
 def weight_range(weight):
     """(smallest, largest finite) weight; (inf, 0) if all cells are lethal."""
-    low = INF
-    high = np.float32(0.0)
-    for i in range(weight.size):
-        w = weight[i]
+    bits = weight.view(np.int32)
+    low = _INF_BITS
+    high = np.int32(0)
+    for i in range(bits.size):
+        w = bits[i]
         low = min(low, w)
-        high = max(high, w if w < INF else np.float32(0.0))
-    return low, high
+        high = max(high, w if w < _INF_BITS else np.int32(0))
+    found = np.array((low, high), np.int32).view(np.float32)
+    return found[0], found[1]
 
 
 @njit(cache=True, nogil=True)
@@ -73,21 +78,24 @@ def cut_window(weight, stride, box, part):
     """The weights of a window as a padded grid of its own. Returns their range, as `weight_range` does."""
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
-    low = INF
-    high = np.float32(0.0)
+    low = _INF_BITS
+    high = np.int32(0)
+    bits = weight.view(np.int32)
+    taken = part.view(np.int32)
     part[:width] = INF
     part[part.size - width :] = INF
     for row in range(row0, row1):
         a = np.uint64((row + 1) * stride + 1 + col0)
         b = np.uint64((row - row0 + 1) * width + 1)
-        part[b - np.uint64(1)] = INF
+        part[b - _ONE] = INF
         for col in range(np.uint64(col1 - col0)):
-            w = weight[a + col]
-            part[b + col] = w
+            w = bits[a + col]
+            taken[b + col] = w
             low = min(low, w)
-            high = max(high, w if w < INF else np.float32(0.0))
+            high = max(high, w if w < _INF_BITS else np.int32(0))
         part[b + np.uint64(col1 - col0)] = INF
-    return low, high
+    found = np.array((low, high), np.int32).view(np.float32)
+    return found[0], found[1]
 
 
 @njit(cache=True, nogil=True)
