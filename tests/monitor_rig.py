@@ -18,10 +18,10 @@ from swarm.clock import NS_PER_S, ManualClock
 from swarm.config import MonitorConfig, Scenario, parse_scenario
 from swarm.liveness import Peer
 from swarm.memory_bus import MemoryBus, MemoryNetwork, PerfectLinks
-from swarm.messages import Fleet, Followed, MarkSet, Message, Note, PlannerStatus, Stats, TargetPose
+from swarm.messages import Fleet, Followed, MarkSet, Message, Note, PlannerStatus, Sighted, Stats, TargetPose
 from swarm.role import RoleSetup
 from swarm.scheduler import Scheduler
-from swarm.topics import FLEET, FOLLOWED, MARKS, NOTE, POSE, STATS, STATUS
+from swarm.topics import FLEET, FOLLOWED, MARKS, NOTE, POSE, SIGHTED, STATS, STATUS
 
 SILENT = MonitorConfig(live=False)
 LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0, memory_mib=16)
@@ -115,6 +115,8 @@ def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
             bus.publish(NOTE, message, role=message.role, id=message.id)
         case Followed():
             bus.publish(FOLLOWED, message, agent="a0", vehicle=message.vehicle)
+        case Sighted():
+            bus.publish(SIGHTED, message, target=message.target, author=message.author)
         case MarkSet():
             region = terrain.grid.region_of_tile(message.tile)
             bus.publish(MARKS, message, region=region, tile=message.tile, author=message.author)

@@ -31,7 +31,7 @@ from swarm.bus import Event
 from swarm.clock import NS_PER_S
 from swarm.config import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
-from swarm.messages import Followed, Note
+from swarm.messages import Followed, Note, Sighted
 from swarm.topics import FOLLOWED, NOTE, TOPICS
 
 
@@ -75,6 +75,20 @@ def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: T
     textures = [rows[f"/world/ground/{tile}"] for tile in range(tiles)]
     assert min(textures) >= 1
     assert max(textures) >= 2, "marks change the photo"
+
+
+def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
+    seen = Sighted(
+        author="a0.1", group="all", target="t0", seq=1, stamp_ns=1, until_ns=NS_PER_S,
+        cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
+    )  # fmt: skip
+    rig.play([(NS_PER_S // 2, seen)])
+    rig.until(3 * NS_PER_S)
+    rig.close()
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 2
 
 
 def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(

@@ -5,6 +5,8 @@ It only listens. It may be late, stalled, killed or absent; nobody waits for it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import rerun as rr
 
@@ -88,7 +90,7 @@ class MonitorService:
         self._routes: dict[str, RouteNow] = {}
         self._stale_tiles: dict[int, None] = {}
         self._sightings = Sightings(replica.reading)
-        self._sightings_new = False
+        self._sighted: Mapping[str, Sighted] = {}
         self._fleets_new = self._targets_new = self._windows_new = False
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
@@ -128,7 +130,7 @@ class MonitorService:
                 self._targets_new = True
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
             case Sighted() as sighted:
-                self._sightings_new |= self._sightings.hear(sighted)
+                self._sightings.hear(sighted)
             case PlannerStatus():
                 self._windows_new = True
             case Followed() as followed:
@@ -214,9 +216,11 @@ class MonitorService:
             if trails_due:
                 places = np.array([pole[0] for pole in feet], np.float32)
                 self._drawing.trails("targets", self._target_trails.advance(targets.ids, places))
-        if self._sightings_new:
-            self._sightings_new = False
-            self._drawing.sightings(*sighting_points(self._ground, self._sightings.best(now_ns)))
+        self._sightings.expire(now_ns)
+        sighted = self._sightings.best(now_ns)
+        if sighted != self._sighted:  # somebody saw more, or what was seen has ended
+            self._sighted = sighted
+            self._drawing.sightings(*sighting_points(self._ground, sighted))
         if self._windows_new:
             self._windows_new = False
             self._draw_windows()
