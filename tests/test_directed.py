@@ -178,7 +178,7 @@ def test_a_part_of_a_route_says_what_is_left_of_it():
     assert len(part.directions) == 7
     assert part.cost_s == pytest.approx(whole.cost_s)
     assert part.remaining_s == pytest.approx(whole.cost_s * 22 / 29)
-    assert whole.cost_s == pytest.approx(29.0 * climb.of_step(0, 1))  # 10 s/m x 0.1: a second a cell on the level
+    assert whole.cost_s == pytest.approx(29.0 * climb.of_step(0, 1))  # 10 m x 0.1 s/m: a second a cell on the level
 
 
 def test_the_way_back_down_is_another_and_cheaper():

@@ -22,9 +22,10 @@ LONGEST_S = 600
 MB = 1e6
 
 
-def measure(*words: str, environment: dict[str, str] | None = None) -> dict[str, Any]:
-    """What such a process prints. Raises SwarmError, with the last line that it wrote, if it fails or hangs."""
-    command = [sys.executable, "-m", __name__, *words]
+def measure(*words: str, module: str = __name__, environment: dict[str, str] | None = None) -> dict[str, Any]:
+    """What such a process prints, or one of another module that prints an object likewise. Raises SwarmError, with
+    the last line that it wrote, if it fails or hangs."""
+    command = [sys.executable, "-m", module, *words]
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=LONGEST_S, env={**os.environ, **(environment or {})}

@@ -9,22 +9,20 @@ from __future__ import annotations
 
 import json
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from launch_scripts.bench.alone import measure
 from launch_scripts.bench.machine import machine
-from swarm.errors import SwarmError
 
 if TYPE_CHECKING:
     from launch_scripts.bench.tables import Progress
 
 RESOLUTION_M = 10.0
 RESOLUTION_DEG = 0.0001
-_LONGEST_S = 600
 PASSES = ("plain", "swarm", "swarm without photo", "swarm with wide vehicles")
 WIDE_M = 2.5 * RESOLUTION_M
 """Radius of vehicles that do not fit into their cell: lethal ground is inflated by three cells for them."""
@@ -46,7 +44,7 @@ def run(
         _make(Path(folder), size, degrees)
         for turn in range(repeats):
             for number, (name, results) in enumerate(passes.items(), 1):
-                results.append(_alone(name, Path(folder)))
+                results.append(measure(name, folder, module="launch_scripts.bench.terrain"))
                 progress(turn * len(passes) + number, repeats * len(passes))
     report: dict[str, Any] = {"size": size, "degrees": degrees, **machine()}
     report["passes"] = [
@@ -63,19 +61,6 @@ def run(
     report["ratio"] = round(ours["seconds"] / plain["seconds"], 2)
     report["cpu_ratio"] = round(ours["cpu_s"] / plain["cpu_s"], 2)
     return report
-
-
-def _alone(name: str, folder: Path) -> dict[str, float]:
-    command = [sys.executable, "-m", "launch_scripts.bench.terrain", name, str(folder)]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise SwarmError(f"pass {name!r} took more than {_LONGEST_S} s") from error
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["nothing was said"])[-1]
-        raise SwarmError(f"pass {name!r} failed with exit code {done.returncode}: {last}")
-    result: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
-    return result
 
 
 def _make(folder: Path, size: int, degrees: bool) -> None:
