@@ -106,7 +106,9 @@ def _print_cost(reply: CostReply, row: int, col: int) -> None:
     elif math.isfinite(cost_s):
         typer.echo(f"from row {row}, col {col} to {reply.target} in {cost_s:.1f} s")
     else:
-        typer.echo(f"unreachable: there is no way from row {row}, col {col} to {reply.target}")
+        typer.echo(
+            f"unreachable: row {row}, col {col} has no way to {reply.target}, is lethal or outside of the terrain"
+        )
 
 
 def _print_route(reply: RouteReply, took_ms: float) -> None:
