@@ -80,17 +80,15 @@ def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | Pr
             found.append(error)
         except ValueError as error:
             found.append(ProtocolError(str(error)[:300]))
-    if len(sets) < _WORTH_ARRAYS:
-        for at, each in sets:
-            try:
-                each.check()
-            except ValueError as error:
-                found[at] = ProtocolError(str(error)[:300])
-    else:
+    if len(sets) >= _WORTH_ARRAYS:
         counts = np.array([len(each.kinds) for _, each in sets], np.int64)
         columns = (b"".join([getattr(each, name) for _, each in sets]) for name in _STATEMENT_COLUMNS)
-        for faulty in faulty_sets(counts, *columns).tolist():
-            found[sets[faulty][0]] = ProtocolError("a set breaks a rule of its statements")
+        sets = [sets[faulty] for faulty in faulty_sets(counts, *columns).tolist()]  # looked at again for the rule
+    for at, each in sets:
+        try:
+            each.check()
+        except ValueError as error:
+            found[at] = ProtocolError(str(error)[:300])
     return found
 
 

@@ -164,9 +164,10 @@ class Routes(msgspec.Struct, frozen=True, kw_only=True, dict=True):
         if count and max(self.statuses) >= len(STATUSES):
             raise ValueError(f"status {max(self.statuses)} is not in 0..{len(STATUSES) - 1}")
         check_column("starts", self.starts, 8, count)
-        for start in column(self.starts, "<i8").tolist() if count else ():
-            if not -(1 << 31) <= start < 1 << 32:
-                raise ValueError(f"start {start} is no cell")
+        starts = column(self.starts, "<i8")
+        outside = starts[(starts < -(1 << 31)) | (starts >= 1 << 32)]
+        if outside.size:
+            raise ValueError(f"start {outside[0]} is no cell, expected -2^31 ... 2^32 - 1")
         check_column("steps", self.steps, 4, count)
         steps = int(column(self.steps, "<u4").sum(dtype=np.int64))
         check_column(f"directions of {steps} steps", self.directions, 3, -(-steps // 8))
