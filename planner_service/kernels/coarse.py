@@ -12,6 +12,16 @@ from planner_service.kernels.rules import INF, NONE, RULE_FOUR, RULE_OCTILE, SQR
 
 
 @njit(cache=True, nogil=True)
+def _longer(array, count, size):
+    """Room for `size` elements, the first `count` copied. By a loop: assigning to a slice would bring along what
+    numba needs for the text of its error, which takes longer to compile than any kernel here."""
+    longer = np.empty(size, array.dtype)
+    for i in range(count):
+        longer[i] = array[i]
+    return longer
+
+
+@njit(cache=True, nogil=True)
 def _sink(keys, items, size):
     """Restore a binary heap after its last element, keys[size], was taken from the end to replace the top."""
     key = keys[size]
@@ -86,9 +96,7 @@ def _tighten(weight, cost, parent, stamp, now, offsets, rule, v, trail):
     many = 0
     while stamp[v] < now and parent[v] != NONE:
         if many == trail.size:
-            longer = np.empty(2 * many, np.int64)
-            longer[:many] = trail
-            trail = longer
+            trail = _longer(trail, many, 2 * many)
         trail[many] = v
         many += 1
         v += offsets[parent[v]]
@@ -161,12 +169,8 @@ def spread(weight, cost, parent, stamp, now, level, stride, rule, corners, root,
         visited += 1
         if size + 16 > capacity:
             capacity *= 2
-            new_keys = np.empty(capacity, np.float32)
-            new_items = np.empty(capacity, np.int64)
-            new_keys[:size] = keys[:size]
-            new_items[:size] = items[:size]
-            keys = new_keys
-            items = new_items
+            keys = _longer(keys, size, capacity)
+            items = _longer(items, size, capacity)
         away = max(abs(u // stride - root_row), abs(u % stride - root_col))
         ring = 1
         while away > inner:

@@ -16,6 +16,16 @@ _FINE = np.uint64(44)
 
 
 @njit(cache=True, nogil=True)
+def _longer(array, count, size):
+    """Room for `size` elements, the first `count` copied. By a loop: assigning to a slice would bring along what
+    numba needs for the text of its error, which takes longer to compile than any kernel here."""
+    longer = np.empty(size, array.dtype)
+    for i in range(count):
+        longer[i] = array[i]
+    return longer
+
+
+@njit(cache=True, nogil=True)
 def _rows_of(weight, stride):
     """`first` and `last` of nothing."""
     rows = weight.size // stride
@@ -108,9 +118,7 @@ def _sweep(weight, cost, stride, rule, corners, first, last, floor, lowered, cou
             weight, cost, np.uint64(stride), np.uint64(begin), np.uint64(end), _diagonal(rule), corners, best, code
         )
         if count + stride > capacity:
-            more = np.empty(2 * capacity + stride, np.uint32)
-            more[:count] = lowered[:count]
-            lowered = more
+            lowered = _longer(lowered, count, 2 * capacity + stride)
             capacity = lowered.size
         for i in range(begin, end):
             if best[i - begin] < cost[i] and cost[i] >= floor and weight[i] < INF:
@@ -153,15 +161,9 @@ def _spread(weight, cost, stride, rule, corners, width, ring, touched, count, fi
     while True:
         if used + np.int64(n) > capacity:
             capacity = 2 * (used + np.int64(n))
-            new_keys = np.empty(capacity, np.float32)
-            new_items = np.empty(capacity, np.uint32)
-            new_behind = np.empty(capacity, np.int32)
-            new_keys[:used] = keys[:used]
-            new_items[:used] = items[:used]
-            new_behind[:used] = behind[:used]
-            keys = new_keys
-            items = new_items
-            behind = new_behind
+            keys = _longer(keys, used, capacity)
+            items = _longer(items, used, capacity)
+            behind = _longer(behind, used, capacity)
         for i in range(n):
             v = touched[i]
             row = np.int64(np.uint64(v) * per_row >> _FINE)
@@ -215,9 +217,7 @@ def _spread(weight, cost, stride, rule, corners, width, ring, touched, count, fi
             taken += 1
             highest = max(highest, key)
             if n + np.uint64(8) > room:
-                more = np.empty(np.int64(2 * room) + 64, np.uint32)
-                more[:n] = touched[:n]
-                touched = more
+                touched = _longer(touched, np.int64(n), np.int64(2 * room) + 64)
                 room = np.uint64(touched.size)
             w = weight[u]
             straight = key + w
@@ -295,9 +295,7 @@ def _detach(weight, cost, parent, stride, corners, changed, before, limit):
     done = 0
     while done < count and count <= limit:
         if count + 8 > capacity:
-            more = np.empty(2 * capacity, np.int64)
-            more[:count] = detached[:count]
-            detached = more
+            detached = _longer(detached, count, 2 * capacity)
             capacity *= 2
         u = np.uint64(detached[done])
         done += 1

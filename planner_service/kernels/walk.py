@@ -119,7 +119,9 @@ def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
         longest = max(max(fill[0], fill[1]), max(fill[2], fill[3]))
         if longest + steps > capacity:
             more = np.empty((_LANES, 2 * capacity), np.uint8)
-            more[:, :capacity] = trails
+            for j in range(_LANES):
+                for i in range(capacity):  # by a loop: see `_longer` in `repair`
+                    more[j, i] = trails[j, i]
             trails = more
             capacity *= 2
         _walk_on(weight, parent, offsets, lengths, cells, sums, trails, fill, steps)
@@ -146,7 +148,8 @@ def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
     directions = np.empty(fill.sum(), np.uint8)
     n = 0
     for j in range(_LANES):
-        directions[n : n + fill[j]] = trails[j, : fill[j]]
+        for i in range(fill[j]):
+            directions[n + i] = trails[j, i]
         for r in range(count * j // _LANES, until[j]):
             ends[r] += n if ends[r] >= 0 else 0
         n += fill[j]
