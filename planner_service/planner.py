@@ -170,7 +170,7 @@ class Planner:
     def _take_dirty(self) -> list[Window]:
         dirty = self._cost_map.take_dirty()
         if self._growing_since_ns is not None:
-            self._dirty_since_snapshot = merged([*self._dirty_since_snapshot, *dirty])
+            self._dirty_since_snapshot = merged(dirty, self._dirty_since_snapshot)
         stamp_ns = self._newest_mark_ns()
         if stamp_ns is not None:
             self._unseen_mark_ns = max(stamp_ns, self._unseen_mark_ns or 0)

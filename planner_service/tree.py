@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from planner_service.ground import Cells, Changes, Ground
 from planner_service.growth import FINE, flood
-from planner_service.kernels import coarse, labels, walk
+from planner_service.kernels import coarse, walk
 from planner_service.kernels.flood import point_to_parents
 from planner_service.kernels.ground import cut_window, find_rim, merge_window
 from planner_service.kernels.repair import repair
@@ -210,7 +210,7 @@ class CostToGoTree:
         straight = ground.grid.resolution_m
         length = np.empty(ground.size, np.float32)
         root = ground.pad(self.root)
-        labels.path_lengths(self.parent, ground.stride, straight, straight * ground.diagonal, root, length)
+        walk.path_lengths(self.parent, ground.stride, straight, straight * ground.diagonal, root, length)
         return np.ascontiguousarray(self.inner(length), np.float32)
 
     def relabel(self) -> None:

@@ -46,7 +46,6 @@ def warm_up() -> None:
     tree.move(_SIDE + 1, window)
     tree.grow_rings(window, find_skeleton(ground))
     tree.tighten(np.array([ground.pad(0)]))
-    tree.lengths()
 
 
 def _live(tree: TargetTree, pace: NDArray[np.float32]) -> None:

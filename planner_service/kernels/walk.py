@@ -1,4 +1,7 @@
-"""Reading a tree: routes, and what is really driven along the parents. Arrays are laid out as `rules` says."""
+"""Reading a tree: routes, and how far and how long one really drives along the parents.
+
+Arrays are laid out as `rules` says.
+"""
 
 from __future__ import annotations
 
@@ -43,6 +46,29 @@ def relabel(weight, parent, stride, rule, root, cost):
             k = parent[v]
             u = v + offsets[k]
             cost[v] = cost[u] + (weight[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else weight[u])
+
+
+@njit(cache=True, nogil=True)
+def path_lengths(parent, stride, straight, diagonal, root, length):
+    """length (float32) := how long the way of each cell along its parents is; inf where there is none."""
+    offsets = step_offsets(stride)
+    unknown = np.float32(-1.0)
+    for i in range(length.size):
+        length[i] = unknown if parent[i] != NONE else INF
+    length[root] = np.float32(0.0)
+    trail = np.empty(length.size, np.uint32)
+    for i in range(length.size):
+        v = i
+        many = 0
+        while length[v] == unknown:
+            trail[many] = v
+            many += 1
+            v += offsets[parent[v]]
+        so_far = np.float64(length[v])
+        for j in range(many - 1, -1, -1):
+            v = np.int64(trail[j])
+            so_far += diagonal if parent[v] & 1 else straight
+            length[v] = so_far
 
 
 @njit(cache=True, nogil=True)
