@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from launch_scripts.commands import ask, roles
+from launch_scripts.commands import query, roles
 from swarm.errors import SwarmError
 
 
@@ -173,7 +173,7 @@ def _up(
 
     from launch_scripts.launcher import options
     from launch_scripts.launcher.up import UpOptions, run_swarm
-    from launch_scripts.processes import ROLES
+    from launch_scripts.process_table import ROLES
     from swarm.errors import ConfigError
 
     scenario = options.with_network(
@@ -224,11 +224,11 @@ def simulate(
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
     """
-    ask.simulate(scenario, seed, seconds, trace, as_json)
+    query.simulate(scenario, seed, seconds, trace, as_json)
 
 
 app.add_typer(roles.app)
-app.add_typer(ask.app)
+app.add_typer(query.app)
 
 
 def _mount(name: str, module: str, help: str) -> None:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from planner_service.strategies import GrownTree
-from swarm.messages import (
+from planner_service.target_tree import GrownTree
+from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
-    Fleet,
     PlannerStatus,
     PushedRoute,
     RouteReply,
     RouteRequest,
-    TargetPose,
 )
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Fleet
 
 # --- events ---------------------------------------------------------------------------------------------------
 

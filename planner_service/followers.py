@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
-from swarm.messages import Fleet, Route, RouteStatus, column
+from swarm.wire.fields import column
+from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.routes import Route, RouteStatus
 
 _STEP_ROW = np.array(STEP_ROW, np.int64)
 _STEP_COL = np.array(STEP_COL, np.int64)

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.followers import Follower, Followers
-from planner_service.strategies import TargetTree
-from shared_map.climb import Climb
+from planner_service.target_tree import TargetTree
+from shared_map.terrain.climb import Climb
 from swarm.clock import NS_PER_S
-from swarm.config import PlannerConfig
+from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
-from swarm.routes import RouteBatch
-from swarm.stats import Counters
+from swarm.runtime.stats import Counters
+from swarm.wire.routes import RouteBatch
 
 _EVERY_NS = NS_PER_S
 _MOST = 64

@@ -6,13 +6,14 @@ from collections.abc import Callable
 from contextlib import closing
 
 from planner_service.service import PlannerService
-from planner_service.warm import warm_up
-from shared_map.terrain import load_terrain
+from planner_service.warm_up import warm_up
+from shared_map.terrain.terrain import load_terrain
+from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
-from swarm.process import Inbox, Process, ThreadWorker, end_with
-from swarm.role import RoleSetup
-from swarm.zenoh_bus import open_bus
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process, ThreadWorker, end_with
+from swarm.runtime.role import RoleSetup
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:

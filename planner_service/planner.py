@@ -23,25 +23,23 @@ from planner_service.events import (
 )
 from planner_service.followers import Follower, Followers
 from planner_service.gaps import GapBooks
-from planner_service.strategies import MODEL_NS_PER_CELL, GrownTree, TargetTree, Update
+from planner_service.target_tree import MODEL_NS_PER_CELL, GrownTree, TargetTree, Update
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
-from swarm.config import PlannerConfig
+from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window
-from swarm.messages import (
+from swarm.runtime.stats import Counters
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
     PlannerStatus,
     PushedRoute,
-    Route,
     RouteReply,
     RouteRequest,
-    RouteStatus,
-    TargetPose,
-    pack_column,
 )
-from swarm.routes import RouteBatch
-from swarm.stats import Counters
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2

@@ -20,19 +20,21 @@ from planner_service.events import (
     TreeGrown,
 )
 from planner_service.planner import Planner
-from planner_service.strategies import GrownTree, TargetTree
+from planner_service.target_tree import GrownTree, TargetTree
 from shared_map.cost_map import CostMap
-from shared_map.feed import MapFeed
-from shared_map.reading import Reading, readable_for_target
-from shared_map.replica import MapReplica
+from shared_map.replication.filter import Reading, readable_for_target
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.sync import MapFeed
 from shared_map.sightings import Sightings, pose_of
-from shared_map.terrain import Terrain
-from swarm.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
-from swarm.config import agent_of
-from swarm.membership import Member
-from swarm.messages import CostRequest, Fleet, RouteRequest, Sighted, TargetPose
-from swarm.role import RoleSetup
-from swarm.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
+from swarm.config.scenario import agent_of
+from swarm.runtime.membership import Member
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.planning import CostRequest, RouteRequest
+from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 
 log = logging.getLogger(__name__)
 

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
-from shared_map.layers import LETHAL, inflate, inflation_halves
-from shared_map.terrain import Terrain
+from shared_map.terrain.layers import LETHAL, inflate, inflation_halves
+from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError
 from swarm.grid import TILE_CELLS, Window
-from swarm.messages import MarkKind
+from swarm.wire.statements import MarkKind
 
 MAX_WINDOWS = 32
 """Dirty windows are merged into fewer beyond this."""

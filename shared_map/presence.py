@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.reading import Reading
+from shared_map.replication.filter import Reading
 from swarm.grid import GridSpec
 from swarm.liveness import Leases
-from swarm.messages import Fleet, VehicleState
+from swarm.wire.messages.vehicles import Fleet, VehicleState
 
 PARKED = frozenset({VehicleState.IDLE, VehicleState.ARRIVED, VehicleState.STRANDED})
 """States of a vehicle that will not leave its cell by itself."""

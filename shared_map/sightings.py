@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from shared_map.reading import Reading
-from swarm.messages import Sighted, TargetPose
+from shared_map.replication.filter import Reading
+from swarm.wire.messages.targets import Sighted, TargetPose
 
 _MOST = 10_000
 

@@ -11,20 +11,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.climb import Climb
 from shared_map.presence import Presence
+from shared_map.terrain.climb import Climb
 from swarm.clock import NS_PER_S
-from swarm.config import AgentPlan, Scenario
+from swarm.config.scenario import AgentPlan, Scenario
 from swarm.grid import GridSpec
-from swarm.messages import Claims, PushedRoute, Route, RouteReply, RouteStatus, TargetPose, VehicleState
+from swarm.wire.messages.planning import PushedRoute, RouteReply
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Claims, VehicleState
+from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.assignment import choose
-from vehicle_agent.avoidance import Resumption, RightOfWay
-from vehicle_agent.follower import route_cells
-from vehicle_agent.grounds import SharedGround
-from vehicle_agent.placement import nearest_free
-from vehicle_agent.sensor import Findings, Sensor, compare
-from vehicle_agent.traffic import Traffic
-from vehicle_agent.vehicle import (
+from vehicle_agent.driving.route_follower import route_cells
+from vehicle_agent.driving.vehicle import (
     AskRoute,
     Assigned,
     Follow,
@@ -41,6 +39,12 @@ from vehicle_agent.vehicle import (
     Vehicle,
     VehicleAction,
 )
+from vehicle_agent.placement import nearest_free
+from vehicle_agent.sensing.sensor import Findings, Sensor, compare
+from vehicle_agent.traffic.deadlock import Traffic
+from vehicle_agent.traffic.resumption import Resumption
+from vehicle_agent.traffic.right_of_way import RightOfWay
+from vehicle_agent.traffic.territory import SharedGround
 
 _LONGEST_STEP_S = 0.5
 _RETRY_NS = NS_PER_S // 2

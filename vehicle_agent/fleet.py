@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
-from swarm.messages import NO_TARGET, Fleet, pack_column
-from vehicle_agent.vehicle import Vehicle
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet
+from vehicle_agent.driving.vehicle import Vehicle
 
 _MOST_TARGETS = NO_TARGET
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from shared_map.terrain import load_terrain, load_truth
+from shared_map.terrain.terrain import load_terrain, load_truth
+from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
-from swarm.process import Inbox, Process, end_with
-from swarm.role import RoleSetup
-from swarm.zenoh_bus import open_bus
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process, end_with
+from swarm.runtime.role import RoleSetup
 from vehicle_agent.service import AgentService
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.config import GroupConfig, Scenario, plan_agents
+from swarm.config.scenario import GroupConfig, Scenario, plan_agents
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 

@@ -9,45 +9,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.cost_map import CostMap
-from shared_map.feed import MapFeed
-from shared_map.interest import Interest
 from shared_map.presence import Presence
-from shared_map.reading import Reading, author_of, readable_groups
-from shared_map.replica import MapReplica
+from shared_map.replication.filter import Reading, author_of, readable_groups
+from shared_map.replication.interest import Interest
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.sync import MapFeed
 from shared_map.sightings import Sightings, pose_of
-from shared_map.terrain import Terrain
-from swarm.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config import plan_agents
+from swarm.config.scenario import plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
-from swarm.membership import Member
-from swarm.messages import (
-    Claims,
-    CostReply,
-    CostRequest,
-    Fleet,
-    Followed,
-    Grounds,
-    Nothing,
-    PushedRoute,
-    RouteReply,
-    RouteRequest,
-    Sighted,
-    TargetPose,
-    VehicleState,
-    column,
-)
-from swarm.role import RoleSetup
-from swarm.topics import CLAIMS, COST, FLEET, FOLLOWED, GROUNDS, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, TRUE_POSE
+from swarm.runtime.membership import Member
+from swarm.runtime.role import RoleSetup
+from swarm.wire.fields import column
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
+from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.vehicles import Claims, Fleet, Followed, Grounds, VehicleState
+from swarm.wire.topics import CLAIMS, COST, FLEET, FOLLOWED, GROUNDS, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, TRUE_POSE
 from vehicle_agent.agent import Agent, AgentAction, AskCosts, AskRoutes, LocalMap
-from vehicle_agent.avoidance import Resumption
+from vehicle_agent.driving.vehicle import Follow, VehicleAction
 from vehicle_agent.fleet import FleetReport, directions_of
-from vehicle_agent.grounds import PLOT_CELLS, SharedGround
-from vehicle_agent.lookout import Lookout
 from vehicle_agent.placement import spawn_cells
-from vehicle_agent.sensor import TruthSensor
-from vehicle_agent.vehicle import Follow, VehicleAction
+from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.sensing.target_detector import Lookout
+from vehicle_agent.traffic.resumption import Resumption
+from vehicle_agent.traffic.territory import PLOT_CELLS, SharedGround
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from launch_scripts.bench.tables import on_machine
-from swarm.config import Strategy
+from swarm.config.scenario import Strategy
 from swarm.errors import ConfigError
 
 app = typer.Typer(
@@ -139,8 +139,8 @@ def peers(
     and the largest relative difference of any cell's cost to ours. Memory says
     little on fields much smaller than 512 x 512.
     """
-    from launch_scripts.bench.peers import missing_sentence, run, tables
-    from launch_scripts.bench.rivals import missing_packages
+    from launch_scripts.bench.planning.libraries import missing_packages
+    from launch_scripts.bench.planning.peers import missing_sentence, run, tables
 
     if edge != "paper" and edge != "octile":
         raise ConfigError(f"--edge is {edge!r}, expected paper or octile")
@@ -167,7 +167,7 @@ def start(
 
     The cache is a temporary folder: that of this installation is left alone.
     """
-    from launch_scripts.bench.start import run_start, tables
+    from launch_scripts.bench.planning.cold_start import run_start, tables
 
     with _progress("start") as progress:
         report = run_start(size, cold_runs, runs, kernels, progress)
@@ -188,7 +188,7 @@ def paper(
     swarm bench paper
     swarm bench paper --frames 60      a first impression in one
     """
-    from launch_scripts.bench.paper import run_paper, tables
+    from launch_scripts.bench.planning.paper_tables import run_paper, tables
 
     with _progress("paper") as progress:
         report = run_paper(size, field, frames, seed, progress)
@@ -224,8 +224,8 @@ def scale(
     a size of 4096. --full takes every combination. Trees that do not fit into
     half of the free memory are run in groups.
     """
-    from launch_scripts.bench.fields import FIELDS
-    from launch_scripts.bench.scale import base_of, points_of, run_scale, tables
+    from launch_scripts.bench.planning.fields import FIELDS
+    from launch_scripts.bench.planning.scale import base_of, points_of, run_scale, tables
 
     if field not in FIELDS:
         raise ConfigError(f"--field is {field!r}, expected {', '.join(FIELDS)}: a file has only one size")
@@ -275,7 +275,7 @@ def gap(
     swarm bench gap --dem ridge.tif --walk random,evade --picture gap.png
     swarm bench gap --dem ridge.tif --strategies rotation --full-every 5
     """
-    from launch_scripts.bench.gap import WALKS, run_gap, tables
+    from launch_scripts.bench.planning.gap import WALKS, run_gap, tables
 
     walks = tuple(name.strip() for name in walk.split(","))
     for name in walks:
@@ -310,7 +310,7 @@ def directed(
     as_json: AsJson = False,
 ) -> None:
     """A full tree where uphill is not downhill (cost.directional), beside one where it is."""
-    from launch_scripts.bench.directed import run
+    from launch_scripts.bench.planning.directed import run
 
     _show(run(_numbers(sizes, "sizes", 16), repeats, seed), as_json)
 
@@ -330,7 +330,7 @@ def kernels(
     swarm bench kernels
     swarm bench kernels --size 2048 --field maze --json
     """
-    from launch_scripts.bench.kernels import run, tables
+    from launch_scripts.bench.planning.kernels import run, tables
 
     with _progress("kernels") as progress:
         report = run(size, field, repeats, side, seed, progress)
@@ -374,7 +374,7 @@ def wire(
     A router and the processes that receive and answer are started on free ports of this machine and ended. Ours and
     raw take turns, with the same bytes under keys of the same form: on a busy machine look at the ratios.
     """
-    from launch_scripts.bench.wire import PARTS, run, tables
+    from launch_scripts.bench.wire.overview import PARTS, run, tables
 
     chosen = tuple(name.strip() for name in parts.split(","))
     for name in chosen:

@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from launch_scripts.bench.chase import Tally
+from launch_scripts.bench.planning.chase import Tally
 from launch_scripts.bench.tables import LABELS, on_machine
 from launch_scripts.report.palette import BLUE, FAINT, GREEN, INK, ORANGE, PINK, SKY
+from launch_scripts.report.plot_style import STYLE
 from launch_scripts.report.plots import halo
-from launch_scripts.report.style import STYLE
-from swarm.config import Strategy
+from swarm.config.scenario import Strategy
 
 COLOURS: dict[Strategy, str] = {
     "full": INK,

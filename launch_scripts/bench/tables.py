@@ -8,7 +8,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from swarm.config import Strategy
+from swarm.config.scenario import Strategy
 
 Progress = Callable[[int, int], None]
 """Told how many steps are done, of how many."""

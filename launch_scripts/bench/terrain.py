@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from launch_scripts.bench.alone import measure
+from launch_scripts.bench.isolated import measure
 from launch_scripts.bench.machine import machine
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def _make(folder: Path, size: int, degrees: bool) -> None:
     import rasterio
     from rasterio.transform import from_origin
 
-    from shared_map.synthetic import landscape, paint_photo
+    from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 
     elevation_m, classes = landscape(size, size, RESOLUTION_M, size * RESOLUTION_M / 20, seed=1)
     photo = paint_photo(elevation_m, classes, RESOLUTION_M, seed=1)
@@ -111,8 +111,8 @@ def _plain(folder: Path) -> None:
 
 
 def _swarm(folder: Path, name: str) -> None:
-    from shared_map.terrain import build_terrain
-    from swarm.config import CostConfig, Scenario, TerrainConfig
+    from shared_map.terrain.terrain import build_terrain
+    from swarm.config.scenario import CostConfig, Scenario, TerrainConfig
 
     photo = None if name == "swarm without photo" else str(folder / "photo.tif")
     cost = CostConfig(vehicle_radius_m=WIDE_M if name == "swarm with wide vehicles" else 0.0)
@@ -124,7 +124,7 @@ def _only(name: str, folder: Path) -> None:
     import rasterio  # noqa: F401
     import scipy.ndimage  # noqa: F401
 
-    import shared_map.sources  # noqa: F401
+    import shared_map.terrain.importers.sources  # noqa: F401
 
     imported, cpu = time.perf_counter(), time.process_time()
     if name == "plain":

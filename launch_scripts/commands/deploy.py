@@ -86,7 +86,8 @@ def zenohd(
 
     from launch_scripts.deploy.zenohd import zenohd_config
     from launch_scripts.launcher.options import tls_of, with_network
-    from swarm.config import Scenario, check_endpoint
+    from swarm.config.load import check_endpoint
+    from swarm.config.scenario import Scenario
 
     if (trust or agent) and tls_ca is None:
         raise ConfigError(

@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from shared_map import exchange
-from shared_map.keeper import KeeperStore
+from shared_map.keeper import export as stored_marks
+from shared_map.keeper.store import KeeperStore
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
-from swarm.messages import MarkSet
+from swarm.wire.messages.marks import MarkSet
 
 app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is_help=True)
 
@@ -34,7 +34,7 @@ def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
 def inspect(store: Store, as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
     """Say what a store holds, by author."""
     terrain, grid, sets = _read(store)
-    _, kind = exchange.to_bands(grid, sets, time.time_ns())
+    _, kind = stored_marks.to_bands(grid, sets, time.time_ns())
     authors: dict[str, list[MarkSet]] = {}
     for each in sets:
         authors.setdefault(each.author, []).append(each)
@@ -47,7 +47,7 @@ def inspect(store: Store, as_json: Annotated[bool, typer.Option("--json", help="
         "cols": grid.cols,
         "sets": len(sets),
         "marks": sum(len(each.kinds) for each in sets),
-        "cells_with_marks": int((kind != exchange.NOTHING_SAID_BAND).sum()),
+        "cells_with_marks": int((kind != stored_marks.NOTHING_SAID_BAND).sum()),
         "cells_lethal": int((kind == 1).sum()),
         "authors": {
             author: {
@@ -89,7 +89,7 @@ def export(store: Store, out: Annotated[Path, typer.Argument(help=".json: every 
     kind_of_file = out.suffix.lower()
     try:
         if kind_of_file in _TEXT:
-            out.write_text(exchange.to_json(terrain, grid, sets), encoding="utf-8")
+            out.write_text(stored_marks.to_json(terrain, grid, sets), encoding="utf-8")
         elif kind_of_file in _PIXELS:
             _write_tiff(out, terrain, grid, sets)
         else:
@@ -109,7 +109,7 @@ def import_(
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise StoreError(f"cannot read {file}: {error}") from error
-    terrain, grid, sets = exchange.from_json(text)
+    terrain, grid, sets = stored_marks.from_json(text)
     with KeeperStore(store) as into:
         into.bind(terrain, grid)
         into.save(sets)
@@ -122,7 +122,7 @@ def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) ->
     from rasterio.errors import CRSError
     from rasterio.transform import from_origin
 
-    pace, kind = exchange.to_bands(grid, sets, time.time_ns())
+    pace, kind = stored_marks.to_bands(grid, sets, time.time_ns())
     try:
         crs = rasterio.crs.CRS.from_user_input(grid.crs)
     except CRSError:
@@ -141,7 +141,7 @@ def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) ->
         transform=from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m),
     ) as tiff:
         tiff.write(pace, 1)
-        said = np.where(kind == exchange.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
+        said = np.where(kind == stored_marks.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
         tiff.write(said, 2)
         tiff.set_band_description(1, "pace of marks, s/m; inf lethal; nan as the prior map says")
         tiff.set_band_description(2, "kind: 0 pace, 1 lethal, 2 clear; nan nothing said")

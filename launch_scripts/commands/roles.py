@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from swarm.config import NetworkConfig
-    from swarm.messages import RunInfo
+    from swarm.config.scenario import NetworkConfig
+    from swarm.wire.messages.processes import RunInfo
 
 app = typer.Typer()
 
@@ -157,13 +157,13 @@ def _run(
     import msgspec
 
     from launch_scripts.launcher import options
-    from launch_scripts.launcher.bars import bars
     from launch_scripts.launcher.child import load_entry, log_to
-    from launch_scripts.launcher.ground import fetch_if_missing
+    from launch_scripts.launcher.progress import bars
+    from launch_scripts.launcher.run_terrain import fetch_if_missing
     from launch_scripts.launcher.watcher import check_vacant
-    from launch_scripts.processes import ENTRIES, processes_of
+    from launch_scripts.process_table import ENTRIES, processes_of
     from swarm.errors import ConfigError, StoreError
-    from swarm.role import RoleSetup
+    from swarm.runtime.role import RoleSetup
 
     scenario = options.with_network(
         options.find_scenario(scenario_name),
@@ -203,7 +203,7 @@ def _run(
 
 def _check_id(id: str) -> None:
     from swarm.errors import ConfigError
-    from swarm.fields import check_id
+    from swarm.wire.fields import check_id
 
     try:
         check_id("--id", id)
@@ -214,7 +214,7 @@ def _check_id(id: str) -> None:
 def _found(network: NetworkConfig) -> list[RunInfo]:
     """Who is in the namespace."""
     from launch_scripts.launcher.watcher import ask_run
-    from swarm.zenoh_bus import open_bus
+    from swarm.bus.zenoh_bus import open_bus
 
     with open_bus(network) as bus:
         return ask_run(bus)

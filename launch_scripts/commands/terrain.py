@@ -13,15 +13,15 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.launcher.bars import bars
+from launch_scripts.launcher.progress import bars
 from shared_map.arrays import Bytes
-from shared_map.layers import TerrainClass, slope_deg
-from swarm.config import Scenario, TerrainConfig
+from shared_map.terrain.layers import TerrainClass, slope_deg
+from swarm.config.scenario import Scenario, TerrainConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
 
 if TYPE_CHECKING:
-    from shared_map.bands import Progress as Tell
-    from shared_map.terrain import Terrain
+    from shared_map.terrain.row_bands import Progress as Tell
+    from shared_map.terrain.terrain import Terrain
     from swarm.grid import GridSpec
 
 app = typer.Typer(
@@ -93,7 +93,7 @@ def info(
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
     """
-    from shared_map.sources import load_source
+    from shared_map.terrain.importers.sources import load_source
 
     if file.endswith(".toml"):
         config = _scenario(file).terrain
@@ -148,7 +148,7 @@ def _crs_name(grid: GridSpec) -> str:
         return grid.crs
     import rasterio
 
-    from shared_map.rasters import crs_name
+    from shared_map.terrain.importers.rasters import crs_name
 
     return crs_name(rasterio.CRS.from_user_input(grid.crs))
 
@@ -168,7 +168,7 @@ def cost(
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain cost mine.toml --out cost.tif
     """
-    from shared_map.terrain import build_terrain
+    from shared_map.terrain.terrain import build_terrain
 
     _check_target(out, "--out", *_TIFF)
     _check_target(picture, "--picture", ".png")
@@ -254,7 +254,7 @@ def synth(
     swarm terrain synth --out dem.tif --photo photo.tif --picture look.png
     swarm terrain info dem.tif
     """
-    from shared_map.terrain import build_terrain
+    from shared_map.terrain.terrain import build_terrain
     from swarm.grid import GridSpec
 
     _check_target(out, "--out", *_TIFF, ".npz")
@@ -315,7 +315,7 @@ def classify(
     class = "forest"
     points_m = [[4700, 4200], [5300, 2900]]
     """
-    from shared_map.terrain import build_terrain
+    from shared_map.terrain.terrain import build_terrain
 
     _check_target(out, "--out", *_TIFF)
     _check_target(picture, "--picture", ".png")
@@ -340,8 +340,8 @@ def classify(
 
 
 def _compare(terrain: Terrain, path: Path) -> None:
-    from shared_map.classify import by_rules, confusion, held_out
-    from shared_map.labels import read_labels
+    from shared_map.terrain.importers.classify import by_rules, confusion, held_out
+    from shared_map.terrain.importers.labels import read_labels
 
     labels = read_labels(path, terrain.grid)
     ground = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)

@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 
-from launch_scripts.report.relief import hillshade
+from launch_scripts.report.hillshade import hillshade
 from shared_map.arrays import Floats
-from shared_map.layers import TerrainClass
-from shared_map.pyramid import Level, level_of
-from shared_map.synthetic import TINT
-from shared_map.terrain import Terrain
+from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pyramid import Level, level_of
+from shared_map.terrain.synthetic.landscape import TINT
+from shared_map.terrain.terrain import Terrain
 from swarm.errors import TerrainError
 
 MOST_CELLS = 1 << 21

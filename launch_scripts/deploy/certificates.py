@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from swarm.errors import ConfigError, StoreError
-from swarm.fields import check_id
+from swarm.wire.fields import check_id
 
 CA = "ca"
 _CA_DAYS = 3650

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from swarm.codec import MAX_PAYLOAD_BYTES
-from swarm.config import NetworkConfig
-from swarm.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, SIGHTED, STATS
-from swarm.zenoh_bus import tls_settings
+from swarm.bus.zenoh_bus import tls_settings
+from swarm.config.scenario import NetworkConfig
+from swarm.wire.codec import MAX_PAYLOAD_BYTES
+from swarm.wire.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, SIGHTED, STATS
 
 ANSWERS = ("declare_queryable", "reply")
 PUTS = ("put", "delete", *ANSWERS, "liveliness_token")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from swarm.errors import SwarmError
-from swarm.role import RoleSetup
+from swarm.runtime.role import RoleSetup
 
 CRASHED = 70
 """Exit code of a process that ended by a bug."""

@@ -8,7 +8,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.report.record import LiveSummary, TargetLine
+from launch_scripts.report.recorder import LiveSummary, TargetLine
 
 SHOWN_TARGETS = 24
 

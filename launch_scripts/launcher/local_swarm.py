@@ -19,8 +19,8 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 from launch_scripts.launcher.child import LastWords, run_child
-from launch_scripts.processes import STOP_ORDER, ProcessSpec
-from swarm.role import RoleSetup
+from launch_scripts.process_table import STOP_ORDER, ProcessSpec
+from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import msgspec
 
-from swarm.config import NetworkConfig, Scenario, TlsConfig, check_endpoint, load_scenario
+from swarm.config.load import check_endpoint, load_scenario
+from swarm.config.scenario import NetworkConfig, Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"

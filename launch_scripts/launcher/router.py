@@ -5,16 +5,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from shared_map.terrain import load_terrain
-from swarm.bus import Bus, Event, Post
+from shared_map.terrain.terrain import load_terrain
+from swarm.bus.bus import Bus, Event, Post
+from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.errors import RunMismatchError
-from swarm.membership import Member
-from swarm.messages import RunInfo
-from swarm.process import Inbox, Process, end_with
-from swarm.role import RoleSetup
-from swarm.stats import Counters
-from swarm.zenoh_bus import open_bus
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.membership import Member
+from swarm.runtime.process import Process, end_with
+from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import Counters
+from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
 

@@ -11,25 +11,25 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from launch_scripts.launcher.bars import bars
 from launch_scripts.launcher.child import log_to
-from launch_scripts.launcher.ground import fetch_if_missing, missing_files
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.launcher.options import check_ports, listening, make_run_dir, new_run_id
-from launch_scripts.launcher.screen import Screen
+from launch_scripts.launcher.progress import bars
+from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
+from launch_scripts.launcher.terminal import Screen
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
-from launch_scripts.processes import ROLES, ProcessSpec, processes_of
-from launch_scripts.report.record import Recorder
-from launch_scripts.report.write import write_report
+from launch_scripts.process_table import ROLES, ProcessSpec, processes_of
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.write_report import write_report
 from shared_map.arrays import Floats
-from shared_map.terrain import Terrain, load_terrain, load_truth, prepare
-from swarm.bus import Bus
+from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
+from swarm.bus.bus import Bus
+from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
-from swarm.config import Scenario
+from swarm.config.scenario import Scenario
 from swarm.errors import BusError, SwarmError
-from swarm.membership import check_same_run
-from swarm.role import RoleSetup
-from swarm.zenoh_bus import open_bus
+from swarm.runtime.membership import check_same_run
+from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
 

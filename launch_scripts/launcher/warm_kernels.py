@@ -16,7 +16,7 @@ import sys
 MODULES = (
     "launch_scripts.launcher.child",
     "launch_scripts.launcher.router",
-    "shared_map.main",
+    "shared_map.keeper.main",
     "vehicle_agent.main",
     "launch_scripts.world.main",
     "planner_service.main",
@@ -39,7 +39,7 @@ def _load() -> None:
 _die_with_launcher()
 try:
     _load()
-    importlib.import_module("planner_service.warm").warm_up()
+    importlib.import_module("planner_service.warm_up").warm_up()
 except Exception:  # a role that cannot be loaded says so better in its own log
     logging.getLogger(__name__).exception("cannot warm up")
 gc.freeze()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 
-from launch_scripts.report.record import RECORDED_TOPICS, Recorder
-from swarm.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
+from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder
+from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
-from swarm.messages import Followed, Note, Nothing, PlannerStatus, RunInfo
-from swarm.process import Inbox
-from swarm.topics import RUN
+from swarm.runtime.inbox import Inbox
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Note, RunInfo
+from swarm.wire.messages.vehicles import Followed
+from swarm.wire.topics import RUN
 
 _TAG = "launcher-run"
 _ASK_TIMEOUT_S = 1.0

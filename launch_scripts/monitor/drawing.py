@@ -14,8 +14,8 @@ import rerun as rr
 
 from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, Ground, MeshTile, Points
 from launch_scripts.report import palette
-from launch_scripts.report.record import Sample
-from swarm.messages import VehicleState
+from launch_scripts.report.recorder import Sample
+from swarm.wire.messages.vehicles import VehicleState
 
 _NAMES_SHOWN = 40
 _ROUTE_COLOUR = (150, 235, 255)

@@ -6,14 +6,15 @@ import contextlib
 from collections.abc import Callable
 
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.outlets import Outlets, new_recording_path
 from launch_scripts.monitor.scene import Ground
 from launch_scripts.monitor.service import MonitorService
-from shared_map.terrain import load_terrain
+from launch_scripts.monitor.sinks import Outlets, new_recording_path
+from shared_map.terrain.terrain import load_terrain
+from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
-from swarm.process import Inbox, Process, end_with
-from swarm.role import RoleSetup
-from swarm.zenoh_bus import open_bus
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process, end_with
+from swarm.runtime.role import RoleSetup
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:

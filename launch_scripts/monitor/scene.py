@@ -13,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.observed import VehicleNow
-from launch_scripts.report.relief import hillshade
-from shared_map.pyramid import Level, any_in_blocks, level_of
-from shared_map.terrain import Terrain
+from launch_scripts.report.hillshade import hillshade
+from launch_scripts.report.latest_state import VehicleNow
+from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
+from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec, Window
-from swarm.messages import Sighted, VehicleState
+from swarm.wire.messages.targets import Sighted
+from swarm.wire.messages.vehicles import VehicleState
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

@@ -11,6 +11,7 @@ import numpy as np
 import rerun as rr
 
 from launch_scripts.monitor.drawing import Drawing
+from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.scene import (
     Ground,
     RouteNow,
@@ -24,23 +25,25 @@ from launch_scripts.monitor.scene import (
     vehicle_points,
     window_outline,
 )
-from launch_scripts.monitor.summary import level_of, summary_markdown
-from launch_scripts.report.observed import VehicleNow
-from launch_scripts.report.record import RECORDED_TOPICS, Recorder, messages_per_s
+from launch_scripts.report.latest_state import VehicleNow
+from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder, messages_per_s
 from shared_map.cost_map import CostMap
-from shared_map.feed import MapFeed
-from shared_map.replica import MapReplica
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.sync import MapFeed
 from shared_map.sightings import Sightings
-from shared_map.terrain import Terrain
-from swarm.bus import Appeared, Bus, Disappeared, Event, Heard, Post
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.grid import Window, walk
 from swarm.liveness import Peer
-from swarm.membership import Member
-from swarm.messages import Fleet, Followed, Note, PlannerStatus, Sighted, TargetPose
-from swarm.role import RoleSetup
-from swarm.stats import Counters
-from swarm.topics import MARKS, SIGHTED
+from swarm.runtime.membership import Member
+from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import Counters
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Note
+from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.vehicles import Fleet, Followed
+from swarm.wire.topics import MARKS, SIGHTED
 
 _TRAILS_NS = NS_PER_S // 2
 _ROUTES_NS = 3 * NS_PER_S // 2

@@ -21,7 +21,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from launch_scripts.monitor import tied
+from launch_scripts.monitor import die_with_parent
 from swarm.errors import StoreError
 
 log = logging.getLogger(__name__)
@@ -144,7 +144,7 @@ def _take_files() -> dict[str, _File]:
         [
             sys.executable,
             "-I",
-            str(Path(tied.__file__)),
+            str(Path(die_with_parent.__file__)),
             str(os.getpid()),
             *serve,
             "rerun+http://127.0.0.1:1/proxy",

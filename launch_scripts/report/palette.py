@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from swarm.messages import VehicleState
+from swarm.wire.messages.vehicles import VehicleState
 
 # Okabe and Ito's colours: told apart by nearly everybody, and of different lightness.
 GREEN, DARK_GREEN, RED, BLUE = "#009E73", "#00754f", "#D1330A", "#0072B2"

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from launch_scripts.report.hillshade import hillshade
 from launch_scripts.report.palette import (
     BLACK,
     DARK_GREEN,
@@ -29,12 +30,11 @@ from launch_scripts.report.palette import (
     RULE,
     YELLOW,
 )
+from launch_scripts.report.plot_style import STYLE
 from launch_scripts.report.plots import draw_plots, duration, halo
-from launch_scripts.report.record import Recorder
-from launch_scripts.report.relief import hillshade
-from launch_scripts.report.style import STYLE
-from shared_map.terrain import Terrain
-from swarm.messages import MarkKind
+from launch_scripts.report.recorder import Recorder
+from shared_map.terrain.terrain import Terrain
+from swarm.wire.statements import MarkKind
 
 WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
 

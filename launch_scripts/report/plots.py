@@ -16,8 +16,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from launch_scripts.report.palette import BLUE, DARK_GREEN, FAINT, GREEN, INK, ORANGE, SKY, STATE_COLOURS, VIOLET
-from launch_scripts.report.record import Recorder, Sample, messages_per_s
-from swarm.stats import Histogram
+from launch_scripts.report.recorder import Recorder, Sample, messages_per_s
+from swarm.runtime.stats import Histogram
 
 
 def draw_plots(figure: Figure, recorder: Recorder) -> None:

@@ -14,22 +14,22 @@ from typing import Any, TextIO
 
 import msgspec
 
-from launch_scripts.processes import STOP_ORDER, ProcessSpec, processes_of
-from launch_scripts.report.record import RECORDED_TOPICS, Recorder
+from launch_scripts.process_table import STOP_ORDER, ProcessSpec, processes_of
+from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.world.targets import TargetsService
 from planner_service.service import PlannerService
-from shared_map.keeper import KeeperStore
-from shared_map.service import KeeperService
-from shared_map.terrain import Terrain, build_terrain, build_truth
-from swarm.bus import Appeared, Disappeared, Event, Heard, Post
+from shared_map.keeper.service import KeeperService
+from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
+from swarm.bus.bus import Appeared, Disappeared, Event, Heard, Post
+from swarm.bus.memory_bus import MemoryBus, MemoryNetwork
+from swarm.bus.scheduler import InlineWorker, Scheduler
 from swarm.clock import NS_PER_S, ManualClock
-from swarm.config import Scenario
-from swarm.memory_bus import MemoryBus, MemoryNetwork
-from swarm.process import Service
-from swarm.role import RoleSetup
-from swarm.scheduler import InlineWorker, Scheduler
+from swarm.config.scenario import Scenario
+from swarm.runtime.process import Service
+from swarm.runtime.role import RoleSetup
 from vehicle_agent.service import AgentService
 
 EPOCH_NS = 1_800_000_000 * NS_PER_S

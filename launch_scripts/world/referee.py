@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
-from swarm.messages import Fleet, column
+from swarm.wire.fields import column
+from swarm.wire.messages.vehicles import Fleet
 
 _SKEW_NS = NS_PER_S // 200
 """Overlaps shorter than this are within what the clocks of two processes may differ."""

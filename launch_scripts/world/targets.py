@@ -15,16 +15,19 @@ from numpy.typing import NDArray
 
 from launch_scripts.world.referee import Collision, LethalEntry, Referee
 from launch_scripts.world.walks import Budget, Ground, Walker, far_place, slowness_of
-from shared_map.layers import inflate, inflation_halves
-from shared_map.terrain import Terrain
-from swarm.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
+from shared_map.terrain.layers import inflate, inflation_halves
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config import Scenario, TargetConfig, ids_of
+from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
-from swarm.membership import Member
-from swarm.messages import NO_TARGET, CostReply, CostRequest, Fleet, PlannerStatus, TargetPose, VehicleState, column
-from swarm.role import RoleSetup
-from swarm.topics import COST, FLEET, POSE, STATUS, TRUE_POSE
+from swarm.runtime.membership import Member
+from swarm.runtime.role import RoleSetup
+from swarm.wire.fields import column
+from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.topics import COST, FLEET, POSE, STATUS, TRUE_POSE
 
 LISTEN_NS = NS_PER_S
 """A starting driver asks the planners where their targets are before it makes places up. So long it waits for a

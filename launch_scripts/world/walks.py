@@ -16,7 +16,7 @@ from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from swarm.config import CostConfig, TargetConfig
+from swarm.config.scenario import CostConfig, TargetConfig
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from planner_service.kernels.rules import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
+from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
 
 _NOBODY = np.int32(-1)
 _ONE = np.uint64(1)

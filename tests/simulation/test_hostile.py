@@ -8,14 +8,15 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from simulated_swarm import Laws, seeded
-from wire_strategies import EXAMPLES, MESSAGES
+from support.simulated_swarm import Laws, seeded
+from support.wire_strategies import EXAMPLES, MESSAGES
 
 from launch_scripts.simulation.simulate import Simulation
-from swarm.bus import Event
-from swarm.codec import encode
-from swarm.messages import Message, RunInfo
-from swarm.topics import TOPICS, Topic
+from swarm.bus.bus import Event
+from swarm.wire.codec import encode
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.topics import TOPICS, Topic
 
 KNOWN = ("t0", "t1", "a0", "a1", "a2", "a0-00", "a1-01", "0", "3", "keeper", "planner", "agent", "targets")
 BY_TYPE = {type(example): example for example in EXAMPLES}

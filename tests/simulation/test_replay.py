@@ -9,14 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from simulated_swarm import SMALL, planned, seeded
+from support.simulated_swarm import SMALL, planned, seeded
 
 from launch_scripts.simulation.simulate import simulate
 
 RUN = """
 import json, sys
 sys.path.insert(0, sys.argv[1])
-from simulated_swarm import SMALL, planned
+from support.simulated_swarm import SMALL, planned
 from launch_scripts.simulation.simulate import simulate
 with open(sys.argv[2], "w") as trace:
     result = simulate(SMALL, seed=int(sys.argv[3]), seconds=12, faults=planned(int(sys.argv[3]), 12), trace=trace)

@@ -1,0 +1,1 @@
+"""Benchmarks of planning: full trees, strategies, gaps and the tables of the paper, beside other libraries."""

@@ -1,0 +1,61 @@
+"""How long a fresh process takes to its first tree, with numba's cache cold and warm."""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from rich.table import Table
+
+from launch_scripts.bench.isolated import measure
+from launch_scripts.bench.machine import machine
+from launch_scripts.bench.tables import Progress, number, table
+
+STAGES = {"tree": "a first tree is grown", "kernels": "a planner has called every kernel"}
+
+
+def run_start(
+    size: int = 512, cold_runs: int = 1, runs: int = 7, kernels: bool = True, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Medians of seconds from the process's beginning. Each cold run gets an empty cache folder (NUMBA_CACHE_DIR)
+    of its own; the warm ones use what the last cold one left there."""
+    rows: list[dict[str, Any]] = []
+    stages = [name for name in STAGES if kernels or name != "kernels"]
+    total = len(stages) * (cold_runs + runs)
+    done = 0
+    for what in stages:
+        took: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
+        with tempfile.TemporaryDirectory() as folder:
+            for n in range(cold_runs + runs):
+                cache = f"{folder}/{min(n, cold_runs - 1)}"
+                started_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+                found = measure(
+                    *("start", what, str(size), str(started_ns)), environment={"NUMBA_CACHE_DIR": cache}
+                )
+                took["cold" if n < cold_runs else "warm"].append(found)
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+        for state, starts in took.items():
+            rows.append(
+                {
+                    "until": what,
+                    "cache": state,
+                    "seconds": round(statistics.median(each["seconds"] for each in starts), 2),
+                    "cpu_s": round(statistics.median(each["cpu_s"] for each in starts), 2),
+                    "runs": len(starts),
+                }
+            )
+    return {"size": size, "rows": rows, **machine()}
+
+
+def tables(report: dict[str, Any]) -> Iterator[Table | str]:
+    shown = table("A fresh process", "<until", "<numba's cache", "seconds", "CPU s", "runs")
+    for row in report["rows"]:
+        shown.add_row(
+            STAGES[row["until"]], row["cache"], number(row["seconds"]), number(row["cpu_s"]), str(row["runs"])
+        )
+    yield shown

@@ -1,0 +1,100 @@
+"""How much more than the optimum is driven while a target moves, and how much of it the certificates can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from launch_scripts.bench.machine import machine
+from launch_scripts.bench.planning.chase import Plan, Tally, chase
+from launch_scripts.bench.planning.fields import Field, make_field
+from launch_scripts.bench.tables import LABELS, Progress, number, percent, table
+from launch_scripts.world.walks import Walk
+from planner_service.warm_up import warm_up
+from swarm.config.scenario import PlannerConfig, Strategy
+
+WALKS: tuple[Walk, ...] = ("random", "waypoints", "evade")
+
+
+def run_gap(
+    dem: str,
+    frames: int,
+    vehicles: int,
+    strategies: Sequence[Strategy],
+    walks: Sequence[Walk] = ("random",),
+    runs: int = 3,
+    speed: int | None = None,
+    seed: int = 1,
+    picture: Path | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Several runs of one target from different roots, all their routes taken together. `speed` is that of vehicles
+    in cells a frame: if not given, they stand, and drive a cell a frame after one that evades them."""
+    stage = Field(make_field(dem, 512, seed))
+    warm_up()
+    rows: list[dict[str, Any]] = []
+    drawn: dict[Walk, dict[Strategy, Tally]] = {}
+    for n, walk in enumerate(walks):
+        tallies: dict[Strategy, Tally] = {name: Tally() for name in strategies}
+        drives = int(walk == "evade") if speed is None else speed
+        for run in range(runs):
+            plan = Plan(vehicles=vehicles, frames=frames, walk=walk, speed=drives, probes=vehicles, seed=seed + run)
+
+            def tell(frame: int, of: int, before: int = n * runs + run) -> None:
+                if progress is not None:
+                    progress(before * of + frame, len(walks) * runs * of)
+
+            entrants = {name: PlannerConfig(strategy=name, **settings) for name in strategies}
+            for name, tally in zip(strategies, chase(stage, entrants, plan, tell).values(), strict=True):
+                tallies[name].add(tally)
+        rows += [
+            {"walk": walk, "vehicle_speed": drives, "strategy": name, **tally.row()}
+            for name, tally in tallies.items()
+        ]
+        drawn[walk] = tallies
+    report = {
+        "dem": Path(dem).name,
+        "shape": list(stage.pace.shape),
+        "frames": frames,
+        "runs": runs,
+        "vehicles": vehicles,
+        **settings,
+        "rows": rows,
+        **machine(),
+    }
+    if picture is not None:
+        from launch_scripts.bench.plots import save_gap
+
+        save_gap(report, drawn, picture)
+    return report
+
+
+def tables(report: dict[str, Any]) -> Iterator[Table | str]:
+    rows: list[dict[str, Any]] = report["rows"]
+    high, wide = report["shape"]
+    yield (
+        f"{report['dem']}, {high} x {wide} cells. {report['runs']} runs of {report['frames']} frames, a target that"
+        f" moves a cell a frame, {report['vehicles']} routes judged in each."
+    )
+    for walk in dict.fromkeys(row["walk"] for row in rows):
+        chosen = [row for row in rows if row["walk"] == walk]
+        speed = chosen[0]["vehicle_speed"]
+        shown = table(
+            f"Target: {walk}. Vehicles {f'drive {speed} a frame' if speed else 'stand anywhere'}",
+            *("<strategy", "gap %\nmean", "\np95", "\nmax", "proven %\nmedian", "\np95"),
+            *("CPU ms\na frame", "growths\na frame"),
+        )
+        for row in chosen:
+            whole = row["updates"].get("full", 0) + row["updates"].get("job", 0)
+            shown.add_row(
+                LABELS[row["strategy"]],
+                *(percent(row[key]) for key in ("gap_mean", "gap_p95", "gap_max", "proven_p50", "proven_p95")),
+                number(row["frame_ms_mean"]),
+                f"{whole / row['frames']:.2f}",
+            )
+        yield shown
+    yield "Gap: driven cost over the optimum; proven: over a certificate's lower bound; - is no bound."

@@ -1,0 +1,267 @@
+"""The processes of `bench.wire` beside the measuring one: a router, and peers that receive, hold and answer."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from shared_map.cost_map import CostMap
+from shared_map.replication.mark_sets import packed
+from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.sync import MapFeed
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import Event
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.clock import MonotonicClock
+from swarm.config.scenario import MapConfig, NetworkConfig
+from swarm.errors import SwarmError
+from swarm.grid import GridSpec
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process
+from swarm.runtime.stats import Counters
+from swarm.wire.codec import encode
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.statements import MarkKind
+
+NAMESPACE = "bench"
+RAW = "raw/bench"
+"""Keys of the raw measurements: as long and as many as ours, where none of us listens."""
+GRID = GridSpec(2048, 2048, 10.0)
+_READY_S = 60.0
+_END_S = 5.0
+
+
+def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
+    """A set of so many marks, spread over its tile."""
+    cells = np.arange(marks, dtype=np.uint16) * (1024 // max(marks, 16))
+    kinds = (np.arange(marks) % 2).astype(np.uint8)
+    paces = np.where(kinds == MarkKind.PACE, np.float32(0.25), np.float32(0))
+    return mark_set(author, "all", tile, 1, seq, Statements(cells, kinds, paces, np.full(marks, seq + 1, np.int64)))
+
+
+def map_key(tile: int, author: str) -> str:
+    """What follows the namespace in the key of a set."""
+    return f"marks/{GRID.region_of_tile(tile)}/{tile}/{author}"
+
+
+class Far:
+    """Processes beside this one, on one router. Left, they are ended, however the measurement went."""
+
+    def __init__(self) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.network = NetworkConfig(namespace=NAMESPACE, listen=(endpoint,), connect=(endpoint,))
+        self._spawning = multiprocessing.get_context("spawn")
+        self._running: list[tuple[BaseProcess, Connection]] = []
+
+    def __enter__(self) -> Far:
+        self.start(_router)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while self._running:
+            self.end()
+
+    def start(self, run: Callable[..., None], *given: Any) -> Connection:
+        """Run `run(network, pipe, *given)` in a process; returns once it has said "ready"."""
+        here, there = self._spawning.Pipe()
+        process = self._spawning.Process(target=run, args=(self.network, there, *given), daemon=True)
+        process.start()
+        self._running.append((process, here))
+        if not here.poll(_READY_S) or here.recv() != "ready":
+            raise SwarmError(f"the process {run.__name__} was not ready within {_READY_S:.0f} s")
+        return here
+
+    def end(self) -> None:
+        """End the process that was started last."""
+        process, pipe = self._running.pop()
+        with contextlib.suppress(OSError):  # it may have ended already
+            pipe.send("end")
+        process.join(_END_S)
+        if process.is_alive():
+            process.kill()
+            process.join(_END_S)
+
+
+def asked(far: Connection, *question: Any, within_s: float = 60.0) -> Any:
+    """What a process answers to a question."""
+    far.send(question)
+    if not far.poll(within_s):
+        raise SwarmError(f"no answer to {question[0]} within {within_s:.0f} s")
+    return far.recv()
+
+
+def _router(network: NetworkConfig, pipe: Connection) -> None:
+    with open_bus(network, mode="router"):
+        pipe.send("ready")
+        pipe.recv()
+
+
+def read_on_thread(entity: Any, arrive: Callable[[Any], None]) -> Any:
+    """Raw Zenoh at its fastest from Python: a FIFO and a thread. Returns the entity, which must be kept."""
+    channel = entity.handler
+
+    def run() -> None:
+        try:
+            while True:
+                arrive(channel.recv())
+        except zenoh.ZError:
+            return
+
+    threading.Thread(target=run, daemon=True).start()
+    return entity
+
+
+def run_service(service: Any, inbox: Inbox, pipe: Connection, answer: Callable[..., Any]) -> None:
+    """Run a service as its role does, until "end"; questions are answered on a thread beside it."""
+    process = Process(service, inbox, MonotonicClock(), 10.0)
+
+    def questions() -> None:
+        while (question := pipe.recv()) != "end":
+            pipe.send(answer(*question))
+        process.stop()
+
+    threading.Thread(target=questions, daemon=True).start()
+    process.run()
+
+
+class _MapPeer:
+    """A process that does nothing but take part in the map."""
+
+    def __init__(self, feed: MapFeed, pipe: Connection) -> None:
+        self.counters = Counters()
+        self._feed = feed
+        self._pipe = pipe
+
+    def start(self, now_ns: int) -> None:
+        self._feed.start(now_ns)
+        self._pipe.send("ready")
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        self._feed.handle(event, now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        self._feed.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        pass
+
+
+def map_peer(network: NetworkConfig, pipe: Connection) -> None:
+    """Applies the sets that it hears to a cost map, and notes when; receives raw samples beside that."""
+    applied: list[tuple[int, int, int]] = []  # (tile, seq, when)
+    raw_ns: list[int] = []
+    cpu_ns: dict[str, int] = {}
+
+    def accepted(each: MarkSet) -> None:
+        applied.append((each.tile, each.seq, time.monotonic_ns()))
+
+    def received(sample: zenoh.Sample) -> None:
+        sample.payload.to_bytes()
+        raw_ns.append(time.monotonic_ns())
+
+    def answer(what: str) -> Any:
+        match what:
+            case "applied":
+                found = (list(applied), list(raw_ns))
+                applied.clear()
+                raw_ns.clear()
+                cpu_ns["start"] = time.process_time_ns()
+                return found
+            case "cpu":
+                return time.process_time_ns() - cpu_ns["start"]
+            case _:
+                return (len(applied), len(raw_ns))
+
+    with open_bus(network) as bus:
+        inbox = Inbox()
+        replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
+        feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
+        raw = bus.session.declare_subscriber(f"{RAW}/**", zenoh.handlers.FifoChannel(1 << 16))
+        kept = read_on_thread(raw, received)
+        run_service(_MapPeer(feed, pipe), inbox, pipe, answer)
+        del kept
+
+
+def map_holder(network: NetworkConfig, pipe: Connection, sets: int, marks: int) -> None:
+    """Holds sets and answers for them as a keeper does; and the same bytes to raw queries, by set and in bulk."""
+    held = [some_set(tile, 0, marks) for tile in range(sets)]
+    with open_bus(network) as bus:
+        inbox = Inbox()
+        replica = MapReplica(GRID)
+        replica.merge_many(held)
+        feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench", name="holder.1", serves_all=True)
+        kept = [
+            _serve_raw(bus, f"{RAW}/sets", [encode(each) for each in held]),
+            _serve_raw(bus, f"{RAW}/bulk", [encode(each) for each in packed(held)]),
+        ]
+        run_service(_MapPeer(feed, pipe), inbox, pipe, lambda *_: None)
+        del kept
+
+
+def _serve_raw(bus: ZenohBus, key: str, payloads: list[bytes]) -> Any:
+    def answer(query: zenoh.Query) -> None:
+        for payload in payloads:
+            query.reply(key, payload)
+        query.drop()  # type: ignore[no-untyped-call]
+
+    return read_on_thread(bus.session.declare_queryable(key, zenoh.handlers.FifoChannel(16)), answer)
+
+
+def replica_cost(network: NetworkConfig, pipe: Connection) -> None:
+    """Tells the memory and times of a replica of a 4096 x 4096 map with a million marks."""
+    grid = GridSpec(4096, 4096, 1.0)
+    replica = MapReplica(grid)
+    replica.merge_many([some_set(tile, 0, 61) for tile in range(16)])
+    replica.digest()
+    before = resident_bytes()
+    cpu_s = time.process_time()
+    for tile in range(grid.tiles):
+        replica.merge(some_set(tile, 1, 61, f"a{tile % 8}.1"))
+    one_by_one_s = time.process_time() - cpu_s
+    held = resident_bytes() - before
+    marks = grid.tiles * 61
+    began_s = time.perf_counter()
+    digest = replica.digest()
+    first_ms = (time.perf_counter() - began_s) * 1e3
+    replica.merge(some_set(7, 2, 61, "a7.1"))
+    began_s = time.perf_counter()
+    replica.digest()
+    again_ms = (time.perf_counter() - began_s) * 1e3
+    again = [some_set(tile, 3, 61, f"a{tile % 8}.1") for tile in range(grid.tiles)]
+    cpu_s = time.process_time()
+    for first in range(0, len(again), 1024):
+        replica.merge_many(again[first : first + 1024])
+    together_s = time.process_time() - cpu_s
+    pipe.send("ready")
+    pipe.recv()
+    pipe.send(
+        {
+            "marks": marks,
+            "sets": grid.tiles,
+            "bytes_per_mark": round(held / marks, 1),
+            "digest_ms": round(max(first_ms, again_ms), 2),
+            "digest_bytes": sum(map(len, digest.values())),
+            "made_and_merged_cpu_us_per_set": round(one_by_one_s / grid.tiles * 1e6, 1),
+            "merged_together_cpu_us_per_set": round(together_s / grid.tiles * 1e6, 1),
+        }
+    )
+    pipe.recv()
+
+
+def resident_bytes() -> int:
+    with open("/proc/self/statm", encoding="ascii") as statm:
+        return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

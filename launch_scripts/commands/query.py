@@ -1,0 +1,287 @@
+"""Sub-commands that ask a running swarm, and the simulated one."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch_scripts.commands.roles import TlsCa, TlsCert, TlsKey
+
+if TYPE_CHECKING:
+    from swarm.config.scenario import NetworkConfig
+    from swarm.wire.messages.planning import CostReply, PlannerStatus, RouteReply
+    from swarm.wire.messages.processes import RunInfo, Stats
+
+app = typer.Typer()
+
+_PANEL = "Ask a running swarm"
+_CONNECT_S = 3.0
+_ROUTE_TIMEOUT_S = 5.0
+_STATUS_LISTEN_S = 1.5
+
+Connect = Annotated[str, typer.Option(help="The router's endpoint.")]
+Namespace = Annotated[str, typer.Option(help="Prefix of all keys.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def _network(connect: str, namespace: str, tls: tuple[str | None, str | None, str | None]) -> NetworkConfig:
+    import msgspec
+
+    from launch_scripts.launcher.options import tls_of, with_network
+    from swarm.config.scenario import Scenario
+
+    chosen = with_network(Scenario(), connect=connect, namespace=namespace, tls=tls_of(*tls)).network
+    return msgspec.structs.replace(chosen, connect_timeout_s=_CONNECT_S)
+
+
+@app.command(rich_help_panel=_PANEL)
+def route(
+    target: Annotated[str, typer.Option(help="To which target, such as t3.")],
+    row: Annotated[int, typer.Option(help="From this row, counted from the north.")],
+    col: Annotated[int, typer.Option(help="From this column, counted from the west.")],
+    connect: Connect = "tcp/127.0.0.1:7447",
+    namespace: Namespace = "swarm",
+    steps: Annotated[int, typer.Option(min=0, help="At most so many steps, 1 for the next; 0 is all.")] = 0,
+    cost: Annotated[bool, typer.Option("--cost", help="Only what it costs, or that there is no way.")] = False,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    as_json: AsJson = False,
+) -> None:
+    """Ask a planner for the cheapest route from a cell to its target.
+
+    swarm route --target t3 --row 40 --col 200
+
+    swarm route --target t3 --row 40 --col 200 --steps 1
+
+    swarm route --target t3 --row 40 --col 200 --json | jq .routes[0].cost_s
+    """
+    from swarm.bus.bus import AskEnded, Replied
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.errors import BusError, ConfigError
+    from swarm.runtime.inbox import Inbox
+    from swarm.wire.codec import encode_readable
+    from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+    from swarm.wire.topics import COST, ROUTE
+
+    network = _network(connect, namespace, (tls_ca, tls_cert, tls_key))
+    inbox = Inbox()
+    reply: RouteReply | CostReply | None = None
+    failure: str | None = None
+    began_s = time.monotonic()
+    with open_bus(network) as bus:
+        topic = COST if cost else ROUTE
+        request = CostRequest(row=row, col=col) if cost else RouteRequest(row=row, col=col, max_cells=steps)
+        bus.ask(topic, request, inbox.post, tag="route", timeout_s=_ROUTE_TIMEOUT_S, target=target)
+        while time.monotonic() < began_s + _ROUTE_TIMEOUT_S + 2.0:
+            match inbox.take(0.5):
+                case Replied(message=(RouteReply() | CostReply()) as found):
+                    reply = found
+                case AskEnded(failure=failure):
+                    break
+        took_ms = (time.monotonic() - began_s) * 1e3
+    if reply is None:
+        if failure is not None and failure != "timeout":
+            raise ConfigError(failure)
+        raise BusError(f"no planner of target {target!r} answers in namespace {namespace!r} at {connect}")
+    if as_json:
+        typer.echo(encode_readable(reply).decode())
+        return
+    if isinstance(reply, CostReply):
+        _print_cost(reply, row, col)
+    else:
+        _print_route(reply, took_ms)
+
+
+def _print_cost(reply: CostReply, row: int, col: int) -> None:
+    from swarm.wire.fields import column
+
+    cost_s = float(column(reply.cost_to_go_s, "<f4")[0])
+    if reply.target_cell is None:
+        typer.echo("no_target: the planner does not know where its target is")
+    elif math.isfinite(cost_s):
+        typer.echo(f"from row {row}, col {col} to {reply.target} in {cost_s:.1f} s")
+    else:
+        typer.echo(
+            f"unreachable: row {row}, col {col} has no way to {reply.target}, is lethal or outside of the terrain"
+        )
+
+
+def _print_route(reply: RouteReply, took_ms: float) -> None:
+    from swarm.wire.routes import RouteStatus
+
+    (found,) = reply.routes
+    row, col = divmod(found.start, reply.cols) if found.start >= 0 else (None, None)
+    if found.status is not RouteStatus.OK:
+        meaning = {
+            RouteStatus.UNREACHABLE: "there is no way from there",
+            RouteStatus.OUTSIDE: f"the cell is outside the terrain of {reply.rows} x {reply.cols} cells",
+            RouteStatus.LETHAL_START: "the cell is lethal, nobody could stand on it",
+            RouteStatus.NO_TARGET: "the planner does not know where its target is",
+        }[found.status]
+        typer.echo(f"{found.status.value}: {meaning}")
+        return
+    gap = f"proven within {100 * (found.gap - 1):.2f} % of the best" if math.isfinite(found.gap) else "gap unknown"
+    typer.echo(f"from row {row}, col {col} to {reply.target} in {found.cost_s:.1f} s, {gap}")
+    rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
+    many = len(found.directions)
+    typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
+    typer.echo(
+        f"tree {reply.tree_age_ms:.0f} ms old, map version {reply.map_version}, answered in {took_ms:.1f} ms"
+    )
+
+
+def _strides(directions: bytes) -> str:
+    """Runs of equal steps: 12 N, 3 NE, ..."""
+    from itertools import groupby
+
+    from swarm.wire.codec import COMPASS
+
+    return (
+        ", ".join(f"{len(list(steps))} {COMPASS[code]}" for code, steps in groupby(directions)) or "already there"
+    )
+
+
+@app.command(rich_help_panel=_PANEL)
+def status(
+    connect: Connect = "tcp/127.0.0.1:7447",
+    namespace: Namespace = "swarm",
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show who takes part in the running swarm and how the planners are doing."""
+    from launch_scripts.launcher.watcher import ask_run
+    from swarm.bus.bus import Heard
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.errors import BusError
+    from swarm.runtime.inbox import Inbox
+    from swarm.wire.messages.planning import PlannerStatus
+    from swarm.wire.messages.processes import Stats
+    from swarm.wire.topics import STATS, STATUS
+
+    inbox = Inbox()
+    stats: dict[tuple[str, str], Stats] = {}
+    planners: dict[str, PlannerStatus] = {}
+    with open_bus(_network(connect, namespace, (tls_ca, tls_cert, tls_key))) as bus:
+        bus.subscribe(STATS, inbox.post)
+        bus.subscribe(STATUS, inbox.post)
+        until_s = time.monotonic() + _STATUS_LISTEN_S
+        members = ask_run(bus)
+        while (left_s := until_s - time.monotonic()) > 0:
+            match inbox.take(left_s):
+                case Heard(message=Stats() as message):
+                    stats[message.role, message.id] = message
+                case Heard(message=PlannerStatus() as message):
+                    planners[message.target] = message
+    if not members:
+        raise BusError(f"nobody answers in namespace {namespace!r} at {connect}: is the swarm running?")
+    members.sort(key=lambda info: (info.role, info.id))
+    if as_json:
+        typer.echo(json.dumps(_status_fields(members, stats, planners), indent=2))
+    else:
+        _print_status(members, stats, planners)
+
+
+def _status_fields(
+    members: list[RunInfo], stats: dict[tuple[str, str], Stats], planners: dict[str, PlannerStatus]
+) -> dict[str, Any]:
+    import msgspec
+
+    return {
+        "run_id": members[0].run_id,
+        "scenario": members[0].scenario,
+        "terrain": members[0].terrain,
+        "processes": [
+            {
+                "role": info.role,
+                "id": info.id,
+                "incarnation": info.incarnation,
+                "counts": stats[info.role, info.id].counts if (info.role, info.id) in stats else None,
+                "gauges": stats[info.role, info.id].gauges if (info.role, info.id) in stats else None,
+            }
+            for info in members
+        ],
+        "planners": [msgspec.to_builtins(planners[target]) for target in sorted(planners)],
+    }
+
+
+def _throttled(stats: dict[tuple[str, str], Stats]) -> list[str]:
+    """Authors of whom a keeper says that their sets wait."""
+    from shared_map.keeper.service import THROTTLED
+
+    gauges = {name for each in stats.values() for name in each.gauges}
+    return sorted(name.removeprefix(THROTTLED) for name in gauges if name.startswith(THROTTLED))
+
+
+def _print_status(
+    members: list[RunInfo], stats: dict[tuple[str, str], Stats], planners: dict[str, PlannerStatus]
+) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    first = members[0]
+    console = Console()
+    console.print(
+        f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells", highlight=False
+    )
+    now_ns = time.time_ns()
+    crew = Table("process", "up s", "messages out", "in", "dropped", pad_edge=False)
+    for info in members:
+        counts = stats[info.role, info.id].counts if (info.role, info.id) in stats else {}
+        numbers = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
+        up_s = (now_ns - info.incarnation) / 1e9
+        crew.add_row(f"{info.role}-{info.id}", f"{up_s:.0f}", *("-" if n is None else str(n) for n in numbers))
+    console.print(crew)
+    for author in _throttled(stats):
+        console.print(f"author {author} marks more than its share: it is heard with delay", style="yellow")
+    if planners:
+        trees = Table(
+            "target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap", pad_edge=False
+        )
+        for id, planner in sorted(planners.items()):
+            gap = "-" if planner.gap_mean is None else f"{planner.gap_mean:.3f}"
+            trees.add_row(
+                id,
+                str(planner.following),
+                planner.strategy,
+                f"{planner.growth_ms:.1f}",
+                str(planner.growths),
+                str(planner.window_growths),
+                str(planner.routes_served),
+                gap,
+            )
+        console.print(trees)
+
+
+def simulate(name: str, seed: int | None, seconds: float | None, trace: Path | None, as_json: bool) -> None:
+    """See `swarm simulate`."""
+    import contextlib
+
+    from launch_scripts.launcher.options import find_scenario
+    from launch_scripts.launcher.terminal import Screen
+    from launch_scripts.simulation.simulate import simulate as run_simulation
+    from swarm.errors import StoreError
+
+    scenario = find_scenario(name)
+    screen = Screen(as_json, plain=True)
+    with contextlib.ExitStack() as stack:
+        try:
+            log = None if trace is None else stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
+        except OSError as error:
+            raise StoreError(f"cannot write {trace}: {error.strerror or error}") from error
+        result = run_simulation(scenario, seed=seed, seconds=seconds, trace=log)
+    if as_json:
+        typer.echo(json.dumps(result.report, indent=2))
+    else:
+        screen.report(result.report)
+    screen.say(
+        f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
+        f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
+    )

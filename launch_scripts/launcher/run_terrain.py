@@ -1,0 +1,83 @@
+"""The terrain of a run on this machine: from the scenario's files, or where they are missing from a keeper."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+from shared_map.keeper.base_map import NEEDED
+from shared_map.keeper.base_map_transfer import Fetching, fetch_base_map
+from shared_map.terrain.row_bands import Progress, no_progress
+from shared_map.terrain.terrain import build_truth, load_prepared, save_prepared, scenario_key
+from swarm.bus.zenoh_bus import open_bus
+from swarm.config.load import BUILT_IN_TERRAINS
+from swarm.config.scenario import Scenario
+from swarm.errors import StoreError, TerrainError
+from swarm.wire.messages.processes import RunInfo
+
+log = logging.getLogger(__name__)
+
+_LOOK = frozenset(("monitor", "keeper"))
+"""Roles that want the photo, too: a keeper hands on what it fetched."""
+
+
+def missing_files(scenario: Scenario) -> list[str]:
+    """The files that the terrain is made of and that are not here."""
+    terrain = scenario.terrain
+    source = None if terrain.source in BUILT_IN_TERRAINS else terrain.source
+    masks = [zone.mask for zone in scenario.cost.zones]
+    named = [source, terrain.photo, terrain.labels, *masks]
+    return [name for name in named if name is not None and not Path(name).is_file()]
+
+
+def fetch_if_missing(
+    scenario: Scenario,
+    run_dir: Path,
+    found: Sequence[RunInfo],
+    *,
+    roles: Collection[str],
+    progress: Progress = no_progress,
+) -> bool:
+    """Where files of the terrain are missing, get it from a keeper and leave it prepared in the run's folder, where
+    every process of this machine finds it. True if the run's folder has a terrain so.
+
+    found  who is in the namespace; the run's terrain is theirs
+    roles  for whom
+    Raises TerrainError with one sentence if no keeper gives the run's terrain.
+    """
+    missing = missing_files(scenario)
+    if not missing:
+        return False
+    why = f"there is no file {missing[0]}"
+    if not found:
+        raise TerrainError(f"{why}, and nobody in the namespace could send the base map: start the keeper first")
+    key = scenario_key(scenario)
+    looks = not _LOOK.isdisjoint(roles)
+    with _alone(run_dir):
+        here = load_prepared(run_dir, key)
+        if here is not None and (here.photo.any() or not looks):
+            return True
+        log.info("%s: asking the keepers of run %s for the base map", why, found[0].run_id)
+        layers = (*NEEDED, "photo") if looks else NEEDED
+        with open_bus(scenario.network) as bus:
+            within_s = 2 * scenario.network.connect_timeout_s  # so slow a link is one that a start may wait for
+            wanted = Fetching(found[0].terrain, scenario.cost, layers, within_s)
+            terrain = fetch_base_map(bus, wanted, why, progress)
+        save_prepared(run_dir, terrain, build_truth(scenario, terrain), key)
+        log.info("%s; terrain %s is as in the run", terrain.notes[-1], terrain.digest)
+    return True
+
+
+@contextlib.contextmanager
+def _alone(run_dir: Path) -> Iterator[None]:
+    """Of processes that share a run's folder one fetches, the others wait for it."""
+    try:
+        lock = (run_dir / "terrain.lock").open("wb")
+    except OSError as error:
+        raise StoreError(f"cannot write to {run_dir}: {error.strerror or error}") from error
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

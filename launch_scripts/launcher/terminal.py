@@ -1,0 +1,100 @@
+"""The launcher's terminal: a live table where there is one, plain lines where there is none."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from launch_scripts.launcher.live_table import live_table, plain_line
+from launch_scripts.report.recorder import LiveSummary
+
+log = logging.getLogger(__name__)
+
+_PLAIN_EVERY_S = 5.0
+_DRAW_EVERY_S = 0.25
+
+REPORTED = {
+    "seconds": "seconds",
+    "startup_s": "start-up, s",
+    "processes": "processes",
+    "restarts": "restarts",
+    "vehicles_routed": "vehicles that had a route",
+    "captures": "captures",
+    "marks": "marks",
+    "reroute_requests": "re-route requests",
+    "routes_served": "routes served",
+    "stranded": "stranded at the end",
+    "lost": "lost at the end",
+    "collisions": "collisions",
+    "lethal_entries": "lethal cells entered",
+    "gap": "gap to the optimum",
+    "growth_ms": "growing a tree, ms",
+    "route_query_ms": "asking for a route, ms",
+    "mark_to_tree_ms": "from mark to tree, ms",
+    "messages_per_s": "messages/s",
+    "payloads_dropped": "payloads dropped",
+}
+
+
+class Screen:
+    """Shows how a run goes. With `as_json`, standard output stays free for the report."""
+
+    def __init__(self, as_json: bool, plain: bool) -> None:
+        self._console = Console(stderr=as_json, highlight=False, soft_wrap=True)
+        self._table = self._console.is_terminal and not plain
+        self._live: Live | None = None
+        self._due_s = 0.0
+
+    def say(self, text: str, style: str | None = None) -> None:
+        """One line, above the table if there is one, and in the launcher's log."""
+        log.info("%s", text)
+        self._console.print(Text(text, style=style or ""))
+        if not self._console.is_terminal:
+            sys.stdout.flush()
+
+    def due(self) -> bool:
+        """Whether it is time to show the next summary."""
+        return time.monotonic() >= self._due_s
+
+    def show(
+        self, title: str, summary: LiveSummary, processes: Mapping[str, tuple[int, int]], restarts: int
+    ) -> None:
+        self._due_s = time.monotonic() + (_DRAW_EVERY_S if self._table else _PLAIN_EVERY_S)
+        if not self._table:
+            self.say(plain_line(summary, processes, restarts))
+            return
+        table = live_table(summary, processes, restarts, title)
+        if self._live is None:
+            self._live = Live(table, console=self._console, auto_refresh=False, transient=False)
+            self._live.start()
+        self._live.update(table, refresh=True)
+
+    def report(self, numbers: Mapping[str, Any]) -> None:
+        """What a run came to."""
+        table = Table(show_header=False, box=None, pad_edge=False)
+        for name, value in numbers.items():
+            if name in REPORTED:
+                table.add_row(REPORTED[name], _plain(value))
+        self._console.print(table)
+
+    def close(self) -> None:
+        """Leave the table as it stands."""
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return "not measured"
+    if isinstance(value, dict):
+        return "  ".join(f"{name} {_plain(part)}" for name, part in value.items())
+    return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"

@@ -1,0 +1,106 @@
+"""Where the recording goes: a file, and viewers on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from launch_scripts.monitor.web import LOOPBACK, ViewerPage
+from swarm.config.scenario import MonitorConfig
+from swarm.errors import BusError, StoreError
+
+log = logging.getLogger(__name__)
+
+APPLICATION = "terrain-swarm"
+_PORT_PATIENCE_S = 3.0
+
+T = TypeVar("T")
+
+
+def new_recording_path(folder: Path) -> Path:
+    """`run.rrd`, or `run-2.rrd` and so on where an earlier monitor left one: nothing is ever overwritten."""
+    for n in range(1, 10_000):
+        path = folder / ("run.rrd" if n == 1 else f"run-{n}.rrd")
+        try:
+            path.open("xb").close()
+            return path
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    raise StoreError(f"{folder} is full of recordings")
+
+
+class Outlets:
+    """A recording stream and where it flows. `close` takes seconds at most, whatever a disk or a viewer does."""
+
+    def __init__(
+        self, recording_id: str, path: Path | None, config: MonitorConfig, blueprint: rrb.Blueprint
+    ) -> None:
+        self.rec = rr.RecordingStream(
+            APPLICATION, recording_id=recording_id, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.1)
+        )
+        self.stream_url: str | None = None
+        """What a native viewer connects to."""
+        self._page: ViewerPage | None = None
+        sinks: list[rr.FileSink | rr.GrpcServerSink] = []
+        if path is not None:
+            sinks.append(rr.FileSink(path, write_footer=True))
+        if config.live:
+            grpc_port = _patiently(_free_port, config.grpc_port, "grpc_port")
+            self.stream_url = stream_url = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
+            page = _patiently(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
+            self._page = page
+            limit = f"{config.memory_mib}MiB"
+            sinks.append(rr.GrpcServerSink(bind_ip=LOOPBACK, port=grpc_port, server_memory_limit=limit))
+        self.rec.set_sinks(*sinks, default_blueprint=blueprint)
+
+    @property
+    def live_url(self) -> str | None:
+        """Where a browser on this machine sees the run."""
+        return None if self._page is None else self._page.url
+
+    def close(self, within_s: float = 3.0) -> None:
+        closing = threading.Thread(target=self._flush, args=(within_s,), name="flush", daemon=True)
+        closing.start()
+        closing.join(within_s)
+        if closing.is_alive():
+            log.warning("the recording was not written to the end within %.0f s", within_s)
+        if self._page is not None:
+            self._page.close()
+
+    def _flush(self, within_s: float) -> None:
+        with contextlib.suppress(Exception):  # a viewer that is gone must not keep the file from its end
+            self.rec.flush(timeout_sec=within_s * 0.8)
+        self.rec.disconnect()
+
+
+def _patiently(listen: Callable[[int], T], port: int, name: str) -> T:
+    """Listen on a port, also if it only soon becomes free, as after a restart. Raises BusError."""
+    deadline_s = time.monotonic() + _PORT_PATIENCE_S
+    while True:
+        try:
+            return listen(port)
+        except OSError as error:
+            if time.monotonic() > deadline_s:
+                raise BusError(
+                    f"cannot show the live view on port {port}: {error.strerror}; choose another "
+                    f"monitor.{name}, 0 for any, or monitor.live = false"
+                ) from error
+        time.sleep(0.1)
+
+
+def _free_port(wanted: int) -> int:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((LOOPBACK, wanted))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,57 @@
+"""The one table of processes: which roles a scenario is made of, in the order in which they start and stop."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from swarm.config.scenario import Scenario, plan_agents
+
+Restart = Literal["always", "never"]
+
+ROLES = ("router", "keeper", "monitor", "planner", "targets", "agent")
+"""In the order of their start: each finds at once what it needs, and the slowest to import begins early."""
+
+STOP_ORDER = ("agent", "targets", "planner", "monitor", "keeper", "router")
+"""Each role outlives those that still talk to it."""
+
+ENTRIES = {
+    "router": "launch_scripts.launcher.router:run",
+    "keeper": "shared_map.keeper.main:run",
+    "monitor": "launch_scripts.monitor.main:run",
+    "planner": "planner_service.main:run",
+    "targets": "launch_scripts.world.main:run",
+    "agent": "vehicle_agent.main:run",
+}
+"""Where each role's `run(setup, stop_when)` is found."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessSpec:
+    """One row of the table.
+
+    entry    `module:function`, called as function(setup, stop_when)
+    restart  whether it is started again when it crashes
+    """
+
+    role: str
+    id: str
+    entry: str
+    restart: Restart = "always"
+
+    @property
+    def name(self) -> str:
+        return f"{self.role}-{self.id}"
+
+
+def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES) -> list[ProcessSpec]:
+    """The processes of a scenario, restricted to `roles`, in the order of their start."""
+    ids: dict[str, list[str]] = {
+        "router": ["0"],
+        "keeper": ["0"],
+        "monitor": ["0"],
+        "planner": scenario.target_ids,
+        "targets": ["0"] if any(target.walk != "external" for target in scenario.targets) else [],
+        "agent": [plan.id for plan in plan_agents(scenario)],
+    }
+    return [ProcessSpec(role, id, ENTRIES[role]) for role in ROLES if role in roles for id in ids[role]]

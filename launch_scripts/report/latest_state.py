@@ -1,0 +1,209 @@
+"""The newest of everything that processes tell about a run: where all are, what they counted, what they marked.
+
+Pure: the launcher, the monitor and the simulation feed it with what they heard on `RECORDED_TOPICS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.grid import TILE_CELLS, GridSpec
+from swarm.liveness import Peer
+from swarm.runtime.stats import Histogram, merged
+from swarm.wire.fields import column
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.statements import MarkKind
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleNow:
+    """Where a vehicle was last heard of. `target` is None while it has none."""
+
+    east_m: float
+    south_m: float
+    heading_rad: float
+    state: VehicleState
+    target: str | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkedCells:
+    """The newest statement per marked cell, over all authors."""
+
+    cells: NDArray[np.int64]
+    kinds: NDArray[np.uint8]
+    paces: NDArray[np.float32]
+
+
+class Observed:
+    """Keeps the newest message per sender, so its memory does not grow with time."""
+
+    def __init__(self, grid: GridSpec) -> None:
+        self.grid = grid
+        self.status: dict[str, PlannerStatus] = {}
+        self.poses: dict[str, TargetPose] = {}
+        self._stats: dict[tuple[str, str, int], Stats] = {}
+        self._messages_before: dict[tuple[str, str, int], int] = {}
+        self._fleets: dict[tuple[str, int], Fleet] = {}
+        self._marks: dict[tuple[str, int], MarkSet] = {}
+        self._alive: dict[tuple[str, str], set[int]] = {}
+        self._incarnations: dict[tuple[str, str], set[int]] = {}
+
+    def heard(self, message: Message) -> None:
+        match message:
+            case Stats():
+                key = (message.role, message.id, message.incarnation)
+                stats = self._stats.get(key)
+                if stats is None or message.stamp_ns >= stats.stamp_ns:
+                    self._stats[key] = message
+                self._messages_before.setdefault(key, message.counts.get("messages_out", 0))
+                self._seen(message.role, message.id, message.incarnation)
+            case PlannerStatus():
+                status = self.status.get(message.target)
+                if status is None or (message.incarnation, message.stamp_ns) >= (
+                    status.incarnation,
+                    status.stamp_ns,
+                ):
+                    self.status[message.target] = message
+            case Fleet():
+                fleet = self._fleets.get((message.author, message.region))
+                if fleet is None or message.seq >= fleet.seq:
+                    self._fleets[message.author, message.region] = message
+            case TargetPose():
+                pose = self.poses.get(message.target)
+                if pose is None or (message.incarnation, message.seq) >= (pose.incarnation, pose.seq):
+                    self.poses[message.target] = message
+            case MarkSet():
+                marks = self._marks.get((message.author, message.tile))
+                if marks is None or (message.epoch, message.seq) > (marks.epoch, marks.seq):
+                    self._marks[message.author, message.tile] = message
+
+    def alive(self, peer: Peer, up: bool) -> None:
+        """A liveliness token rose or fell."""
+        incarnations = self._alive.setdefault((peer.role, peer.id), set())
+        if up:
+            incarnations.add(peer.incarnation)
+            self._seen(peer.role, peer.id, peer.incarnation)
+        else:
+            incarnations.discard(peer.incarnation)
+
+    def _seen(self, role: str, id: str, incarnation: int) -> None:
+        self._incarnations.setdefault((role, id), set()).add(incarnation)
+
+    # --- who --------------------------------------------------------------------------------------------------
+
+    def up(self) -> list[tuple[str, str]]:
+        """(role, id) of every process that is alive now."""
+        return sorted(key for key, incarnations in self._alive.items() if incarnations)
+
+    def is_up(self, role: str, id: str) -> bool:
+        return bool(self._alive.get((role, id)))
+
+    @property
+    def processes(self) -> int:
+        """How many there have been, restarts not counted."""
+        return len(self._incarnations)
+
+    @property
+    def restarts(self) -> int:
+        """Later incarnations of processes that were there before."""
+        return sum(len(incarnations) - 1 for incarnations in self._incarnations.values())
+
+    # --- where ------------------------------------------------------------------------------------------------
+
+    def vehicles(self) -> dict[str, VehicleNow]:
+        """Every vehicle as last heard of, in order of id."""
+        now: dict[str, VehicleNow] = {}
+        for fleet in sorted(self._fleets.values(), key=lambda fleet: (fleet.stamp_ns, fleet.seq)):
+            rows = zip(
+                fleet.ids,
+                column(fleet.east_m, "<f4").tolist(),
+                column(fleet.south_m, "<f4").tolist(),
+                column(fleet.heading_rad, "<f4").tolist(),
+                fleet.states,
+                fleet.targets,
+                strict=True,
+            )
+            for id, east_m, south_m, heading_rad, state, target in rows:
+                chased = None if target == NO_TARGET else fleet.target_ids[target]
+                now[id] = VehicleNow(east_m, south_m, heading_rad, VehicleState(state), chased)
+        return dict(sorted(now.items()))
+
+    def targets(self) -> dict[str, tuple[float, float]]:
+        """(east, south) in metres of every target, in order of id."""
+        return {id: self.place_m(pose) for id, pose in sorted(self.poses.items())}
+
+    def place_m(self, pose: TargetPose) -> tuple[float, float]:
+        """(east, south) from the north-west corner of the grid."""
+        return pose.x_m - self.grid.west_m, self.grid.north_m - pose.y_m
+
+    @property
+    def any_marks(self) -> bool:
+        return bool(self._marks)
+
+    def marked(self) -> MarkedCells:
+        """The newest statement per cell, ties by the larger author; cells cleared again are left out."""
+        newest: dict[int, tuple[int, str, int, float]] = {}
+        for (author, tile), marks in sorted(self._marks.items()):
+            if tile >= self.grid.tiles:
+                continue
+            window = self.grid.tile_window(tile)
+            columns = (column(marks.cells, "<u2"), column(marks.stamps_ns, "<i8"), column(marks.paces, "<f4"))
+            rows = zip(*(values.tolist() for values in columns), marks.kinds, strict=True)
+            for inside, stamp_ns, pace, kind in rows:
+                row, col = window.row0 + inside // TILE_CELLS, window.col0 + inside % TILE_CELLS
+                if row >= window.row1 or col >= window.col1:
+                    continue
+                cell = row * self.grid.cols + col
+                if cell not in newest or (stamp_ns, author) > newest[cell][:2]:
+                    newest[cell] = (stamp_ns, author, kind, pace)
+        kept = [(cell, kind, pace) for cell, (_, _, kind, pace) in sorted(newest.items()) if kind != MarkKind.CLEAR]
+        return MarkedCells(
+            np.array([cell for cell, _, _ in kept], np.int64),
+            np.array([kind for _, kind, _ in kept], np.uint8),
+            np.array([pace for _, _, pace in kept], np.float32),
+        )
+
+    # --- how much ---------------------------------------------------------------------------------------------
+
+    def total(self, name: str) -> int | None:
+        """A count, summed over processes and incarnations; None if no process ever told of it."""
+        told = [stats.counts[name] for stats in self._stats.values() if name in stats.counts]
+        return sum(told) if told else None
+
+    @property
+    def messages(self) -> int:
+        """Sent by all processes since each was first heard of: grows evenly, also for who joins late."""
+        return sum(
+            stats.counts.get("messages_out", 0) - self._messages_before[key] for key, stats in self._stats.items()
+        )
+
+    def gauge(self, name: str) -> float | None:
+        """A gauge, summed over the newest incarnation of each process; None if nobody told of it."""
+        newest: dict[tuple[str, str], Stats] = {}
+        for (role, id, incarnation), stats in self._stats.items():
+            if (role, id) not in newest or incarnation > newest[role, id].incarnation:
+                newest[role, id] = stats
+        told = [stats.gauges[name] for _, stats in sorted(newest.items()) if name in stats.gauges]
+        return sum(told) if told else None
+
+    def histogram(self, name: str) -> Histogram:
+        """What all incarnations of all processes observed under a name."""
+        return merged(stats.histograms.get(name, {}) for stats in self._stats.values())
+
+
+def count_states(vehicles: Mapping[str, VehicleNow]) -> tuple[int, ...]:
+    """How many vehicles are in each VehicleState, in its order."""
+    counts = [0] * len(VehicleState)
+    for vehicle in vehicles.values():
+        counts[vehicle.state] += 1
+    return tuple(counts)

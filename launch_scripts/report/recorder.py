@@ -1,0 +1,385 @@
+"""What happened in a run: messages in, numbers out. The launcher, the monitor and the simulation use the same.
+
+Pure: time is an argument, and whoever owns a bus feeds it with what it heard on `RECORDED_TOPICS`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from launch_scripts.report.latest_state import MarkedCells, Observed, VehicleNow, count_states
+from launch_scripts.report.tracks import TrackKey, Tracks
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import Scenario, plan_agents
+from swarm.grid import GridSpec
+from swarm.liveness import Peer
+from swarm.runtime.stats import Histogram
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Note
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Followed, VehicleState
+from swarm.wire.topics import FLEET, FOLLOWED, MARKS, NOTE, POSE, STATS, STATUS, Topic
+
+RECORDED_TOPICS: tuple[Topic, ...] = (STATS, STATUS, FLEET, POSE, NOTE, FOLLOWED, MARKS)
+
+_TRACK_NS = NS_PER_S // 2
+_SAMPLE_NS = NS_PER_S
+_SAMPLES_KEPT = 4096
+_NOTES_KEPT = 1000
+_CAPTURES_AT_ONCE = 100
+"""More between two poses is nobody's count: a message must not fill the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    time_s: float
+    target: str
+    east_m: float
+    south_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The run at one instant. `states` counts vehicles per VehicleState; totals are None until anybody tells."""
+
+    time_s: float
+    states: tuple[int, ...]
+    captures: int | None
+    marks: int | None
+    reroute_requests: int | None
+    routes_served: int | None
+    messages: int
+    alive: int
+    gaps: dict[str, float]
+    growth_ms: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class TargetLine:
+    """One row of the live table. `nearest_m` is how far the nearest vehicle is."""
+
+    id: str
+    planner_up: bool
+    following: int
+    nearest_m: float | None
+    growths: int | None
+    growth_ms: float | None
+    gap: float | None
+    captures: int
+
+
+@dataclass(frozen=True, slots=True)
+class LiveSummary:
+    """What the live table shows."""
+
+    elapsed_s: float
+    targets: tuple[TargetLine, ...]
+    states: dict[str, int]
+    captures: int | None
+    reroute_requests: int | None
+    marks: int | None
+    messages_per_s: float | None
+    alive: int
+    expected: int
+    restarts: int
+
+
+class Recorder:
+    """Everything worth keeping of what was heard, in memory that does not grow with the rate of messages."""
+
+    def __init__(self, scenario: Scenario, grid: GridSpec) -> None:
+        self.scenario = scenario
+        self.grid = grid
+        self.observed = Observed(grid)
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self.ready_ns: int | None = None
+        """When all processes of the scenario were alive and the first vehicle had begun a route."""
+        self.samples: deque[Sample] = deque(maxlen=_SAMPLES_KEPT)
+        self.captures: list[Capture] = []
+        self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
+        self.vehicle_tracks = Tracks(_TRACK_NS)
+        self.target_tracks = Tracks(_TRACK_NS)
+        self.routed: set[str] = set()
+        self._expected = _expected(scenario)
+        self._sample_due_ns: int | None = None
+        self._gap_max: float | None = None
+        self._certified_excess = Histogram()
+        self._unproven = 0
+
+    def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
+        """Take note of one message; `fields` are the chunks of its key."""
+        self._touch(now_ns)
+        match message:
+            case TargetPose():
+                self._capture(message, now_ns)
+            case PlannerStatus(gap_max=float(gap)):
+                self._gap_max = max(gap, self._gap_max or 0.0)
+            case Followed():
+                self.routed.add(message.vehicle)
+                self._certify(message)
+            case Note():
+                self.notes.append((self.seconds(now_ns), message))
+        self.observed.heard(message)
+        self._look(now_ns)
+
+    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
+        """A liveliness token rose or fell."""
+        self._touch(now_ns)
+        self.observed.alive(peer, up)
+        self._look(now_ns)
+
+    def seconds(self, now_ns: int) -> float:
+        """Since the first thing heard."""
+        return 0.0 if self.first_ns is None else (now_ns - self.first_ns) / NS_PER_S
+
+    def missing(self) -> list[str]:
+        """The processes of the scenario that are not alive now, as `role id`."""
+        up = self.observed.up()
+        roles = {role for role, _ in up}
+        return [
+            f"{role} {id}" if id else role
+            for role, id in self._expected
+            if (role, id) not in up and not (id == "" and role in roles)
+        ]
+
+    def marked(self) -> MarkedCells:
+        return self.observed.marked()
+
+    def _touch(self, now_ns: int) -> None:
+        if self.first_ns is None:
+            self.first_ns = now_ns
+        self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
+
+    def _capture(self, pose: TargetPose, now_ns: int) -> None:
+        known = self.observed.poses.get(pose.target)
+        if known is None or known.incarnation != pose.incarnation or pose.captures <= known.captures:
+            return
+        # Where it stood before: by now it may already have turned up elsewhere.
+        capture = Capture(self.seconds(now_ns), pose.target, *self.observed.place_m(known))
+        self.captures += [capture] * min(pose.captures - known.captures, _CAPTURES_AT_ONCE)
+
+    def _certify(self, route: Followed) -> None:
+        if 0 < route.lower_bound_s < math.inf and math.isfinite(route.cost_s):
+            self._certified_excess.add(max(route.cost_s / route.lower_bound_s - 1.0, 0.0))
+        else:
+            self._unproven += 1
+
+    def _look(self, now_ns: int) -> None:
+        if self.ready_ns is None and self.routed and not self.missing():
+            self.ready_ns = now_ns
+        tracks_due = self.vehicle_tracks.due(now_ns)
+        sample_due = self._sample_due_ns is None or now_ns >= self._sample_due_ns
+        if not (tracks_due or sample_due):
+            return
+        vehicles = self.observed.vehicles()
+        if tracks_due:
+            self._sample_tracks(now_ns, vehicles)
+        if sample_due:
+            self._sample_due_ns = now_ns + _SAMPLE_NS
+            self.samples.append(self.sample(now_ns, vehicles))
+
+    def _sample_tracks(self, now_ns: int, vehicles: Mapping[str, VehicleNow]) -> None:
+        moving = (VehicleState.FOLLOWING, VehicleState.ARRIVED)
+        self.routed.update(id for id, vehicle in vehicles.items() if vehicle.state in moving)
+        keys: list[TrackKey] = [(id, 0) for id in vehicles]
+        places = [(vehicle.east_m, vehicle.south_m) for vehicle in vehicles.values()]
+        self.vehicle_tracks.add(now_ns, keys, np.array(places, np.float32))
+        poses = sorted(self.observed.poses.items())
+        pieces: list[TrackKey] = [(id, pose.jumps) for id, pose in poses]
+        places = [self.observed.place_m(pose) for _, pose in poses]
+        self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
+
+    def sample(self, now_ns: int, vehicles: Mapping[str, VehicleNow]) -> Sample:
+        observed = self.observed
+        status = sorted(observed.status.items())
+        return Sample(
+            time_s=self.seconds(now_ns),
+            states=count_states(vehicles),
+            captures=observed.total("captures"),
+            marks=observed.total("marks"),
+            reroute_requests=observed.total("reroute_requests"),
+            routes_served=observed.total("routes_served"),
+            messages=observed.messages,
+            alive=len(observed.up()),
+            gaps={id: s.gap_mean for id, s in status if s.gap_mean is not None},
+            growth_ms={id: s.growth_ms for id, s in status},
+        )
+
+    def summary(self, now_ns: int) -> LiveSummary:
+        """The numbers of the live table."""
+        observed = self.observed
+        vehicles = observed.vehicles()
+        rates = messages_per_s(list(self.samples)[-2:])
+        return LiveSummary(
+            elapsed_s=self.seconds(now_ns),
+            targets=tuple(self._target_line(id, vehicles) for id in self.scenario.target_ids),
+            states=_by_state(count_states(vehicles)),
+            captures=observed.total("captures"),
+            reroute_requests=observed.total("reroute_requests"),
+            marks=observed.total("marks"),
+            messages_per_s=rates[-1][1] if rates else None,
+            alive=len(self._expected) - len(self.missing()),
+            expected=len(self._expected),
+            restarts=observed.restarts,
+        )
+
+    def _target_line(self, id: str, vehicles: Mapping[str, VehicleNow]) -> TargetLine:
+        observed = self.observed
+        pose, status = observed.poses.get(id), observed.status.get(id)
+        nearest_m = None
+        if pose is not None and vehicles:
+            east_m, south_m = observed.place_m(pose)
+            nearest_m = min(math.hypot(v.east_m - east_m, v.south_m - south_m) for v in vehicles.values())
+        return TargetLine(
+            id=id,
+            planner_up=observed.is_up("planner", id),
+            following=sum(1 for vehicle in vehicles.values() if vehicle.target == id),
+            nearest_m=nearest_m,
+            growths=None if status is None else status.growths + status.window_growths,
+            growth_ms=None if status is None else status.growth_ms,
+            gap=None if status is None else status.gap_mean,
+            captures=sum(1 for capture in self.captures if capture.target == id),
+        )
+
+    def report(
+        self,
+        *,
+        run_id: str | None = None,
+        seconds: float | None = None,
+        processes: int | None = None,
+        restarts: int | None = None,
+        startup_s: float | None = None,
+    ) -> dict[str, Any]:
+        """The numbers of the run. What nobody measured is None; what the caller knows better, it gives."""
+        if seconds is None and self.first_ns is not None and self.last_ns is not None:
+            seconds = (self.last_ns - self.first_ns) / NS_PER_S
+        observed, total = self.observed, self.observed.total
+        rates = [rate for _, rate in messages_per_s(list(self.samples))]
+        fields = {
+            "scenario": self.scenario.name,
+            "run_id": run_id,
+            "seed": self.scenario.seed,
+            "seconds": seconds,
+            "time_scale": self.scenario.time_scale,
+            "vehicles": self.scenario.vehicle_count,
+            "targets": len(self.scenario.target_ids),
+            "processes": observed.processes if processes is None else processes,
+            "restarts": observed.restarts if restarts is None else restarts,
+            "startup_s": startup_s,
+            "vehicles_routed": len(self.routed),
+            "captures": total("captures"),
+            "collisions": total("collisions"),
+            "lethal_entries": total("lethal_entries"),
+            "stranded": _whole(observed.gauge("stranded")),
+            "lost": _whole(observed.gauge("lost")),
+            "states_at_end": _by_state(count_states(observed.vehicles())),
+            "reroute_requests": total("reroute_requests"),
+            "marks": total("marks"),
+            "marked_cells": len(self.marked().cells) if observed.any_marks else None,
+            "routes_served": total("routes_served"),
+            "routes_received": total("routes_received"),
+            "growths": total("growths"),
+            "window_growths": total("window_growths"),
+            "gap": self._gap(),
+            "certified_gap": {**_excess(self._certified_excess), "unproven": self._unproven},
+            **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
+            "messages_out": total("messages_out"),
+            "messages_in": total("messages_in"),
+            "messages_per_s": _mean(rates),
+            "payloads_dropped": total("payloads_dropped"),
+            "ticks_dropped": total("ticks_dropped"),
+        }
+        return {name: _rounded(value) for name, value in fields.items()}
+
+    def series(self, points: int = 120) -> dict[str, list[Any]]:
+        """How it went, at no more than about so many instants: lists of one value each per `t_s`."""
+        samples = list(self.samples)
+        samples = samples[:: max(1, -(-len(samples) // points))]
+        names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
+        rates = {round(time_s, 6): rate for time_s, rate in messages_per_s(samples)}
+        fields: dict[str, list[Any]] = {
+            "t_s": [sample.time_s for sample in samples],
+            **{name: [getattr(sample, name) for sample in samples] for name in names},
+            **{state.name.lower(): [sample.states[state] for sample in samples] for state in VehicleState},
+            "gap_mean": [_mean(sample.gaps.values()) for sample in samples],
+            "growth_ms_mean": [_mean(sample.growth_ms.values()) for sample in samples],
+            "messages_per_s": [rates.get(round(sample.time_s, 6)) for sample in samples],
+        }
+        return {name: [_rounded(value) for value in values] for name, values in fields.items()}
+
+    def _gap(self) -> dict[str, float | None]:
+        """Driven cost over optimum, as the planners measured it.
+
+        `gap_excess` counts gap - 1, which tells 1.002 from 1.01; `gap` itself has buckets of 4 %.
+        """
+        fine, coarse = self.observed.histogram("gap_excess"), self.observed.histogram("gap")
+        if fine.count:
+            gap = _excess(fine)
+        else:
+            gap = {"mean": coarse.mean(), "p95": coarse.quantile(0.95), "max": coarse.quantile(1.0)}
+        return gap if self._gap_max is None else {**gap, "max": self._gap_max}
+
+
+TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "tick_ms")
+"""Histograms whose quantiles are reported."""
+
+
+def quantiles(histogram: Histogram) -> dict[str, float | None]:
+    return {"p50": histogram.quantile(0.5), "p99": histogram.quantile(0.99)}
+
+
+def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
+    """(time, rate) between successive samples, from when processes began to tell."""
+    return [
+        (late.time_s, max(late.messages - early.messages, 0) / (late.time_s - early.time_s))
+        for early, late in itertools.pairwise(samples)
+        if late.time_s > early.time_s and early.messages > 0
+    ]
+
+
+def _expected(scenario: Scenario) -> list[tuple[str, str]]:
+    """(role, id) of the processes without which a run is not whole; "" stands for any id."""
+    driven = any(target.walk != "external" for target in scenario.targets)
+    return [
+        ("keeper", ""),
+        *([("targets", "")] if driven else []),
+        *(("planner", id) for id in scenario.target_ids),
+        *(("agent", plan.id) for plan in plan_agents(scenario)),
+    ]
+
+
+def _excess(histogram: Histogram) -> dict[str, float | None]:
+    """Of a histogram of gap - 1, the gaps."""
+    values = {"mean": histogram.mean(), "p95": histogram.quantile(0.95), "max": histogram.quantile(1.0)}
+    return {name: None if value is None else 1.0 + value for name, value in values.items()}
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    kept = list(values)
+    return sum(kept) / len(kept) if kept else None
+
+
+def _by_state(counts: Iterable[int]) -> dict[str, int]:
+    return {state.name.lower(): n for state, n in zip(VehicleState, counts, strict=True)}
+
+
+def _whole(value: float | None) -> int | None:
+    return None if value is None else round(value)
+
+
+def _rounded(value: Any) -> Any:
+    """Six digits are more than anything here is measured to; what JSON cannot say is None."""
+    if isinstance(value, dict):
+        return {name: _rounded(item) for name, item in value.items()}
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value

@@ -1,0 +1,122 @@
+"""The exact tree of one root over weights of any ratio: a flood over a radix heap. Arrays are as `rules` says.
+
+Where one weight is thousands of times another, buckets as narrow as the smallest weight are too many to turn over
+one by one. Here a key's bits are read as digits, which sort positive floats, and a cell waits in the list of the
+first digit in which its key differs from the keys that are served now. When these reach a list, it is spread over
+the lists of the digits below; or served whole where it is no wider than the smallest weight. So a cell moves a few
+times, whatever the ratio, and no width is too fine: float32 keys are served in the order that they have.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, WALL
+
+_ONE = np.uint64(1)
+_DIGIT = np.uint64(6)
+_SLOTS = np.uint64(64)
+_INF_BITS = np.uint64(0x7F800000)
+_LEVELS = np.uint64(6)
+"""Digits of 6 bits that 32 bits take."""
+
+
+@njit(cache=True, nogil=True)
+def _enter(heads, links, waiting, item, key, served):
+    """Put an item into the list of the first digit in which its key differs from `served`; of equal ones, the last.
+
+    Keys are the bits of float32 numbers, as integers."""
+    level = np.uint64(0)
+    rest = (key ^ served) >> _DIGIT
+    while rest:
+        rest >>= _DIGIT
+        level += _ONE
+    slot = level * _SLOTS + ((key >> (level * _DIGIT)) & (_SLOTS - _ONE))
+    links[item] = heads[slot]
+    heads[slot] = item
+    waiting[level] += _ONE
+
+
+@njit(cache=True, nogil=True)
+def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
+    """First-touch flood for weights of any ratio. `cost` and `parent` are written whole: where one weight drowns in
+    the rounding of another, costs do not tell the parents.
+
+    width  s; the smallest weight, or less
+
+    Returns the largest exit key, which no cost exceeds.
+    """
+    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
+    every = 2 if rule == RULE_FOUR else 1
+    kinds = 2 if rule == RULE_OCTILE else 1
+    for i in range(weight.size):
+        parent[i] = NONE
+        cost[i] = INF if weight[i] < INF else WALL
+    # With octile steps item 2 * v waits under the straight key of v, 2 * v + 1 under its diagonal one. None is 0.
+    heads = np.zeros(_LEVELS * _SLOTS, np.uint32)
+    links = np.empty(kinds * weight.size, np.uint32)
+    waiting = np.zeros(_LEVELS, np.uint64)
+    touched = np.empty(weight.size, np.uint32)
+    bits = np.empty(1, np.float32)
+    as_bits = bits.view(np.uint32)
+    cost[root] = np.float32(0.0)
+    touched[0] = root
+    count = 1
+    served = np.uint64(0)
+    reach = np.float32(0.0)
+    while True:
+        for i in range(count):
+            v = np.uint64(touched[i])
+            for kind in range(kinds):
+                bits[0] = cost[v] + (weight[v] * SQRT2 if kind else weight[v])
+                _enter(heads, links, waiting, v * np.uint64(kinds) + np.uint64(kind), np.uint64(as_bits[0]), served)
+        count = 0
+        level = np.uint64(0)
+        while level < _LEVELS and waiting[level] == 0:
+            level += _ONE
+        if level == _LEVELS:
+            break
+        shift = level * _DIGIT
+        digit = (served >> shift) & (_SLOTS - _ONE)
+        while heads[level * _SLOTS + digit] == 0:
+            digit += _ONE
+        item = heads[level * _SLOTS + digit]
+        heads[level * _SLOTS + digit] = 0
+        above = shift + _DIGIT
+        served = (served >> above << above) | (digit << shift)
+        as_bits[0] = served
+        first = bits[0]
+        as_bits[0] = min(served + (_ONE << shift), _INF_BITS)
+        whole = level == 0 or bits[0] - first <= width
+        while item != 0:
+            following = links[item]
+            waiting[level] -= _ONE
+            u = np.int64(item) // kinds
+            kind = np.int64(item) % kinds
+            key = cost[u] + (weight[u] * SQRT2 if kind else weight[u])
+            if not whole:
+                bits[0] = key
+                _enter(heads, links, waiting, np.uint64(item), np.uint64(as_bits[0]), served)
+                item = following
+                continue
+            item = following
+            reach = max(reach, key)
+            for k in range(kind, 8, every * kinds):
+                v = u + offsets[k]
+                if not key < cost[v]:
+                    continue
+                if (
+                    k & 1
+                    and not corners
+                    and not max(weight[u + offsets[k - 1]], weight[u + offsets[(k + 1) & 7]]) < INF
+                ):
+                    continue
+                if cost[v] == INF:
+                    touched[count] = v
+                    count += 1
+                cost[v] = key
+                parent[v] = (k + 4) & 7
+    for i in range(weight.size):
+        cost[i] = cost[i] if cost[i] >= np.float32(0.0) else INF
+    return reach

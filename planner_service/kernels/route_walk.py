@@ -1,0 +1,244 @@
+"""Reading a tree: routes, and how far and how long one really drives along the parents.
+
+Arrays are laid out as `rules` says.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from planner_service.kernels.layout import INF, NONE, RULE_OCTILE, SQRT2, SQRT2_EXACT
+
+OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
+"""What became of a route that was asked for."""
+
+_LANES = 4
+"""Routes that are walked side by side. A step waits for the one before it, but not for another route's."""
+_STRETCH = 32
+"""Steps between two looks at whether a lane's route has ended; a route that has stands still meanwhile."""
+
+
+@njit(cache=True, nogil=True)
+def step_offsets(stride):
+    """What each direction code 0..7 adds to a padded cell index."""
+    return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
+
+
+@njit(cache=True, nogil=True)
+def relabel(weight, parent, stride, rule, root, cost):
+    """cost := what is really driven from each cell along its parents. `cost` is written whole."""
+    offsets = step_offsets(stride)
+    unknown = np.float32(-1.0)
+    for i in range(cost.size):
+        cost[i] = unknown if parent[i] != NONE else INF
+    cost[root] = np.float32(0.0)
+    trail = np.empty(cost.size, np.uint32)
+    for i in range(cost.size):
+        v = i
+        many = 0
+        while cost[v] == unknown:
+            trail[many] = v
+            many += 1
+            v += offsets[parent[v]]
+        for j in range(many - 1, -1, -1):
+            v = np.int64(trail[j])
+            k = parent[v]
+            u = v + offsets[k]
+            cost[v] = cost[u] + (weight[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else weight[u])
+
+
+@njit(cache=True, nogil=True)
+def path_lengths(parent, stride, straight, diagonal, root, length):
+    """length (float32) := how long the way of each cell along its parents is; inf where there is none."""
+    offsets = step_offsets(stride)
+    unknown = np.float32(-1.0)
+    for i in range(length.size):
+        length[i] = unknown if parent[i] != NONE else INF
+    length[root] = np.float32(0.0)
+    trail = np.empty(length.size, np.uint32)
+    for i in range(length.size):
+        v = i
+        many = 0
+        while length[v] == unknown:
+            trail[many] = v
+            many += 1
+            v += offsets[parent[v]]
+        so_far = np.float64(length[v])
+        for j in range(many - 1, -1, -1):
+            v = np.int64(trail[j])
+            so_far += diagonal if parent[v] & 1 else straight
+            length[v] = so_far
+
+
+@njit(cache=True, nogil=True)
+def _walk_on(weight, parent, offsets, lengths, cells, sums, trails, fill, steps):
+    """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
+    a, b, c, d = np.uint64(cells[0]), np.uint64(cells[1]), np.uint64(cells[2]), np.uint64(cells[3])
+    sum_a, sum_b, sum_c, sum_d = sums[0], sums[1], sums[2], sums[3]
+    trail_a, trail_b, trail_c, trail_d = trails[0], trails[1], trails[2], trails[3]
+    at_a, at_b, at_c, at_d = np.uint64(fill[0]), np.uint64(fill[1]), np.uint64(fill[2]), np.uint64(fill[3])
+    for i in range(np.uint64(steps)):
+        code_a, code_b, code_c, code_d = parent[a], parent[b], parent[c], parent[d]
+        trail_a[at_a + i] = code_a
+        trail_b[at_b + i] = code_b
+        trail_c[at_c + i] = code_c
+        trail_d[at_d + i] = code_d
+        a += offsets[code_a]
+        b += offsets[code_b]
+        c += offsets[code_c]
+        d += offsets[code_d]
+        sum_a += np.float64(weight[a]) * lengths[code_a]
+        sum_b += np.float64(weight[b]) * lengths[code_b]
+        sum_c += np.float64(weight[c]) * lengths[code_c]
+        sum_d += np.float64(weight[d]) * lengths[code_d]
+    cells[0], cells[1], cells[2], cells[3] = np.int64(a), np.int64(b), np.int64(c), np.int64(d)
+    sums[0], sums[1], sums[2], sums[3] = sum_a, sum_b, sum_c, sum_d
+
+
+@njit(cache=True, nogil=True)
+def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
+    """The routes from `starts` (padded cells that have a way), at most `max_steps` long where that is positive.
+
+    limit  no route can be longer than so many steps
+    Returns directions (uint8, one route after the other), ends (int64, where each stops in directions), driven
+    (float64, s, recomputed along the cells), diagonals (int64, how many steps were diagonal), last (int64, the
+    last cell). A cycle or a hole would be a bug: ends is -1 there.
+    """
+    # Beyond the codes of directions, NONE: to stay, at no cost. Unsigned, as sums of a cell and a signed offset
+    # would be floating-point numbers; they wrap.
+    offsets = np.zeros(256, np.uint64)
+    lengths = np.zeros(256, np.float64)
+    near = step_offsets(stride)
+    for k in range(8):
+        offsets[k] = np.uint64(near[k])
+        lengths[k] = SQRT2_EXACT if rule == RULE_OCTILE and k & 1 else 1.0
+    count = starts.size
+    ends = np.empty(count, np.int64)
+    driven = np.empty(count, np.float64)
+    diagonals = np.empty(count, np.int64)
+    last = np.empty(count, np.int64)
+    most = limit if max_steps <= 0 else min(limit, max_steps)
+
+    # Each lane has a share of the routes, and its trail holds them in order.
+    capacity = 1024
+    trails = np.empty((_LANES, capacity), np.uint8)
+    route = np.empty(_LANES, np.int64)
+    until = np.empty(_LANES, np.int64)
+    begun = np.zeros(_LANES, np.int64)
+    fill = np.zeros(_LANES, np.int64)
+    cells = np.full(_LANES, root, np.int64)
+    sums = np.zeros(_LANES, np.float64)
+    for j in range(_LANES):
+        route[j] = count * j // _LANES
+        until[j] = count * (j + 1) // _LANES
+        if route[j] < until[j]:
+            cells[j] = starts[route[j]]
+    while True:
+        steps = 0
+        for j in range(_LANES):
+            if route[j] < until[j]:
+                left = min(_STRETCH, most - (fill[j] - begun[j]))
+                steps = left if steps == 0 else min(steps, left)
+        if steps == 0:
+            break
+        longest = max(max(fill[0], fill[1]), max(fill[2], fill[3]))
+        if longest + steps > capacity:
+            more = np.empty((_LANES, 2 * capacity), np.uint8)
+            for j in range(_LANES):
+                for i in range(capacity):  # by a loop: see `_longer` in `repair`
+                    more[j, i] = trails[j, i]
+            trails = more
+            capacity *= 2
+        _walk_on(weight, parent, offsets, lengths, cells, sums, trails, fill, steps)
+        for j in range(_LANES):
+            r = route[j]
+            if r == until[j]:
+                continue
+            end = fill[j] + steps
+            while end > begun[j] and trails[j, end - 1] == NONE:
+                end -= 1
+            fill[j] = end
+            v = cells[j]
+            if parent[v] != NONE and end - begun[j] < most:
+                continue
+            broken = v != root and (parent[v] == NONE or end - begun[j] == limit)
+            ends[r] = -1 if broken else end
+            driven[r] = sums[j]
+            last[r] = v
+            route[j] = r + 1
+            begun[j] = end
+            sums[j] = 0.0
+            cells[j] = starts[r + 1] if r + 1 < until[j] else root
+
+    directions = np.empty(fill.sum(), np.uint8)
+    n = 0
+    for j in range(_LANES):
+        for i in range(fill[j]):
+            directions[n + i] = trails[j, i]
+        for r in range(count * j // _LANES, until[j]):
+            ends[r] += n if ends[r] >= 0 else 0
+        n += fill[j]
+    n = 0
+    for r in range(count):
+        odd = 0
+        for i in range(n, ends[r]):
+            odd += directions[i] & 1
+        diagonals[r] = odd
+        n = max(n, ends[r])
+    return directions, ends, driven, diagonals, last
+
+
+@njit(cache=True, nogil=True)
+def find_starts(weight, cost, stride, root, asked, starts, status):
+    """Where routes from `asked` cells (int64, of the grid) start, padded, and whether there is one.
+
+    Written: starts (int64; the root where there is no route, so that none is walked), status (uint8).
+    """
+    cols = stride - 2
+    cells = (weight.size // stride - 2) * cols
+    for i in range(asked.size):
+        cell = asked[i]
+        starts[i] = root
+        if cell < 0 or cell >= cells:
+            status[i] = OUTSIDE
+            continue
+        v = (cell // cols + 1) * stride + cell % cols + 1
+        if not weight[v] < INF:
+            status[i] = LETHAL_START
+        elif not cost[v] < INF:
+            status[i] = UNREACHABLE
+        else:
+            status[i] = OK
+            starts[i] = v
+
+
+@njit(cache=True, nogil=True)
+def price_routes(cost, offset, root, resolution, diagonal, length_weight, walks, status, prices):
+    """What walked routes cost and how long they are.
+
+    walks   (ends, driven, diagonals, last) as `walk_routes` returns them
+    prices  float64 (4, routes): in, the proven bounds as its second row; out, cost_s, lower_bound_s, length_m and
+            remaining_s, where there is a route; inf, 0, 0, 0 elsewhere
+    Returns False if a route does not end where it should.
+    """
+    ends, driven, diagonals, last = walks
+    begin = 0
+    for i in range(status.size):
+        if status[i] != OK:
+            prices[0, i] = np.inf
+            prices[1:, i] = 0.0
+            continue
+        if ends[i] < 0:
+            return False
+        length = (np.float64(ends[i] - begin) + np.float64(diagonals[i]) * (diagonal - 1.0)) * resolution
+        begin = ends[i]
+        remaining = 0.0
+        if last[i] != root:
+            remaining = max(np.float64(cost[last[i]]) + offset, 0.0)
+        whole = driven[i] - length * length_weight + remaining
+        prices[0, i] = whole
+        prices[1, i] = min(prices[1, i], whole)
+        prices[2, i] = length
+        prices[3, i] = remaining
+    return True

@@ -1,0 +1,194 @@
+"""The base map on the wire: a terrain in packed pieces, and a terrain again, for machines that lack its files.
+
+What a piece must hash to is told beforehand, so that a false one is refused when it comes; that the whole is the
+terrain of the run is seen from the run's digest. Core: no bus, no clock.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.terrain import Terrain, finished
+from swarm.config.scenario import CostConfig
+from swarm.errors import ProtocolError, TerrainError
+from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec, Window
+from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap, BaseMapTile
+
+REGION_CELLS = REGION_TILES * TILE_CELLS
+MAX_CELLS = 1 << 28
+"""A larger base map than 16384 x 16384 is not taken from anybody."""
+_LEVEL = 1  # a third smaller than the raw bytes as with level 6, in half the time
+
+
+@dataclass(frozen=True, slots=True)
+class _Layer:
+    dtype: type[np.generic]
+    depth: int  # values per cell
+
+
+LAYERS = {
+    "ground": _Layer(np.float32, 1),
+    "elevation": _Layer(np.float32, 1),
+    "classes": _Layer(np.uint8, 1),
+    "photo": _Layer(np.uint8, 3),
+}
+NEEDED = ("ground", "elevation", "classes")
+"""What all need. The prior pace follows from the ground and the vehicle's radius; the photo is to look at."""
+
+
+def layers_of(terrain: Terrain) -> dict[str, NDArray[Any]]:
+    return {
+        "ground": terrain.ground_s_per_m,
+        "elevation": terrain.elevation_m,
+        "classes": terrain.classes,
+        "photo": terrain.photo,
+    }
+
+
+def region_window(grid: GridSpec, region: int) -> Window:
+    """The cells of a region; regions at the east and south border may be cut off."""
+    region_row, region_col = divmod(region, grid.region_cols)
+    row0, col0 = region_row * REGION_CELLS, region_col * REGION_CELLS
+    return Window(row0, col0, min(row0 + REGION_CELLS, grid.rows), min(col0 + REGION_CELLS, grid.cols))
+
+
+def describe(terrain: Terrain, keeper: str) -> BaseMap:
+    """What a keeper tells of its terrain."""
+    grid = terrain.grid
+    digests = {}
+    for name, array in layers_of(terrain).items():
+        pieces = (_piece(array, region_window(grid, region)) for region in range(grid.regions))
+        digests[name] = b"".join(_digest(piece) for piece in pieces)
+    return BaseMap(
+        keeper=keeper,
+        terrain=terrain.digest,
+        rows=grid.rows,
+        cols=grid.cols,
+        resolution_m=grid.resolution_m,
+        west_m=grid.west_m,
+        north_m=grid.north_m,
+        crs=grid.crs,
+        digests=digests,
+        notes=list(terrain.notes),
+    )
+
+
+def pack(terrain: Terrain, layer: str, region: int) -> BaseMapTile:
+    """One layer of one region. zlib, because every process has it; byte planes halve what it leaves of floats."""
+    array = layers_of(terrain)[layer]
+    values = np.frombuffer(_piece(array, region_window(terrain.grid, region)), np.uint8)
+    planes = values.reshape(-1, array.itemsize).T.tobytes()
+    return BaseMapTile(layer=layer, region=region, data=zlib.compress(planes, _LEVEL))
+
+
+def _piece(array: NDArray[Any], window: Window) -> bytes:
+    return array[window.row0 : window.row1, window.col0 : window.col1].tobytes()
+
+
+def _digest(piece: bytes) -> bytes:
+    return hashlib.blake2b(piece, digest_size=BASE_DIGEST_BYTES).digest()
+
+
+class BaseMapCopy:
+    """A terrain that comes in pieces. Takes only pieces that are as described, and memory only for those.
+
+    Raises TerrainError at once where the description cannot be that of the run's terrain.
+
+    layers  which to fetch: NEEDED, and "photo" for those who look
+    """
+
+    def __init__(self, described: BaseMap, terrain: str, layers: tuple[str, ...] = NEEDED) -> None:
+        who = f"the base map of keeper {described.keeper}"
+        if described.terrain != terrain:
+            raise TerrainError(f"{who} is terrain {described.terrain}, the run has {terrain}")
+        if described.rows * described.cols > MAX_CELLS:
+            raise TerrainError(
+                f"{who} has {described.rows} x {described.cols} cells, at most {MAX_CELLS} are taken"
+            )
+        for layer in layers:
+            if layer not in described.digests:
+                raise TerrainError(f"{who} lacks the layer {layer}: it has {', '.join(sorted(described.digests))}")
+        self.grid = described.grid
+        self.notes = tuple(described.notes)
+        self.keeper = described.keeper
+        self._who = who
+        self._terrain = terrain
+        self._digests = {layer: described.digests[layer] for layer in layers}
+        self._missing = {layer: dict.fromkeys(range(self.grid.regions)) for layer in layers}
+        self._arrays: dict[str, NDArray[Any]] = {}
+        for layer in layers:
+            kind = LAYERS[layer]
+            shape = (self.grid.rows, self.grid.cols)
+            # Of `empty` the system gives memory page by page, when a piece is written there.
+            self._arrays[layer] = np.empty(shape if kind.depth == 1 else (*shape, kind.depth), kind.dtype)
+
+    def missing(self, at_most: int) -> Iterator[tuple[str, list[int]]]:
+        """(layer, regions) still to come, so many of each layer."""
+        for layer, regions in self._missing.items():
+            if regions:
+                yield layer, list(regions)[:at_most]
+
+    @property
+    def share(self) -> float:
+        """How much of it has come, 0 to 1."""
+        left = sum(len(regions) for regions in self._missing.values())
+        return 1.0 - left / (len(self._missing) * self.grid.regions)
+
+    def take(self, tile: BaseMapTile) -> bool:
+        """Put a piece into its place; False if it is there already. Raises ProtocolError on a false one."""
+        if tile.region not in self._missing.get(tile.layer, {}):
+            if tile.layer in self._missing and tile.region < self.grid.regions:
+                return False
+            raise ProtocolError(f"{self._who}: nobody asked for layer {tile.layer[:40]!r}, region {tile.region}")
+        what = f"{self._who}: layer {tile.layer}, region {tile.region}"
+        window, kind = region_window(self.grid, tile.region), LAYERS[tile.layer]
+        width = np.dtype(kind.dtype).itemsize
+        planes = _inflated(tile.data, window.cells * kind.depth * width, what)
+        piece = np.frombuffer(planes, np.uint8).reshape(width, -1).T.tobytes()
+        place = tile.region * BASE_DIGEST_BYTES
+        if _digest(piece) != self._digests[tile.layer][place : place + BASE_DIGEST_BYTES]:
+            raise ProtocolError(f"{what} is not as its digest says")
+        into = self._arrays[tile.layer][window.row0 : window.row1, window.col0 : window.col1]
+        into[...] = np.frombuffer(piece, kind.dtype).reshape(into.shape)
+        del self._missing[tile.layer][tile.region]
+        return True
+
+    def terrain(self, cost: CostConfig) -> Terrain:
+        """The whole, once nothing is missing. Raises TerrainError if it is not the terrain of the run."""
+        ground, elevation, classes = (self._arrays[layer] for layer in NEEDED)
+        if np.isnan(ground).any() or (ground <= 0).any():
+            raise TerrainError(f"{self._who} has ground with no possible pace")
+        if classes.max(initial=0) > max(TerrainClass):
+            raise TerrainError(f"{self._who} has class {classes.max()}, at most {int(max(TerrainClass))} exists")
+        photo = self._arrays.get("photo")
+        if photo is None:
+            photo = np.broadcast_to(np.uint8(0), (*classes.shape, 3))  # black: nobody looks
+        notes = (*self.notes, f"fetched from keeper {self.keeper}, as its files are not on this machine")
+        made = finished(self.grid, elevation, photo, classes, ground, cost, notes)
+        if made.digest != self._terrain:
+            raise TerrainError(
+                f"{self._who} with this scenario's cost rules is terrain {made.digest}, the run has "
+                f"{self._terrain}: are the [cost] sections of the scenarios the same?"
+            )
+        return made
+
+
+def _inflated(data: bytes, size: int, what: str) -> bytes:
+    """Exactly `size` bytes. No more are ever unpacked than were asked for."""
+    unpacker = zlib.decompressobj()
+    try:
+        unpacked = unpacker.decompress(data, size + 1)
+    except zlib.error as error:
+        raise ProtocolError(f"{what} does not unpack: {error}") from error
+    if len(unpacked) != size or not unpacker.eof:
+        found = f"{len(unpacked)}" if len(unpacked) < size else f"more than {size}"
+        raise ProtocolError(f"{what} has {found} bytes, expected {size}")
+    return unpacked

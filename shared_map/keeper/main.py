@@ -1,0 +1,45 @@
+"""The keeper process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from shared_map.keeper.service import KeeperService
+from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.terrain import load_terrain
+from swarm.bus.zenoh_bus import open_bus
+from swarm.clock import MonotonicClock
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process, end_with
+from swarm.runtime.role import RoleSetup
+
+TICK_HZ = 10.0
+
+
+def run(
+    setup: RoleSetup,
+    stop_when: Callable[[], None] | None,
+    store_path: Path | None = None,
+    rebuild: bool = False,
+) -> None:
+    """Keep the map until told to stop.
+
+    store_path  the SQLite file; if not given, `map.sqlite` in the run's folder (`map-ID.sqlite` of a keeper whose
+                id is not 0), or memory where there is none
+    rebuild     a damaged store is moved aside and filled anew from the swarm
+    """
+    terrain = load_terrain(setup)
+    if store_path is None and setup.run_dir is not None:
+        store_path = setup.run_dir / ("map.sqlite" if setup.id == "0" else f"map-{setup.id}.sqlite")
+    with (
+        KeeperStore(store_path or ":memory:", rebuild=rebuild) as store,
+        open_bus(setup.scenario.network) as bus,
+    ):
+        inbox = Inbox()
+        service = KeeperService(setup, terrain, bus, inbox.post, store)
+        process = Process(service, inbox, MonotonicClock(), TICK_HZ)
+        process.stop_on_signals()
+        if stop_when is not None:
+            end_with(stop_when, process.stop)
+        process.run()

@@ -1,0 +1,198 @@
+"""The keeper's shell: the map on the bus, and every set of it in the store."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import suppress
+
+from shared_map.keeper.base_map_transfer import BaseMapServer
+from shared_map.keeper.compaction import FoldPlan, fold
+from shared_map.keeper.store import Keeper, KeeperStore
+from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.sync import MapFeed
+from shared_map.sightings import Sightings
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Bus, Event, Heard, Post
+from swarm.clock import NS_PER_S
+from swarm.errors import StoreError
+from swarm.runtime.membership import Member
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.marks import Digest, MarkSet
+from swarm.wire.messages.targets import Sighted
+from swarm.wire.topics import SIGHTED
+
+log = logging.getLogger(__name__)
+
+THROTTLED = "throttled."
+"""Begins the gauge, there only while it is so, of an author that marks more than its share."""
+
+_RETRY_NS = NS_PER_S
+_NOTE_AGAIN_NS = 60 * NS_PER_S
+_NAME_AT_MOST = 16
+_FOLD_EVERY_NS = NS_PER_S
+_FOLD_TILES = 16
+_SWEEP_EVERY_NS = 600 * NS_PER_S
+
+
+class KeeperService:
+    """A replica that writes every set to its store, tells by its digest what is safe there, and answers for all
+    authors, above all for those that are gone."""
+
+    def __init__(self, setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post, store: KeeperStore) -> None:
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self.counters = self._member.counters
+        self._bus = bus
+        self._post = post
+        self._base_map = BaseMapServer(terrain, setup.id)
+        self._store = store
+        self._keeper = Keeper()
+        self.replica = MapReplica(terrain.grid)
+        self._feed = MapFeed(
+            self.replica,
+            bus,
+            post,
+            setup.scenario.map,
+            setup.role,
+            name=setup.author,
+            serves_all=True,
+            held=self._keeper.committed.held,
+            on_accepted=self._accepted,
+        )
+        config = setup.scenario.map
+        self._fold_after_ns = int(config.fold_after_s * NS_PER_S)
+        self._fold_keep_ns = int(config.fold_keep_s * NS_PER_S)
+        self._fold_plan = FoldPlan(self._fold_after_ns, 0)
+        self._fold_due_ns = 0
+        self._sweep_due_ns = 0
+        for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged"):
+            self.counters.count(name, 0)
+        self._save_due_ns = 0
+        self._sightings = Sightings(self.replica.reading)
+        self._seen: dict[str, Sighted] = {}
+        self._sightings_due_ns = 0
+        self._noted_ns: int | None = None
+        self._named: list[str] = []
+        store.bind(terrain.digest, terrain.grid)
+        for mark_set in store.load():
+            if self.replica.merge(mark_set, measured=False) is not None:
+                self._keeper.restored(mark_set)
+
+    def start(self, now_ns: int) -> None:
+        self._member.join()
+        self._base_map.start(self._bus)
+        self._fold_plan = FoldPlan(self._fold_after_ns, now_ns)
+        self._feed.start(now_ns)
+        self._bus.subscribe(SIGHTED, self._post)
+        log.info("keeper started: %d tiles in store %s", len(self.replica.tiles), self._store.path)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Sighted):
+            self._sightings.hear(event.message)
+            return
+        if isinstance(event, Heard) and isinstance(event.message, Digest):
+            self._fold_plan.heard(event.message.author, now_ns)
+        if not self._member.handle(event):
+            self._feed.handle(event, now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        if now_ns >= self._save_due_ns:
+            self._save(now_ns)
+        if now_ns >= self._fold_due_ns and not self._keeper.waiting:
+            self._fold_due_ns = now_ns + _FOLD_EVERY_NS
+            self._fold(now_ns)
+        if now_ns >= self._sightings_due_ns:
+            self._save_sightings(now_ns)
+        self._feed.tick(now_ns)
+        self._name_throttled(now_ns)
+        counts = self.replica.counts
+        self.counters.counts["marks_merged"] = counts["marks_merged"]
+        self.counters.counts["sets_refused"] = counts["sets_refused"]
+        self.counters.gauge("sets_waiting", float(len(self._keeper.waiting)))
+        self._member.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        self._save(now_ns)
+        self._member.publish_stats(now_ns)
+
+    def _save_sightings(self, now_ns: int) -> None:
+        """Where targets were seen is for people to look at: what a full disk does not take is not missed."""
+        self._sightings_due_ns = now_ns + NS_PER_S
+        new = {id: each for id, each in self._sightings.best(now_ns).items() if self._seen.get(id) != each}
+        self._sightings.expire(now_ns)
+        if new:
+            self._seen.update(new)
+            with suppress(StoreError):
+                self._store.save_sightings(new.values())
+
+    def _name_throttled(self, now_ns: int) -> None:
+        """Tell people once who marks more than its share."""
+        throttled = self._feed.throttled
+        self.counters.gauge("authors_throttled", float(len(throttled)))
+        for author in self._named:
+            self.counters.gauges.pop(THROTTLED + author, None)
+        for author in throttled[:_NAME_AT_MOST]:
+            self.counters.gauge(THROTTLED + author, 1.0)
+        for author in throttled[:_NAME_AT_MOST]:
+            if author not in self._named:
+                self._named.append(author)
+                text = f"author {author} marks more than its share: it is heard with delay"
+                self._member.note(now_ns, "quota", text)
+        self._named = [author for author in self._named if author in throttled]
+
+    def _accepted(self, mark_set: MarkSet) -> None:
+        self._keeper.accept(mark_set)
+        self._fold_plan.accepted(mark_set)
+
+    def _fold(self, now_ns: int) -> None:
+        """Fold what the dead have left, a few tiles at a time. On the disk first: what is put is never less than
+        what the store could put back."""
+        plan = self._fold_plan
+        plan.update(self.replica.ledger, now_ns)
+        tiles = plan.take_due(_FOLD_TILES, now_ns)
+        folded: list[MarkSet] = []
+        try:
+            for tile, dropped_too in tiles.items():
+                sets = self.replica.sets(tile)
+                dropped = self._store.folded(tile) if dropped_too else {}
+                names = {*dropped, *(each.author for each in sets)}
+                gone = {name for name in names if plan.is_gone(name, now_ns)}
+                new = fold(sets, dropped, gone, now_ns - self._fold_after_ns)
+                left = {each.author: each for each in sets if each.author in gone}
+                plan.folded(tile, (left | {each.author: each for each in new}).values(), now_ns)
+                folded.extend(new)
+            if folded:
+                self._store.save(folded, now_ns)
+            if now_ns >= self._sweep_due_ns:
+                self._sweep_due_ns = now_ns + _SWEEP_EVERY_NS
+                self._store.forget_folded(now_ns - self._fold_keep_ns)
+        except StoreError as error:
+            plan.put_off(tiles)
+            self._fold_due_ns = now_ns + 10 * _FOLD_EVERY_NS
+            log.warning("cannot fold: %s", error)
+            return
+        self.replica.merge_many(folded, measured=False)
+        self._keeper.saved(folded)
+        self._feed.publish(PublishSet(each) for each in folded)
+        self.counters.count("sets_folded", len(folded))
+
+    def _save(self, now_ns: int) -> None:
+        """Commit what waits. A disk that refuses is told of, tried again, and no reason to stop serving."""
+        waiting = self._keeper.waiting
+        if not waiting:
+            return
+        try:
+            self._store.save(waiting, now_ns)
+        except StoreError as error:
+            self.counters.count("saves_failed")
+            self._save_due_ns = now_ns + _RETRY_NS
+            if self._noted_ns is None or now_ns - self._noted_ns >= _NOTE_AGAIN_NS:
+                self._noted_ns = now_ns
+                log.error("%s; %d sets wait, serving goes on", error, len(waiting))
+                self._member.note(now_ns, "store", f"{error}; {len(waiting)} sets wait, serving goes on")
+            return
+        if self._noted_ns is not None:
+            self._noted_ns = None
+            log.info("the store can be written again")
+            self._member.note(now_ns, "store", f"the store {self._store.path} can be written again")
+        self._keeper.saved(waiting)
+        self.counters.count("sets_saved", len(waiting))

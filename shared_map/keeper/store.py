@@ -1,0 +1,336 @@
+"""What the keeper must not lose: sets on their way to the disk (core), and the disk (SQLite)."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import sqlite3
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import IO
+from urllib.parse import quote
+
+from shared_map.keeper.compaction import united, without
+from shared_map.replication.digest import Ledger
+from shared_map.replication.marks import base_seq, is_burial
+from swarm.errors import ProtocolError, StoreError
+from swarm.grid import GridSpec
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.marks import FOLDS, MarkSet
+from swarm.wire.messages.targets import Sighted
+
+log = logging.getLogger(__name__)
+
+STORE_VERSION = "2"
+_MEMORY = ":memory:"
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS sets (
+    tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
+    cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL,
+    untils_ns BLOB NOT NULL,
+    PRIMARY KEY (tile, author)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS folded (
+    tile INTEGER NOT NULL, author TEXT NOT NULL, grp TEXT NOT NULL, epoch INTEGER NOT NULL, seq INTEGER NOT NULL,
+    cells BLOB NOT NULL, kinds BLOB NOT NULL, paces BLOB NOT NULL, stamps_ns BLOB NOT NULL,
+    untils_ns BLOB NOT NULL, since_ns INTEGER NOT NULL,
+    PRIMARY KEY (tile, author)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS sightings (
+    target TEXT PRIMARY KEY, stamp_ns INTEGER NOT NULL, sighted BLOB NOT NULL
+) WITHOUT ROWID;
+"""
+_SEEN = """
+INSERT INTO sightings (target, stamp_ns, sighted) VALUES (?, ?, ?)
+ON CONFLICT (target) DO UPDATE SET stamp_ns = excluded.stamp_ns, sighted = excluded.sighted
+WHERE excluded.stamp_ns >= sightings.stamp_ns
+"""
+_FIELDS = ("tile", "author", "group", "epoch", "seq", "cells", "kinds", "paces", "stamps_ns", "untils_ns")
+_COLUMNS = tuple("grp" if field == "group" else field for field in _FIELDS)  # GROUP is a word of SQL
+_UPSERT = """
+INSERT INTO sets (tile, author, grp, epoch, seq, cells, kinds, paces, stamps_ns, untils_ns)
+VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
+ON CONFLICT (tile, author) DO UPDATE SET grp = excluded.grp, epoch = excluded.epoch, seq = excluded.seq,
+    cells = excluded.cells, kinds = excluded.kinds, paces = excluded.paces, stamps_ns = excluded.stamps_ns,
+    untils_ns = excluded.untils_ns
+WHERE (excluded.epoch, excluded.seq) >= (sets.epoch, sets.seq)
+"""
+_BURY = "DELETE FROM sets WHERE tile = ? AND author = ? AND (epoch, seq) <= (?, ?)"
+_OUTDATE = "DELETE FROM folded WHERE tile = ? AND author = ? AND (epoch, seq) < (?, ?)"
+"""What was dropped from a set counts only as long as its author says nothing newer."""
+_DROP = f"REPLACE INTO folded ({', '.join(_COLUMNS)}, since_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+
+
+class KeeperStore:
+    """Every set in one SQLite file, or in memory under the name ":memory:". One process at a time.
+
+    A commit is on the disk when it returns (WAL with synchronous=FULL): it survives kill -9 of this process at any
+    instant, and a power cut as far as the disk keeps what it was told to flush.
+
+    rebuild    move a damaged file aside and begin an empty one, to be filled from the swarm
+    read_only  look at a store, also while a keeper writes it
+    """
+
+    def __init__(self, path: Path | str, *, rebuild: bool = False, read_only: bool = False) -> None:
+        self.path = Path(path)
+        self._lock: IO[bytes] | None = None
+        in_memory = str(path) == _MEMORY
+        if read_only:
+            self._db = _open_to_read(self.path)
+            return
+        if not in_memory:
+            self._lock = _lock(self.path)
+        try:
+            self._db = _open(str(path))
+        except StoreError:
+            if in_memory or not rebuild:
+                self._unlock()
+                raise
+            log.warning("moved the damaged store to %s", _move_aside(self.path))
+            self._db = _open(str(path))
+
+    def bind(self, terrain: str, grid: GridSpec) -> None:
+        """Belong to this terrain from now on. Raises StoreError if the store holds the marks of another."""
+        bound = self.terrain
+        if bound is None:
+            try:
+                with self._db:
+                    self._db.execute("INSERT INTO meta VALUES ('terrain', ?)", (terrain,))
+                    self._db.execute("INSERT INTO meta VALUES ('grid', ?)", (json.dumps(asdict(grid)),))
+            except sqlite3.Error as error:
+                raise StoreError(f"cannot write the store {self.path}: {error}") from error
+        elif bound != terrain:
+            raise StoreError(
+                f"the store {self.path} holds marks on terrain {bound}, but this run has terrain {terrain}: "
+                "give another --store, or the terrain and cost rules that it was made with"
+            )
+
+    @property
+    def terrain(self) -> str | None:
+        """Digest of the terrain that the store belongs to; None before the first `bind`."""
+        return self._meta("terrain")
+
+    @property
+    def grid(self) -> GridSpec | None:
+        """The grid of that terrain."""
+        text = self._meta("grid")
+        try:
+            return None if text is None else GridSpec(**json.loads(text))
+        except (ValueError, TypeError) as error:
+            raise StoreError(_damaged(self.path, f"grid: {error}")) from error
+
+    def _meta(self, key: str) -> str | None:
+        try:
+            row = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        except sqlite3.Error as error:
+            raise StoreError(_damaged(self.path, str(error))) from error
+        return None if row is None else str(row[0])
+
+    def load(self) -> Iterator[MarkSet]:
+        """Everything in the store. Raises StoreError where a row is no set."""
+        return self._sets("FROM sets")
+
+    def folded(self, tile: int) -> dict[str, MarkSet]:
+        """Author -> what was dropped from its set of this tile, under the number of the last folding."""
+        return {each.author: each for each in self._sets("FROM folded WHERE tile = ?", tile)}
+
+    def forget_folded(self, before_ns: int) -> None:
+        """Drop for good what was folded before. Raises StoreError."""
+        try:
+            with self._db:
+                self._db.execute("DELETE FROM folded WHERE since_ns < ?", (before_ns,))
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    def _sets(self, where: str, *values: object) -> Iterator[MarkSet]:
+        try:
+            for row in self._db.execute(f"SELECT {', '.join(_COLUMNS)} {where}", values):
+                fields = dict(zip(_FIELDS, row, strict=True))
+                mark_set = MarkSet(**fields)
+                mark_set.check()
+                yield mark_set
+        except (sqlite3.Error, ValueError, TypeError) as error:
+            raise StoreError(_damaged(self.path, str(error))) from error
+
+    def _set_at(self, table: str, tile: int, author: str) -> MarkSet | None:
+        found = list(self._sets(f"FROM {table} WHERE tile = ? AND author = ?", tile, author))
+        return found[0] if found else None
+
+    def save(self, sets: Iterable[MarkSet], now_ns: int = 0) -> None:
+        """Commit all or none; on the disk when this returns. What a folding drops from the set that it replaces is
+        set aside. Raises StoreError, which leaves the store usable."""
+        given = list(sets)
+        own = [each for each in given if each.seq % FOLDS == 0]
+        try:
+            with self._db:
+                self._db.executemany(_UPSERT, [_row(each) for each in own])
+                self._db.executemany(_OUTDATE, [(each.tile, each.author, each.epoch, each.seq) for each in own])
+                for each in given:
+                    if each.seq % FOLDS:
+                        self._save_folding(each, now_ns)
+        except sqlite3.ProgrammingError:
+            raise  # a bug of ours, and no disk will get better
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    def _save_folding(self, folding: MarkSet, now_ns: int) -> None:
+        at = (folding.tile, folding.author)
+        stored = self._set_at("sets", *at)
+        if stored is not None and (stored.epoch, stored.seq) > (folding.epoch, folding.seq):
+            return
+        base = (folding.epoch, base_seq(folding.seq))
+        before = [
+            each
+            for each in (stored, self._set_at("folded", *at))
+            if each is not None and (each.epoch, base_seq(each.seq)) == base
+        ]
+        if before:
+            self._db.execute(_DROP, (*_row(without(united(*before), folding)), now_ns))
+        elif is_burial(folding):
+            self._db.execute(_DROP, (*_row(folding), now_ns))
+        if is_burial(folding):
+            self._db.execute(_BURY, (*at, folding.epoch, folding.seq))
+        else:
+            self._db.execute(_UPSERT, _row(folding))
+
+    def save_sightings(self, seen: Iterable[Sighted]) -> None:
+        """Keep where each target was seen last. Raises StoreError, which leaves the store usable."""
+        try:
+            with self._db:
+                self._db.executemany(_SEEN, [(each.target, each.stamp_ns, encode(each)) for each in seen])
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    def sightings(self) -> list[Sighted]:
+        """Where each target was seen last, in order of target; of a store from before there were any, nothing."""
+        try:
+            rows = self._db.execute("SELECT sighted FROM sightings ORDER BY target").fetchall()
+            return [decode(row[0], Sighted) for row in rows]
+        except sqlite3.OperationalError:
+            return []
+        except (sqlite3.Error, ProtocolError) as error:
+            raise StoreError(_damaged(self.path, str(error))) from error
+
+    def close(self) -> None:
+        self._db.close()
+        self._unlock()
+
+    def __enter__(self) -> KeeperStore:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
+def _row(of: MarkSet) -> tuple[object, ...]:
+    return tuple(getattr(of, field) for field in _FIELDS)
+
+
+def _open(path: str) -> sqlite3.Connection:
+    try:
+        db = sqlite3.connect(path, check_same_thread=False, timeout=2.0)
+    except sqlite3.Error as error:
+        raise StoreError(f"cannot open the store {path}: {error}") from error
+    try:
+        db.execute("PRAGMA journal_mode = WAL")
+        db.execute("PRAGMA synchronous = FULL")
+        found = [row[0] for row in db.execute("PRAGMA quick_check(1)")]
+        if found != ["ok"]:
+            raise StoreError(_damaged(path, found[0] if found else "no answer from quick_check"))
+        with db:
+            db.executescript(_SCHEMA)
+            db.execute("INSERT OR IGNORE INTO meta VALUES ('version', ?)", (STORE_VERSION,))
+        version = db.execute("SELECT value FROM meta WHERE key = 'version'").fetchone()[0]
+        if version != STORE_VERSION:
+            raise StoreError(f"the store {path} has version {version}, this program reads {STORE_VERSION}")
+    except sqlite3.DatabaseError as error:
+        db.close()
+        if isinstance(error, sqlite3.OperationalError):
+            raise StoreError(f"cannot open the store {path}: {error}") from error
+        raise StoreError(_damaged(path, str(error))) from error
+    except StoreError:
+        db.close()
+        raise
+    return db
+
+
+def _open_to_read(path: Path) -> sqlite3.Connection:
+    if not path.is_file():
+        raise StoreError(f"there is no store {path}")
+    try:
+        db = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True, timeout=2.0)
+        db.execute("SELECT count(*) FROM meta").fetchone()
+    except sqlite3.Error as error:
+        raise StoreError(f"cannot read the store {path}: {error}") from error
+    return db
+
+
+def _damaged(path: Path | str, reason: str) -> str:
+    return (
+        f"the store {path} is damaged ({reason}): move it away, or start the keeper with --rebuild to fill a new "
+        "one from the swarm"
+    )
+
+
+def _lock(path: Path) -> IO[bytes]:
+    """One writer: a second keeper on the same file is refused. The lock falls with its process."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = open(f"{path}.lock", "wb")  # noqa: SIM115 - held until close
+    except OSError as error:
+        raise StoreError(f"cannot open the store {path}: {error.strerror or error}") from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        lock.close()
+        raise StoreError(f"the store {path} is in use by another keeper") from error
+    return lock
+
+
+def _move_aside(path: Path) -> Path:
+    number = 1
+    while (aside := path.with_name(f"{path.name}.damaged-{number}")).exists():
+        number += 1
+    os.replace(path, aside)
+    for tail in ("-wal", "-shm"):
+        Path(f"{path}{tail}").unlink(missing_ok=True)
+    return aside
+
+
+class Keeper:
+    """Which sets wait for the disk and which are on it. Only the latter are in `committed`, which is what the
+    keeper's digest, and so the acknowledgement, is made of."""
+
+    def __init__(self) -> None:
+        self.committed = Ledger()
+        self._waiting: dict[tuple[int, str], MarkSet] = {}
+
+    def restored(self, mark_set: MarkSet) -> None:
+        self.committed.record(mark_set.author, mark_set.tile, mark_set.epoch, mark_set.seq)
+
+    def accept(self, mark_set: MarkSet) -> None:
+        """A set that the replica took in: the newest of its tile and author."""
+        self._waiting[mark_set.tile, mark_set.author] = mark_set
+
+    @property
+    def waiting(self) -> list[MarkSet]:
+        return list(self._waiting.values())
+
+    def saved(self, sets: Iterable[MarkSet]) -> None:
+        """These are on the disk, or buried there."""
+        for each in sets:
+            if is_burial(each):
+                self.committed.drop(each.author, each.tile)
+            else:
+                self.committed.record(each.author, each.tile, each.epoch, each.seq)
+            if self._waiting.get((each.tile, each.author)) is each:
+                del self._waiting[each.tile, each.author]

@@ -1,0 +1,1 @@
+"""The ground before any mark: elevation, photo and classes become pace."""

@@ -1,0 +1,1 @@
+"""Files to elevation, photo and classes on one square metric grid."""

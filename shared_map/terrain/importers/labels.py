@@ -1,0 +1,86 @@
+"""Labelled places on a photo: polygons and points of known class, from a TOML file.
+
+[[labels]]
+class = "water"
+polygon_m = [[4300, 1750], [4900, 1700], [4600, 2400]]    # [east, south] from the north-west corner
+
+[[labels]]
+class = "forest"
+points_m = [[4700, 4200], [5300, 2900]]                   # each stands for 3 x 3 cells
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bytes
+from shared_map.terrain.layers import TerrainClass, polygon_mask
+from swarm.config.scenario import ClassName, Point, Section
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+
+
+class Label(Section, frozen=True, kw_only=True, rename={"kind": "class"}):
+    """A polygon, or points, of one class."""
+
+    kind: ClassName
+    polygon_m: Annotated[tuple[Point, ...], Meta(min_length=3)] | None = None
+    points_m: tuple[Point, ...] = ()
+
+
+class _File(Section, frozen=True, kw_only=True):
+    labels: Annotated[tuple[Label, ...], Meta(min_length=1)]
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """classes uint8, UNKNOWN where nobody has looked; groups int32, number of polygon or point, -1 elsewhere."""
+
+    classes: Bytes
+    groups: NDArray[np.int32]
+    count: int
+
+
+def read_labels(path: Path, grid: GridSpec) -> Labels:
+    """Labels of a file on a grid. Raises TerrainError with one sentence."""
+    try:
+        found = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
+    except OSError as error:
+        raise TerrainError(f"labels {path} cannot be read: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise TerrainError(f"labels {path} is not TOML: {error}") from error
+    except msgspec.ValidationError as error:
+        raise TerrainError(f"labels {path}: {error}") from error
+    classes = np.zeros((grid.rows, grid.cols), np.uint8)
+    groups = np.full((grid.rows, grid.cols), -1, np.int32)
+    count = 0
+    for n, label in enumerate(found.labels):
+        kind = TerrainClass[label.kind.upper()]
+        places = [_around(point, grid) for point in label.points_m]
+        if label.polygon_m is not None:
+            places.append(polygon_mask(label.polygon_m, grid))
+        if not any(place.any() for place in places):
+            raise TerrainError(f"labels {path}: label {n} ({label.kind}) covers no cell of the terrain")
+        for place in places:
+            classes[place], groups[place] = kind, count
+            count += 1
+    if len(np.unique(classes[groups >= 0])) < 2:
+        raise TerrainError(f"labels {path}: all labels are of one class; two are needed to tell them apart")
+    return Labels(classes, groups, count)
+
+
+def _around(point: Point, grid: GridSpec) -> NDArray[np.bool_]:
+    """The cell of a point and its eight neighbours."""
+    col, row = int(point[0] // grid.resolution_m), int(point[1] // grid.resolution_m)
+    place = np.zeros((grid.rows, grid.cols), np.bool_)
+    if grid.inside(row, col):
+        place[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = True
+    return place

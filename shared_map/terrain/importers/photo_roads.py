@@ -1,0 +1,101 @@
+"""Roads on a photo: thin, long, bright lines with darker ground on both of their sides.
+
+Eight directions are tried: how much brighter is a cell than the brighter of its two sides, less how much it differs
+from what is before and behind it, averaged along the line, so that a tree over the road does not cut it. The edge
+of a shadow or of a meadow is bright on one side only. What is strong is kept where all that hangs together is long.
+
+Measured on the one photo that it was tuned on: docs/terrain-figures.md.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bools, Bytes
+from shared_map.terrain.layers import spread
+
+COARSEST_M = 30.0
+"""On coarser cells a thin line is a ridge, a river or a seam of the photo."""
+REACH = 8
+"""Rows and columns around a cell that its strength looks at."""
+_DIRECTIONS = 8
+_SIDE = 2.0
+_TAPS = (-4, -2, 0, 2, 4)
+_MARGIN = 6
+"""Of side and tap together."""
+_BRIGHTEST = 40
+"""Grey levels over its sides that count at most: one bright roof is no road."""
+_FIXED = 8
+"""Parts of a grey level while strengths are summed in 16 bits, which is twice as fast as in floats."""
+_STRONG = 60
+_SHORTEST = 25
+"""Cells; specks, roofs and field boundaries are shorter."""
+
+Shorts = NDArray[np.int16]
+
+
+def line_strength(rgb: Bytes) -> Bytes:
+    """uint8 (rows, cols), in tenths of a grey level: the strength of a line whose crest is at that cell, else 0.
+
+    The outer `REACH` rows are those of somebody who sees no farther."""
+    from scipy import ndimage
+
+    # A road is bright in red, unlike forest and meadow, and in blue, unlike bare soil.
+    grey = np.minimum(rgb[..., 0], rgb[..., 2]).astype(np.float32)
+    smooth = (ndimage.gaussian_filter(grey, 0.7, truncate=3) * _FIXED).astype(np.int16)
+    padded = np.pad(smooth, _MARGIN, mode="edge")
+    best = np.zeros(grey.shape, np.int16)
+    crest = np.zeros(grey.shape, np.bool_)
+    for number in range(_DIRECTIONS):
+        angle = math.pi * number / _DIRECTIONS
+        down, right = math.sin(angle), math.cos(angle)
+        contrast = _contrast(padded, down, right)
+        total = np.zeros(grey.shape, np.int16)
+        for tap in _TAPS:
+            total += _moved(contrast, 4, tap * down, tap * right)
+        better = total > best
+        np.copyto(best, total, where=better)
+        one, other = (_moved(padded, _MARGIN, sign * right, -sign * down) for sign in (1, -1))
+        np.copyto(crest, smooth >= np.maximum(one, other), where=better)
+    best[~crest] = 0
+    return np.clip(best // (_FIXED * len(_TAPS) // 10), 0, 255).astype(np.uint8)
+
+
+def _contrast(padded: Shorts, down: float, right: float) -> Shorts:
+    """Brighter than both sides, less a quarter of the bend along the line; `_MARGIN` - 4 narrower on each side."""
+    here = _moved(padded, 2, 0, 0)
+    sides = np.maximum(
+        _moved(padded, 2, _SIDE * right, -_SIDE * down), _moved(padded, 2, -_SIDE * right, _SIDE * down)
+    )
+    bend = _moved(padded, 2, _SIDE * down, _SIDE * right) + _moved(padded, 2, -_SIDE * down, -_SIDE * right)
+    bend -= 2 * here
+    most = _BRIGHTEST * _FIXED
+    contrast: Shorts = np.clip(here - sides - np.abs(bend) // 4, -most, most)
+    return contrast
+
+
+def _moved(array: Shorts, trim: int, down: float, right: float) -> Shorts:
+    """The array without `trim` rows and columns on each side, of cells so far away."""
+    rows, cols = array.shape
+    dr, dc = round(down), round(right)
+    return array[trim + dr : rows - trim + dr, trim + dc : cols - trim + dc]
+
+
+def long_lines(strength: Bytes) -> Bools:
+    """The cells of strong lines that are long, over gaps of a cell or two."""
+    from scipy import ndimage
+
+    strong = strength >= _STRONG
+    labels, count = ndimage.label(spread(strong, (1, 1)), np.ones((3, 3), np.int8))
+    sizes = np.bincount(labels[strong], minlength=count + 1)
+    line = strong & (sizes >= _SHORTEST)[labels]
+    padded = np.pad(line, 1)
+    rows, cols = line.shape
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        before = padded[1 - down : 1 - down + rows, 1 - right : 1 - right + cols]
+        behind = padded[1 + down : 1 + down + rows, 1 + right : 1 + right + cols]
+        line |= before & behind
+    return np.asarray(line, np.bool_)

@@ -1,0 +1,325 @@
+"""Where elevation, photo and classes come from: built-in terrains and files, put on one square metric grid."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.row_bands import Progress, no_progress
+from swarm.config.scenario import TerrainConfig
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+
+JACKSBORO_RESOLUTION_M = 75.0
+JACKSBORO_FILE = "jacksboro_fault_dem.npz"
+SYNTHETIC_RESOLUTION_M = 30.0
+FILE_KINDS = ".tif, .tiff, .hgt, .asc, .npz, .png, .map, .yaml (ROS)"
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Everything known about the ground on one grid.
+
+    elevation_m  float32  NaN is a void
+    classes      uint8    TerrainClass
+    photo, seen  the colour photo, and where it shows anything
+    factor       float32  pace relative to open ground that the file itself states; inf is lethal
+    """
+
+    grid: GridSpec
+    elevation_m: Floats
+    classes: Bytes
+    photo: Bytes | None = None
+    seen: Bools | None = None
+    factor: Floats | None = None
+    notes: tuple[str, ...] = ()
+
+
+def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progress) -> Source:
+    """Read or make what the scenario names. Raises TerrainError with one sentence."""
+    try:
+        return _loaded(config, seed, progress)
+    except MemoryError as error:
+        raise TerrainError(
+            f"terrain {config.source} does not fit into memory; crop it or set a larger terrain.resolution_m"
+        ) from error
+
+
+def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
+    if config.source == "synthetic":
+        source = _synthetic(config, seed)
+    elif config.source == "jacksboro":
+        source = _jacksboro(config, seed)
+    else:
+        source = _from_file(Path(config.source), config, progress)
+    source = _without_voids(source, config)
+    if config.photo is not None:
+        source = _with_photo(source, Path(config.photo), config, progress)
+    if source.photo is None:
+        if config.labels is not None:
+            raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
+        return source
+    return _classified(source, config, seed, progress)
+
+
+# --- built in -----------------------------------------------------------------------------------------------
+
+
+def _synthetic(config: TerrainConfig, seed: int) -> Source:
+    from shared_map.terrain.synthetic.landscape import landscape
+
+    resolution_m = config.resolution_m or SYNTHETIC_RESOLUTION_M
+    elevation_m, classes = landscape(config.rows, config.cols, resolution_m, config.relief_m, seed, config.rivers)
+    grid = GridSpec(config.rows, config.cols, resolution_m)
+    return Source(grid, elevation_m, classes, notes=(f"synthetic landscape, seed {seed}",))
+
+
+def _jacksboro(config: TerrainConfig, seed: int) -> Source:
+    """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
+    from shared_map.terrain.importers.plain_files import read_npz
+    from shared_map.terrain.synthetic.landscape import cover, flat_water
+
+    plain = read_npz(_jacksboro_path())
+    assert plain.heights is not None
+    elevation_m, grid, note = _from_degrees(
+        plain.heights, plain.step, plain.west, plain.north, config, JACKSBORO_FILE
+    )
+    classes = cover(elevation_m, grid.resolution_m, seed)
+    # Lakes are level in the file's own whole metres, no longer after resampling.
+    wet = flat_water(plain.heights)
+    at_row = (np.arange(grid.rows) + 0.5) * (wet.shape[0] / grid.rows)
+    at_col = (np.arange(grid.cols) + 0.5) * (wet.shape[1] / grid.cols)
+    classes[wet[np.ix_(at_row.astype(np.intp), at_col.astype(np.intp))]] = TerrainClass.WATER
+    origin = "Jacksboro fault, Tennessee: USGS 3 arc seconds, public domain, from matplotlib's sample data"
+    return Source(grid, elevation_m, classes, notes=(origin, note))
+
+
+def _jacksboro_path() -> Path:
+    # Not matplotlib.cbook.get_sample_data: importing it takes 0.8 s.
+    spec = importlib.util.find_spec("matplotlib")
+    if spec is None or spec.origin is None:
+        raise TerrainError("terrain.source = 'jacksboro' comes with matplotlib, which is not installed")
+    path = Path(spec.origin).parent / "mpl-data" / "sample_data" / JACKSBORO_FILE
+    if not path.is_file():
+        raise TerrainError(f"matplotlib is installed without its sample data: {path} is missing")
+    return path
+
+
+# --- files --------------------------------------------------------------------------------------------------
+
+
+def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    if not path.exists():
+        raise TerrainError(f"terrain {path} does not exist; give {FILE_KINDS}, or jacksboro or synthetic")
+    if path.is_dir():
+        raise TerrainError(f"terrain {path} is a folder; give a file: {FILE_KINDS}")
+    match path.suffix.lower():
+        case ".tif" | ".tiff" | ".hgt" | ".vrt":
+            _check_hgt(path)
+            from shared_map.terrain.importers.rasters import read_elevation
+
+            raster = read_elevation(path, config, progress)
+            classes = np.zeros(raster.elevation_m.shape, np.uint8)
+            return Source(raster.grid, raster.elevation_m, classes, notes=(str(path), *raster.notes))
+        case ".png":
+            return _png(path, config)
+        case ".asc" | ".npz":
+            return _heights(path, config)
+        case ".map" | ".yaml" | ".yml":
+            return _map(path, config)
+        case suffix:
+            raise TerrainError(f"terrain {path}: {suffix or 'a file without ending'} is unknown; give {FILE_KINDS}")
+
+
+def _check_hgt(path: Path) -> None:
+    """.hgt has no header: its length is its only description."""
+    sides = (1201, 3601)
+    length = path.stat().st_size
+    if path.suffix.lower() == ".hgt" and length not in [2 * side * side for side in sides]:
+        raise TerrainError(
+            f"terrain {path} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
+            f" {2 * 1201 * 1201}, one of 3601 has {2 * 3601 * 3601}"
+        )
+
+
+def _png(path: Path, config: TerrainConfig) -> Source:
+    """A grey image of heights: needs to be told how many metres a grey level and a cell are."""
+    from shared_map.terrain.importers.rasters import check_size, opened
+
+    if config.resolution_m is None or config.height_scale is None:
+        raise TerrainError(
+            f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel) and"
+            " terrain.height_scale (metres per grey level)"
+        )
+    with opened(path, "terrain") as dataset:
+        if dataset.count not in (1, 2):
+            raise TerrainError(f"terrain {path} has {dataset.count} colour bands; heights are one grey band")
+        check_size(dataset.height, dataset.width, f"terrain {path}")
+        heights = dataset.read(1).astype(np.float32) * np.float32(config.height_scale)
+    grid = GridSpec(heights.shape[0], heights.shape[1], config.resolution_m)
+    notes = (str(path), f"{config.height_scale:g} m per grey level, {config.resolution_m:g} m per pixel")
+    return Source(grid, heights, np.zeros(heights.shape, np.uint8), notes=notes)
+
+
+def _heights(path: Path, config: TerrainConfig) -> Source:
+    from shared_map.terrain.importers.plain_files import read_asc, read_npz
+
+    plain = read_asc(path) if path.suffix.lower() == ".asc" else read_npz(path)
+    assert plain.heights is not None
+    heights, step, photo = plain.heights, plain.step, plain.photo
+    if config.height_scale is not None:
+        heights = heights * np.float32(config.height_scale)
+    if step == (0.0, 0.0):
+        if config.resolution_m is None:
+            raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
+        step = (config.resolution_m, config.resolution_m)
+    degrees = plain.degrees or _geographic(config.crs)
+    if path.suffix.lower() == ".asc" and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
+        raise TerrainError(
+            f"terrain {path}: a cell of {step[0]:g} looks like degrees; set terrain.crs = 'EPSG:4326'"
+        )
+    if degrees:
+        heights, grid, note = _from_degrees(heights, step, plain.west, plain.north, config, str(path))
+    else:
+        heights, grid, note = _from_metres(heights, step, plain.west, plain.north, config, str(path))
+    if photo is not None and photo.shape[:2] != heights.shape:
+        at_row = ((np.arange(grid.rows) + 0.5) * photo.shape[0] / grid.rows).astype(np.intp)
+        at_col = ((np.arange(grid.cols) + 0.5) * photo.shape[1] / grid.cols).astype(np.intp)
+        photo = photo[np.ix_(at_row, at_col)]
+    return Source(grid, heights, np.zeros(heights.shape, np.uint8), photo, notes=(str(path), note))
+
+
+def _geographic(crs: str | None) -> bool:
+    if crs is None:
+        return False
+    from shared_map.terrain.importers.rasters import crs_of
+
+    return bool(crs_of(None, crs, "terrain").is_geographic)
+
+
+def _map(path: Path, config: TerrainConfig) -> Source:
+    """A map without heights: level, with the pace that the file states."""
+    from shared_map.terrain.importers.plain_files import read_map, read_ros
+
+    plain = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
+    assert plain.factor is not None
+    resolution_m = plain.step[0] or config.resolution_m or 1.0
+    if config.resolution_m is not None and abs(config.resolution_m - resolution_m) > 1e-9:
+        raise TerrainError(
+            f"terrain {path} has cells of {resolution_m:g} m and cannot be resampled without closing gaps;"
+            " leave terrain.resolution_m out"
+        )
+    factor = plain.factor.copy()
+    factor[np.isnan(factor)] = 1.0 if config.nodata == "fill" else np.inf
+    grid = GridSpec(factor.shape[0], factor.shape[1], resolution_m, plain.west, plain.north)
+    level = np.zeros(factor.shape, np.float32)
+    notes = (str(path), *plain.notes)
+    return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=notes)
+
+
+# --- onto the grid ------------------------------------------------------------------------------------------
+
+
+def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
+    """Length of one degree of latitude and of longitude on WGS 84, to the millimetre."""
+    phi = math.radians(latitude_deg)
+    lat = 111132.954 - 559.822 * math.cos(2 * phi) + 1.175 * math.cos(4 * phi)
+    lon = 111412.84 * math.cos(phi) - 93.5 * math.cos(3 * phi)
+    return round(lat, 3), round(lon, 3)
+
+
+def _from_degrees(
+    heights: Floats, step: tuple[float, float], west: float, north: float, config: TerrainConfig, what: str
+) -> tuple[Floats, GridSpec, str]:
+    """Degrees put on metres, equidistant at the mean latitude. Needs no rasterio: the demo builds in a second."""
+    middle = north - step[1] * heights.shape[0] / 2
+    if not (abs(middle) < 85 and abs(west) <= 360):
+        raise TerrainError(f"{what}: its middle is at latitude {middle:g}; degrees must lie between -85 and 85")
+    per_lat, per_lon = metres_per_degree(middle)
+    crs = f"+proj=eqc +lat_ts={middle:.6f} +lon_0={west:.6f} +datum=WGS84 +units=m +no_defs"
+    metric = (step[0] * per_lon, step[1] * per_lat)
+    if what == JACKSBORO_FILE and config.resolution_m is None:
+        config = _at(config, JACKSBORO_RESOLUTION_M)
+    return _from_metres(heights, metric, 0.0, round(north * per_lat, 3), config, what, crs)
+
+
+def _at(config: TerrainConfig, resolution_m: float) -> TerrainConfig:
+    import msgspec
+
+    return msgspec.structs.replace(config, resolution_m=resolution_m)
+
+
+def _from_metres(
+    heights: Floats,
+    step: tuple[float, float],
+    west: float,
+    north: float,
+    config: TerrainConfig,
+    what: str,
+    crs: str | None = None,
+) -> tuple[Floats, GridSpec, str]:
+    from shared_map.terrain.importers.resample import resample
+
+    resolution_m = config.resolution_m or float(f"{math.sqrt(step[0] * step[1]):.4g}")
+    col_step, row_step = resolution_m / step[0], resolution_m / step[1]
+    rows, cols = int(heights.shape[0] / row_step + 1e-6), int(heights.shape[1] / col_step + 1e-6)
+    if rows < 1 or cols < 1:
+        raise TerrainError(f"terrain.resolution_m = {resolution_m:g} is coarser than the whole of {what}")
+    if rows * cols > 16384 * 16384:
+        raise TerrainError(f"{what} would be {rows} x {cols} cells; set a larger terrain.resolution_m")
+    grid = GridSpec(rows, cols, resolution_m, west, north, crs or config.crs or "local")
+    if abs(col_step - 1) < 1e-9 and abs(row_step - 1) < 1e-9:
+        return heights, grid, f"{rows} x {cols} cells of {resolution_m:g} m"
+    note = f"resampled from {step[1]:.1f} x {step[0]:.1f} m to {resolution_m:g} m"
+    return resample(heights, rows, cols, row_step, col_step), grid, note
+
+
+def _without_voids(source: Source, config: TerrainConfig) -> Source:
+    """Voids counted, and filled if asked for; nothing is done in silence."""
+    from shared_map.terrain.importers.voids import fill_voids, voids_of
+
+    elevation_m = source.elevation_m
+    if not elevation_m.flags.writeable:
+        elevation_m = elevation_m.copy()
+    count = voids_of(elevation_m)
+    if count == 0:
+        return replace(source, elevation_m=elevation_m)
+    share = count / elevation_m.size
+    if share == 1.0:
+        raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")
+    if config.nodata == "fill":
+        note = f"{count} voids ({share:.1%}) filled from their surroundings"
+        return replace(source, elevation_m=fill_voids(elevation_m), notes=(*source.notes, note))
+    hint = "; crop the file, or set terrain.nodata = 'fill'" if share > 0.05 else ""
+    note = f"{count} voids ({share:.1%} of the cells) are lethal{hint}"
+    return replace(source, elevation_m=elevation_m, notes=(*source.notes, note))
+
+
+def _with_photo(source: Source, path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    from shared_map.terrain.importers.photos import read_photo
+
+    photo = read_photo(path, source.grid, config.crs, progress)
+    return replace(source, photo=photo.rgb, seen=photo.seen, notes=(*source.notes, str(path), *photo.notes))
+
+
+def _classified(source: Source, config: TerrainConfig, seed: int, progress: Progress) -> Source:
+    from shared_map.terrain.importers.classify import by_rules, learnt
+
+    assert source.photo is not None
+    ground = (source.photo, source.elevation_m, source.grid.resolution_m)
+    if config.labels is None:
+        classes = by_rules(*ground, source.seen, progress)
+        note = "classes from the photo, by rules"
+    else:
+        from shared_map.terrain.importers.labels import read_labels
+
+        labels = read_labels(Path(config.labels), source.grid)
+        classes = learnt(*ground, labels.classes, source.seen, seed, progress)
+        note = f"classes from the photo, learnt from {labels.count} labels"
+    return replace(source, classes=classes, notes=(*source.notes, note))

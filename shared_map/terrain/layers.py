@@ -1,0 +1,366 @@
+"""Layers: pure functions from arrays to pace, and the rule that merges them.
+
+The merge rule, per cell, in this order:
+
+1. pace = flat pace x slope factor x class factor x (1 + rough_per_m x roughness); on a road the road pace instead.
+   Where `cost.directional`, the slope factor is left out here, and each step costs by its rise instead (`climb`).
+2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
+3. Zones in the order painted: a road sets the road pace (over cliffs and water too: a bridge, a cutting; not over a
+   void), preferred halves, rough doubles; then every forbidden zone is lethal, whatever else was painted there.
+4. This is the ground. The prior map is the ground with inflation: a cell is lethal where a vehicle of
+   `vehicle_radius_m` in its middle would touch a lethal cell.
+5. Marks replace the ground cell by cell (see `cost_map`), before inflation.
+
+Costly is not lethal: a factor, however large, never makes a cell infinite.
+
+Only correctly rounded operations (+ - * / sqrt) go into linear, quadratic and energy paces, so that two machines
+get the same bits and the same digest.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.terrain.row_bands import in_bands
+from swarm.config.scenario import CostConfig, ZoneConfig
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+
+LETHAL = np.float32(np.inf)
+
+
+class TerrainClass(enum.IntEnum):
+    """What covers a cell."""
+
+    UNKNOWN = 0
+    WATER = 1
+    FOREST = 2
+    ROCK = 3
+    GRASS = 4
+    SOIL = 5
+    ROAD = 6
+    BUILT = 7
+    SNOW = 8
+
+
+CLASS_FACTOR: Mapping[TerrainClass, float] = {
+    TerrainClass.UNKNOWN: 1.0,
+    TerrainClass.WATER: math.inf,
+    TerrainClass.FOREST: 1.8,
+    TerrainClass.ROCK: 2.5,
+    TerrainClass.GRASS: 1.0,
+    TerrainClass.SOIL: 1.2,
+    TerrainClass.ROAD: 1.0,
+    TerrainClass.BUILT: 3.0,
+    TerrainClass.SNOW: 2.5,
+}
+"""Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`."""
+
+PREFERRED_FACTOR = np.float32(0.5)
+ROUGH_FACTOR = np.float32(2.0)
+ROLLING_RESISTANCE = 0.08
+"""Share of its weight that a wheeled vehicle needs to roll on level open ground (grass, firm soil)."""
+
+
+def gradient(elevation_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
+    """Horn's derivative, metres per metre: (to the east, to the north).
+
+    The weights 1 2 1 over 3 x 3 cells, as in GDAL. At the border the ground goes on as steep as it is; a void (NaN)
+    beside a cell counts as level with it.
+    """
+    padded = np.pad(elevation_m, 1, mode="reflect", reflect_type="odd")
+    return gradient_of_padded(padded, resolution_m)
+
+
+def gradient_of_padded(padded_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
+    """`gradient` of an array that brings its own border of one cell."""
+    if np.isnan(padded_m).any():
+        return _gradient_beside_voids(padded_m, resolution_m)
+    scale = np.float32(1.0 / (8.0 * resolution_m))
+    # Neighbours are subtracted before they are summed: 4000 m in float32 has steps of a quarter millimetre.
+    across = padded_m[:, 2:] - padded_m[:, :-2]
+    east = across[1:-1] * np.float32(2)
+    east += across[:-2]
+    east += across[2:]
+    east *= scale
+    down = padded_m[:-2] - padded_m[2:]
+    north = down[:, 1:-1] * np.float32(2)
+    north += down[:, :-2]
+    north += down[:, 2:]
+    north *= scale
+    return east, north
+
+
+def _gradient_beside_voids(padded_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
+    scale = np.float32(1.0 / (8.0 * resolution_m))
+    rows, cols = padded_m.shape[0] - 2, padded_m.shape[1] - 2
+    centre = padded_m[1:-1, 1:-1]
+    east = np.zeros((rows, cols), np.float32)
+    north = np.zeros((rows, cols), np.float32)
+    for dr in (-1, 0, 1):
+        for dc in (-1, 0, 1):
+            if dr == dc == 0:
+                continue
+            rise = padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols] - centre
+            np.copyto(rise, np.float32(0), where=np.isnan(rise))
+            east += np.float32(dc * (2 - abs(dr))) * rise
+            north -= np.float32(dr * (2 - abs(dc))) * rise
+    return east * scale, north * scale
+
+
+def grade(elevation_m: Floats, resolution_m: float) -> Floats:
+    """Steepest rise over run of each cell."""
+    east, north = gradient(elevation_m, resolution_m)
+    return _hypot(east, north)
+
+
+def _hypot(east: Floats, north: Floats) -> Floats:
+    """sqrt(a^2 + b^2) in place of `east`: numpy's hypot costs ten times as much and nothing here overflows."""
+    east *= east
+    east += north * north
+    return np.sqrt(east, out=east)
+
+
+def grade_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
+    return _hypot(*gradient_of_padded(padded_m, resolution_m))
+
+
+def slope_deg(elevation_m: Floats, resolution_m: float) -> Floats:
+    """Slope of each cell in degrees, for people; costs are taken from `grade`."""
+    return np.degrees(np.arctan(grade(elevation_m, resolution_m))).astype(np.float32)
+
+
+def slope_factor(grade_: Floats, cost: CostConfig) -> Floats:
+    """Pace relative to level ground, the same in all directions; inf where steeper than `max_slope_deg`.
+
+    linear, quadratic  in the sine of the slope (gravity's pull), reaching `steep_factor` at `max_slope_deg`
+    tobler             Tobler's hiking function, up and down averaged
+    energy             a wheeled vehicle of constant power: against rolling resistance and gravity uphill, no faster
+                       than on the level downhill, up and down averaged
+    """
+    limit = math.sin(math.radians(cost.max_slope_deg))
+    sine = _sine(grade_)
+    match cost.slope_rule:
+        case "linear":
+            factor = sine * np.float32((cost.steep_factor - 1) / limit) + np.float32(1)
+        case "quadratic":
+            factor = sine * sine
+            factor *= np.float32((cost.steep_factor - 1) / limit**2)
+            factor += np.float32(1)
+        case "tobler":
+            factor = (_tobler(grade_) + _tobler(-grade_)) * np.float32(0.5)
+        case "energy":
+            factor = (_energy(grade_) + _energy(-grade_)) * np.float32(0.5)
+    if cost.max_slope_deg < 90:
+        np.copyto(factor, LETHAL, where=sine > np.float32(limit))
+    np.copyto(factor, LETHAL, where=np.isnan(grade_))
+    return factor
+
+
+def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
+    """Pace relative to level ground when driving up a rise (metres per metre; negative is downhill).
+
+    Steeper than `max_slope_deg` is inf. Uphill is not downhill: tobler is fastest at 5 % downhill, energy gains
+    nothing downhill, linear and quadratic know only how steep it is.
+    """
+    steepness = np.abs(rise)
+    match cost.slope_rule:
+        case "tobler":
+            factor = _tobler(rise)
+        case "energy":
+            factor = _energy(rise)
+        case _:
+            return slope_factor(steepness, cost)
+    limit = np.float32(math.sin(math.radians(cost.max_slope_deg)))
+    if cost.max_slope_deg < 90:
+        np.copyto(factor, LETHAL, where=_sine(steepness) > limit)
+    return factor
+
+
+def _sine(grade_: Floats) -> Floats:
+    square = grade_ * grade_
+    square += np.float32(1)
+    np.sqrt(square, out=square)
+    np.divide(grade_, square, out=square)
+    return square
+
+
+def _tobler(rise: Floats) -> Floats:
+    """Tobler (1993): walking speed 6 exp(-3.5 |rise + 0.05|) km/h, here as pace relative to the level.
+
+    Cut off at a hundredfold pace: costly is not lethal."""
+    exponent = np.float32(3.5) * (np.abs(rise + np.float32(0.05)) - np.float32(0.05))
+    capped: Floats = np.minimum(np.exp(np.minimum(exponent, np.float32(5))), np.float32(100))
+    return capped
+
+
+def _energy(rise: Floats) -> Floats:
+    sine = _sine(rise)
+    cosine = np.sqrt(np.float32(1) - sine * sine)
+    factor = cosine + sine * np.float32(1 / ROLLING_RESISTANCE)
+    floored: Floats = np.maximum(factor, np.float32(1))
+    return floored
+
+
+def roughness_m(elevation_m: Floats, resolution_m: float) -> Floats:
+    """How far the eight neighbours lie off the plane that leans on a cell, at most: 0 on any even slope."""
+    return roughness_of_padded(np.pad(elevation_m, 1, mode="reflect", reflect_type="odd"), resolution_m)
+
+
+def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
+    """`roughness_m` of an array that brings its own border of one cell; a void beside a cell does not count."""
+    east, north = gradient_of_padded(padded_m, resolution_m)
+    rows, cols = east.shape
+    centre = padded_m[1:-1, 1:-1]
+    most = np.zeros((rows, cols), np.float32)
+    for dr in (-1, 0, 1):
+        for dc in (-1, 0, 1):
+            plane = centre + (east * np.float32(dc) - north * np.float32(dr)) * np.float32(resolution_m)
+            off = np.abs(padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols] - plane)
+            np.fmax(most, off, out=most)
+    return most
+
+
+def class_factors(cost: CostConfig) -> Floats:
+    """Factor of each class, indexed by its number: the built-in ones, replaced by the scenario's."""
+    factors = np.ones(256, np.float32)
+    for kind, factor in CLASS_FACTOR.items():
+        factors[kind] = factor
+    for name, value in cost.class_factor.items():
+        factors[TerrainClass[name.upper()]] = LETHAL if value == "lethal" else value
+    return factors
+
+
+def terrain_pace(grade_: Floats, classes: Bytes, cost: CostConfig, rough_m: Floats | None = None) -> Floats:
+    """Steps 1 and 2 of the merge rule. A NaN grade is a void."""
+    pace = slope_factor(grade_, cost)
+    if cost.directional:
+        pace[np.isfinite(pace)] = 1
+    pace *= np.float32(1 / cost.flat_speed_m_per_s)
+    if cost.classes:
+        pace *= class_factors(cost)[classes]
+    if rough_m is not None:
+        pace *= np.float32(1) + np.float32(cost.rough_per_m) * rough_m
+    road = classes == TerrainClass.ROAD
+    if road.any():
+        np.copyto(pace, np.float32(1 / cost.road_speed_m_per_s), where=road & np.isfinite(pace))
+    return pace
+
+
+def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
+    """Cells whose middle lies in the polygon (even-odd), or that are painted in the mask. Raises TerrainError if it
+    covers none."""
+    if zone.mask is not None:
+        from shared_map.terrain.importers.rasters import mask_of
+
+        inside = mask_of(Path(zone.mask), grid)
+    else:
+        inside = polygon_mask(zone.polygon_m or (), grid)
+    if not inside.any():
+        width, height = grid.cols * grid.resolution_m, grid.rows * grid.resolution_m
+        raise TerrainError(
+            f"{where} {zone.name or zone.kind!r} covers no cell: its corners are metres east and south of the"
+            f" north-west corner of a terrain of {width:.0f} m x {height:.0f} m"
+        )
+    return inside
+
+
+def polygon_mask(polygon_m: Sequence[tuple[float, float]], grid: GridSpec) -> Bools:
+    """Cells whose middle lies in a polygon of [east, south] corners in metres (even-odd rule)."""
+    inside = np.zeros((grid.rows, grid.cols), np.bool_)
+    corners = [(x / grid.resolution_m, y / grid.resolution_m) for x, y in polygon_m]
+    lowest = max(math.floor(min(y for _, y in corners)), 0)
+    highest = min(math.ceil(max(y for _, y in corners)), grid.rows)
+    for row in range(lowest, highest):
+        middle = row + 0.5
+        crossings = []
+        for (x0, y0), (x1, y1) in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if (y0 <= middle) != (y1 <= middle):
+                crossings.append(x0 + (middle - y0) / (y1 - y0) * (x1 - x0))
+        crossings.sort()
+        for start, stop in zip(crossings[::2], crossings[1::2], strict=True):
+            first, end = math.ceil(start - 0.5), math.ceil(stop - 0.5)
+            inside[row, max(first, 0) : max(min(end, grid.cols), 0)] = True
+    return inside
+
+
+def paint_zones(
+    pace: Floats, zones: Sequence[ZoneConfig], grid: GridSpec, cost: CostConfig, void: Bools | None = None
+) -> None:
+    """Step 3 of the merge rule, in place."""
+    for zone in zones:
+        inside = zone_mask(zone, grid)
+        match zone.kind:
+            case "preferred":
+                pace[inside] *= PREFERRED_FACTOR
+            case "rough":
+                pace[inside] *= ROUGH_FACTOR
+            case "road":
+                if void is not None:
+                    inside &= ~void
+                pace[inside] = np.float32(1 / cost.road_speed_m_per_s)
+    for zone in zones:
+        if zone.kind == "forbidden":
+            pace[zone_mask(zone, grid)] = LETHAL
+
+
+def inflation_halves(vehicle_radius_m: float, resolution_m: float) -> list[int]:
+    """Per row distance 0, 1, 2, ...: how many cells to either side a lethal cell spreads.
+
+    A vehicle in the middle of a cell touches a lethal cell if it reaches the nearest border of it. Empty if the
+    vehicle fits into its own cell.
+    """
+    radius = vehicle_radius_m / resolution_m
+    halves: list[int] = []
+    while True:
+        gap = max(len(halves) - 0.5, 0.0)
+        if gap >= radius:
+            break
+        reach = math.sqrt(radius * radius - gap * gap)
+        halves.append(max(math.ceil(reach + 0.5) - 1, 0))
+    return halves if len(halves) > 1 else []
+
+
+def spread(lethal: Bools, halves: Sequence[int]) -> Bools:
+    """Every lethal cell widened by `halves` (see `inflation_halves`)."""
+    if not halves or not lethal.any():
+        return lethal.copy()
+    rows, cols = lethal.shape
+    wide = np.zeros_like(lethal)
+    # Lethal cells west of each cell, and as far beyond both borders as anything spreads: slices, no look-ups.
+    reach = max(halves)
+    counts = np.zeros((rows, cols + 1 + 2 * reach), np.int32)
+    np.cumsum(lethal, axis=1, out=counts[:, reach + 1 : reach + 1 + cols])
+    counts[:, reach + 1 + cols :] = counts[:, reach + cols, None]
+    for distance, half in enumerate(halves):
+        if distance >= rows:
+            break
+        near = counts[:, reach + half + 1 :][:, :cols] > counts[:, reach - half :][:, :cols]
+        if distance == 0:
+            wide |= near
+        else:
+            wide[distance:] |= near[:-distance]
+            wide[:-distance] |= near[distance:]
+    return wide
+
+
+def inflate(ground: Floats, halves: Sequence[int]) -> Floats:
+    """Step 4 of the merge rule: the ground, lethal also where the vehicle would touch a lethal cell."""
+    pace = ground.copy()
+    if not halves:
+        return pace
+    rows, reach = ground.shape[0], len(halves) - 1
+
+    def work(row0: int, row1: int) -> None:
+        above, below = max(row0 - reach, 0), min(row1 + reach, rows)
+        wide = spread(np.isinf(ground[above:below]), halves)
+        pace[row0:row1][wide[row0 - above : row1 - above]] = LETHAL
+
+    in_bands(rows, work)
+    return pace

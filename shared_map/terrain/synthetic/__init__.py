@@ -1,0 +1,1 @@
+"""Made-up ground: seeded landscapes, rivers and roads."""

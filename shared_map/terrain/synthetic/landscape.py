@@ -1,0 +1,141 @@
+"""Seeded landscapes: heights, what covers them, and a photograph of it.
+
+Only additions, products and square roots of seeded numbers, so that a seed gives the same landscape everywhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.terrain.layers import TerrainClass, gradient, gradient_of_padded
+from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.terrain.synthetic.noise import fractal, mountains
+from shared_map.terrain.synthetic.rivers import carve
+
+TINT = np.array(
+    [
+        [122, 118, 100],  # UNKNOWN
+        [42, 74, 98],  # WATER
+        [58, 84, 46],  # FOREST
+        [138, 130, 120],  # ROCK
+        [126, 142, 78],  # GRASS
+        [156, 134, 98],  # SOIL
+        [186, 178, 164],  # ROAD
+        [164, 122, 108],  # BUILT
+        [236, 240, 244],  # SNOW
+    ],
+    np.uint8,
+)
+"""Natural colours of the classes, as in a photograph."""
+
+
+def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Floats:
+    """Mountains with sharp crests, broad valleys and plains, `relief_m` from lowest to highest."""
+    rng = np.random.default_rng([seed, 1])
+    broad = max(min(rows, cols) / 2.5, 8.0)
+    ridges = mountains(rng, rows, cols, broad, ridged=True)
+    where = mountains(rng, rows, cols, broad * 1.5)
+    hills = mountains(rng, rows, cols, broad / 2)
+    where -= np.float32(where.min())
+    where /= np.float32(max(float(where.max()), 1e-6))
+    height = ridges * where * where + hills * np.float32(0.15)
+    height -= np.float32(height.min())
+    height *= np.float32(relief_m / max(float(height.max()), 1e-6))
+    return height
+
+
+def landscape(
+    rows: int, cols: int, resolution_m: float, relief_m: float, seed: int, rivers: int = 0
+) -> tuple[Floats, Bytes]:
+    """Heights and classes of a synthetic terrain."""
+    elevation_m = synthetic_elevation(rows, cols, relief_m, seed)
+    if rivers == 0:
+        return elevation_m, cover(elevation_m, resolution_m, seed)
+    elevation_m, water, fords = carve(elevation_m, rivers, resolution_m, seed)
+    classes = cover(elevation_m, resolution_m, seed)
+    classes[water] = TerrainClass.WATER
+    classes[fords] = TerrainClass.SOIL
+    return elevation_m, classes
+
+
+def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
+    """Plausible classes where nobody has looked: rock on what is steep, forest on slopes, grass between, bare soil
+    here and there."""
+    rows, cols = elevation_m.shape
+    rng = np.random.default_rng([seed, 2])
+    east, north = gradient(elevation_m, resolution_m)
+    grade = np.sqrt(east * east + north * north)
+    patches = fractal(rng, rows, cols, max(min(rows, cols) / 12, 4.0))
+    known = ~np.isnan(elevation_m)
+    steep = np.quantile(grade[known], 0.985) if known.any() else 1.0
+    gentle = np.quantile(grade[known], 0.30) if known.any() else 0.0
+    classes = np.full((rows, cols), TerrainClass.GRASS, np.uint8)
+    classes[(grade > gentle) & (patches > -0.12)] = TerrainClass.FOREST
+    classes[(grade <= gentle) & (patches < -0.35)] = TerrainClass.SOIL
+    classes[grade > max(float(steep), 0.3)] = TerrainClass.ROCK
+    classes[~known] = TerrainClass.UNKNOWN
+    return classes
+
+
+def flat_water(elevation_m: Floats, at_least: int = 4) -> Bools:
+    """Level patches: cells exactly as high as all eight neighbours, in patches of `at_least`, and their shores.
+
+    Elevation models are levelled on lakes; real ground is never as flat as that. A plain (more than a third of the
+    terrain) is no lake."""
+    from scipy import ndimage
+
+    level = ndimage.maximum_filter(elevation_m, 3) == ndimage.minimum_filter(elevation_m, 3)
+    labels, count = ndimage.label(level, structure=np.ones((3, 3), np.int8))
+    if count == 0 or level.mean() > 1 / 3:
+        return np.zeros(elevation_m.shape, np.bool_)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    lakes: NDArray[np.bool_] = sizes[labels] >= at_least
+    return np.asarray(ndimage.binary_dilation(lakes, np.ones((3, 3), np.bool_)), np.bool_)
+
+
+LEVEL_LIGHT = 0.70710678
+"""How bright level ground is."""
+
+
+def shade(east: Floats, north: Floats, exaggeration: float = 1.0) -> Floats:
+    """Light from the north-west, 45 degrees high, on a gradient: 0 dark to 1 bright."""
+    east = east * np.float32(exaggeration)
+    north = north * np.float32(exaggeration)
+    light = (east - north) * np.float32(0.5) + np.float32(LEVEL_LIGHT)
+    light /= np.sqrt(east * east + north * north + np.float32(1))
+    return np.clip(light, 0, 1, out=light)
+
+
+def hillshade(elevation_m: Floats, resolution_m: float, exaggeration: float = 1.0) -> Floats:
+    """`shade` of heights; a void is level."""
+    return shade(*gradient(elevation_m, resolution_m), exaggeration)
+
+
+def paint_photo(
+    elevation_m: Floats, classes: Bytes, resolution_m: float, seed: int, progress: Progress = no_progress
+) -> Bytes:
+    """A photograph of what covers the ground, lit from the north-west, paler in the heights."""
+    rows, cols = elevation_m.shape
+    texture = fractal(np.random.default_rng([seed, 3]), rows, cols, 16.0)
+    low, high = float(np.nanmin(elevation_m)), float(np.nanmax(elevation_m))
+    photo = np.empty((rows, cols, 3), np.uint8)
+
+    def work(row0: int, row1: int) -> None:
+        here, grain = elevation_m[row0:row1], texture[row0:row1]
+        colour = TINT[np.minimum(classes[row0:row1], len(TINT) - 1)].astype(np.float32)
+        water = classes[row0:row1] == TerrainClass.WATER
+        height = np.nan_to_num((here - np.float32(low)) / np.float32(max(high - low, 1e-3)))
+        pale = np.where(water, np.float32(0), height * np.float32(0.25))[..., None]
+        colour += (np.float32(190) - colour) * pale
+        light = shade(*gradient_of_padded(padded_rows(elevation_m, row0, row1), resolution_m), 1.5)
+        light = np.float32(0.35) + np.float32(0.65 / LEVEL_LIGHT) * light + grain * np.float32(0.18)
+        light = np.where(water, np.float32(1) + grain * np.float32(0.04), light)
+        colour *= light[..., None]
+        colour[np.isnan(here)] = 0
+        photo[row0:row1] = np.clip(colour, 0, 255)
+
+    in_bands(rows, work, "painting the photo", progress)
+    return photo

@@ -1,0 +1,104 @@
+"""Rivers of a synthetic landscape: they follow its valleys from border to border and cut them deeper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bools, Floats
+from shared_map.terrain.synthetic.noise import fractal
+
+FORD_EVERY, FORD_LENGTH = 64, 4
+"""Cells along a river from one shallow place to the next, and how long it is: a river never cuts a map in two."""
+_COARSE_CELLS = 250_000
+_BANK_GRADE = 0.03
+
+Course = tuple[NDArray[np.intp], NDArray[np.intp]]
+
+
+def carve(elevation_m: Floats, count: int, resolution_m: float, seed: int) -> tuple[Floats, Bools, Bools]:
+    """(heights with valleys cut, water, fords) for `count` rivers, three cells wide."""
+    from scipy import ndimage
+
+    rng = np.random.default_rng([seed, 6])
+    courses = _courses(elevation_m, count, rng)
+    water, fords = np.zeros(elevation_m.shape, np.bool_), np.zeros(elevation_m.shape, np.bool_)
+    level = np.full(elevation_m.shape, np.inf, np.float32)
+    for rows, cols in courses:
+        heights = np.minimum.accumulate(elevation_m[rows, cols]) - np.float32(1.0)
+        np.minimum.at(level, (rows, cols), heights)
+        water[rows, cols] = True
+        shallow = (np.arange(len(rows)) + int(rng.integers(FORD_EVERY))) % FORD_EVERY < FORD_LENGTH
+        fords[rows[shallow], cols[shallow]] = True
+    water = np.asarray(ndimage.binary_dilation(water), np.bool_)
+    fords = np.asarray(ndimage.binary_dilation(fords, iterations=2), np.bool_) & water
+    return _cut(elevation_m, level, resolution_m), water & ~fords, fords
+
+
+def _courses(elevation_m: Floats, count: int, rng: np.random.Generator) -> list[Course]:
+    """Cells of each river from its spring down: the lowest way between two opposite borders, with bends."""
+    from skimage.graph import MCP_Geometric
+
+    stride = 1
+    while elevation_m.size // stride**2 > _COARSE_CELLS:
+        stride *= 2
+    coarse = elevation_m[::stride, ::stride]
+    rows, cols = coarse.shape
+    spread = max(float(coarse.max() - coarse.min()), 1e-3)
+    bends = fractal(rng, rows, cols, max(min(rows, cols) / 8, 4.0))
+    price = ((coarse - coarse.min()) / spread * 6) ** 2 + 0.5 + (2.5 * (bends + 0.8)) ** 2
+    courses = []
+    for number in range(count):
+        upright = number % 2 == 0
+        # Away from the borders that it runs along, or the way of least resistance is just outside the picture.
+        off = np.linspace(-1.0, 1.0, cols)[None, :] if upright else np.linspace(-1.0, 1.0, rows)[:, None]
+        search = MCP_Geometric(price + 12.0 * off**4, fully_connected=True)
+        begin = _lowest(coarse[0], rng) if upright else _lowest(coarse[:, 0], rng)
+        reached, _ = search.find_costs([(0, begin) if upright else (begin, 0)])
+        end = (rows - 1, int(np.argmin(reached[-1]))) if upright else (int(np.argmin(reached[:, -1])), cols - 1)
+        at_row, at_col = np.array(search.traceback(end)).T
+        price[at_row, at_col] *= 0.3
+        course = _finer(at_row, at_col, stride, elevation_m.shape)
+        if elevation_m[course[0][0], course[1][0]] < elevation_m[course[0][-1], course[1][-1]]:
+            course = (course[0][::-1], course[1][::-1])
+        courses.append(course)
+    return courses
+
+
+def _lowest(border: Floats, rng: np.random.Generator) -> int:
+    """A low place in the middle three fifths of a border."""
+    first, last = len(border) // 5, max(len(border) * 4 // 5, len(border) // 5 + 1)
+    order = np.argsort(border[first:last], kind="stable")
+    return first + int(order[int(rng.integers(max(len(order) // 6, 1)))])
+
+
+def _finer(at_row: NDArray[Any], at_col: NDArray[Any], stride: int, shape: tuple[int, ...]) -> Course:
+    """A coarse course as cells that touch each other: smoothed, so that it bends instead of turning corners, and
+    drawn out to the very border."""
+    half = 3
+    weights = np.ones(2 * half + 1) / (2 * half + 1)
+    places = []
+    for at, size in ((at_row, shape[0]), (at_col, shape[1])):
+        fine = np.concatenate([at * stride, [size - 1 if at[-1] >= (size - 1) // stride else at[-1] * stride]])
+        smooth = np.convolve(np.pad(fine.astype(np.float64), half, mode="edge"), weights, mode="valid")
+        smooth[0], smooth[-1] = fine[0], fine[-1]
+        places.append(smooth)
+    gaps = np.maximum(np.abs(np.diff(places[0])), np.abs(np.diff(places[1])))
+    along = np.concatenate([[0.0], np.cumsum(gaps)])
+    steps = np.arange(0.0, along[-1] + 0.5, 0.5)
+    rows, cols = (np.rint(np.interp(steps, along, place)).astype(np.intp) for place in places)
+    new = np.concatenate([[True], (np.diff(rows) != 0) | (np.diff(cols) != 0)])
+    return rows[new], cols[new]
+
+
+def _cut(elevation_m: Floats, level: Floats, resolution_m: float) -> Floats:
+    """A valley: nowhere higher above the river than its banks rise, steeper the farther away."""
+    from scipy import ndimage
+
+    distance, nearest = ndimage.distance_transform_edt(np.isinf(level), return_indices=True)
+    away = distance.astype(np.float32) * np.float32(resolution_m)
+    rise = away * np.float32(_BANK_GRADE) * (np.float32(1) + away / np.float32(12 * resolution_m))
+    lowered: Floats = np.minimum(elevation_m, level[tuple(nearest)] + rise)
+    return lowered

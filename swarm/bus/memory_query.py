@@ -1,0 +1,102 @@
+"""One query on the simulated network: who asked, who still has to answer, and how the answers travel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from swarm.bus.bus import AskEnded, Post, Replied
+from swarm.wire.codec import decode_either, encode
+from swarm.wire.messages.base import Message
+from swarm.wire.topics import Topic
+
+if TYPE_CHECKING:
+    from swarm.bus.memory_bus import Interest, MemoryBus
+
+
+@dataclass(eq=False)
+class Asking:
+    """One query under way. `waiting` are the queryables that have not ended yet."""
+
+    bus: MemoryBus
+    topic: Topic
+    wanted: dict[str, str]
+    tag: str
+    post: Post
+    waiting: set[int] = field(default_factory=set)
+    replies: int = 0
+    failure: str | None = None
+    over: bool = False
+
+    def finish(self) -> None:
+        if not self.over:
+            self.over = True
+            self.post(AskEnded(self.tag, self.topic, self.replies, self.failure))
+
+    def time_out(self) -> None:
+        if not self.over:
+            self.failure = "timeout"
+            self.finish()
+
+
+@dataclass(eq=False)
+class MemoryAnswerer:
+    asking: Asking
+    interest: Interest
+    index: int
+    ended: bool = False
+    last_arrival_ns: int = 0
+
+    def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
+        if self.ended:
+            raise RuntimeError("answered after the end")
+        asking, bus = self.asking, self.interest.bus
+        named = asking.topic.one({**self.interest.narrow, **fields})
+        if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
+            return
+        bus.counts["messages_out"] += 1
+        payload = encode(message)
+        parsed = decode_either(payload, asking.topic.message, asking.topic.bulk)
+        reply = Replied(asking.tag, asking.topic, named, parsed)
+
+        def arrive() -> None:
+            if not asking.over:
+                asking.bus.counts["messages_in"] += 1
+                asking.replies += 1
+                asking.post(reply)
+
+        self._send(payload, arrive)
+
+    def refuse(self, reason: str) -> None:
+        def arrive() -> None:
+            self.asking.failure = reason
+
+        if not self.ended:
+            self._send(reason.encode(), arrive)
+
+    def end(self) -> None:
+        if self.ended:
+            return
+        self.ended = True
+
+        def arrive() -> None:
+            self.asking.waiting.discard(self.index)
+            if not self.asking.waiting:
+                self.asking.finish()
+
+        self._send(b"", arrive)
+
+    def _send(self, payload: bytes, arrive: Callable[[], None]) -> None:
+        """What answers one query stays in order; it may be lost or repeated."""
+        source, to, what = self.interest.bus, self.asking.bus, self.asking.topic.name
+        if source.closed:
+            return
+
+        def deliver() -> None:
+            if to.traced(source, what, payload):
+                arrive()
+
+        for arrival_ns in source.network.arrivals_ns(source, to, what):
+            self.last_arrival_ns = max(self.last_arrival_ns, arrival_ns)
+            source.network.scheduler.at(self.last_arrival_ns, deliver)

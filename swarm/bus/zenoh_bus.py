@@ -1,0 +1,411 @@
+"""The only door to zenoh. Bytes become messages here; what does not parse is counted, logged once per key and
+minute, and dropped.
+
+What the choices rest on is measured: rings that drop the oldest keep a stalled reader from holding up queries
+on the same link; replies come straight on zenoh's own thread, because a thread per query is ten times slower.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import zenoh
+
+from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Post, Replied
+from swarm.config.scenario import NetworkConfig, TlsConfig
+from swarm.errors import BusError, ProtocolError
+from swarm.liveness import Peer
+from swarm.wire.codec import (
+    MAX_PAYLOAD_BYTES,
+    decode,
+    decode_either,
+    decode_many,
+    decode_parameters,
+    encode,
+    encode_readable,
+)
+from swarm.wire.messages.base import Message
+from swarm.wire.topics import ALIVE_KEY, Priority, Topic
+
+log = logging.getLogger(__name__)
+
+_PRIORITIES = {
+    Priority.INTERACTIVE: zenoh.Priority.INTERACTIVE_HIGH,
+    Priority.DATA: zenoh.Priority.DATA,
+    Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
+}
+_LOG_AGAIN_S = 60.0
+_QUERY_BUFFER = 4096
+_TOKEN_BUFFER = 65_536
+_CLOSE_S = 3.0
+_TOGETHER = 1024
+"""At most so many samples in one event, so that a tick is not kept waiting for long."""
+
+
+def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
+    """Open a session. Raises BusError with a sentence when it cannot listen or nobody answers.
+
+    mode  "client" connects to `network.connect`; "router" listens on `network.listen` and passes messages on
+    """
+    endpoints = network.listen if mode == "router" else network.connect
+    try:
+        return ZenohBus(zenoh.open(_zenoh_config(network, mode)), network.namespace)
+    except zenoh.ZError as error:
+        reason = str(error).split(" at /")[0]
+        what = "listen on" if mode == "router" else "reach a router at"
+        hint = "is the port taken?" if mode == "router" else "is `swarm router` running there?"
+        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason} ({hint})") from error
+
+
+def _zenoh_config(network: NetworkConfig, mode: str) -> zenoh.Config:
+    settings: dict[str, Any] = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/unicast/max_sessions": 8192,
+        "transport/unicast/accept_pending": 2048,
+        "transport/unicast/accept_timeout": 20_000,
+        "transport/link/tx/lease": int(network.lease_s * 1000),
+        "transport/link/tx/keep_alive": 4,
+        "transport/link/rx/max_message_size": MAX_PAYLOAD_BYTES + (1 << 16),
+        "transport/shared_memory/enabled": False,
+    }
+    if mode == "router":
+        settings["listen/endpoints"] = list(network.listen)
+        settings["listen/exit_on_failure"] = True
+        settings["connect/endpoints"] = list(network.peers)
+        settings["connect/exit_on_failure"] = False
+    else:
+        settings["listen/endpoints"] = []
+        settings["connect/endpoints"] = list(network.connect)
+        settings["connect/timeout_ms"] = int(network.connect_timeout_s * 1000)
+    settings["connect/retry"] = {
+        "period_init_ms": 100,
+        "period_max_ms": 500,
+        "period_increase_factor": 1.5,
+    }
+    if network.tls is not None:
+        settings["transport/link/tls"] = tls_settings(network.tls)
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def tls_settings(tls: TlsConfig) -> dict[str, Any]:
+    """What zenoh calls mutual TLS, both ways with one certificate."""
+    return {
+        "root_ca_certificate": tls.ca,
+        "enable_mtls": True,
+        "listen_certificate": tls.certificate,
+        "listen_private_key": tls.key,
+        "connect_certificate": tls.certificate,
+        "connect_private_key": tls.key,
+    }
+
+
+class ZenohBus:
+    """A `Bus` on one zenoh session. `close` it, always: an unclosed session can hang the interpreter's exit."""
+
+    def __init__(self, session: zenoh.Session, namespace: str) -> None:
+        self._session = session
+        self._namespace = namespace
+        self._counts = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
+        self._counting = threading.Lock()
+        self._own_peers: list[Peer] = []
+        self._entities: list[Any] = []
+        self._subscribers: dict[str, list[Any]] = {}
+        self._threads: list[threading.Thread] = []
+        self._logged_s: dict[str, float] = {}
+        self._closed = False
+
+    @property
+    def namespace(self) -> str:
+        return self._namespace
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        return self._counts
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The raw session, for measurements that compare with it."""
+        return self._session
+
+    def __enter__(self) -> ZenohBus:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
+        if self._closed:
+            return
+        self._count("messages_out")
+        self._session.put(
+            topic.keyed(self._namespace, **fields),
+            encode(message),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=_PRIORITIES[topic.priority],
+        )
+
+    def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
+        def arrive(sample: zenoh.Sample) -> None:
+            self._count("messages_in")
+            key = str(sample.key_expr)
+            try:
+                named = self._fields(topic, key)
+                message = decode(sample.payload.to_bytes(), topic.message)
+                topic.check_key(named, message)
+            except ProtocolError as error:
+                self._drop(key, error)
+                return
+            post(Heard(topic, named, message))
+
+        def arrive_together(samples: list[zenoh.Sample]) -> None:
+            self._count("messages_in", len(samples))
+            keys = [str(sample.key_expr) for sample in samples]
+            decoded = decode_many([sample.payload.to_bytes() for sample in samples], topic.message)
+            heard: list[tuple[str, Message]] = []
+            for key, message in zip(keys, decoded, strict=True):
+                if isinstance(message, ProtocolError):
+                    self._drop(key, message)
+                else:
+                    heard.append((key[len(self._namespace) + 1 :], message))
+            if heard:
+                post(HeardMany(topic, heard))
+
+        expression = topic.expression(self._namespace, **fields)
+        subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
+        self._subscribers.setdefault(expression, []).append(subscriber)
+        if together:
+            self._read(subscriber, arrive_together, f"sub-{topic.name}", together=True)
+        else:
+            self._read(subscriber, arrive, f"sub-{topic.name}")
+
+    def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
+        for subscriber in self._subscribers.pop(topic.expression(self._namespace, **fields), ()):
+            self._entities.remove(subscriber)
+            subscriber.undeclare()  # which ends the thread that reads its channel
+        self._threads = [thread for thread in self._threads if thread.is_alive()]  # those of earlier ones
+
+    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
+        request_type = topic.request
+        if request_type is None:
+            raise TypeError(f"topic {topic.name} is not a queryable")
+        concrete = {name: str(value) for name, value in fields.items()}
+
+        def arrive(query: zenoh.Query) -> None:
+            self._count("messages_in")
+            key = str(query.key_expr)
+            parameters = dict(list(query.parameters))  # type: ignore[call-overload]
+            answerer = _ZenohAnswerer(self, topic, query, concrete, parameters.get("format") == "json")
+            try:
+                payload = query.payload
+                if payload is None:
+                    request = decode_parameters(parameters, request_type)
+                else:
+                    request = decode(payload.to_bytes(), request_type)
+            except ProtocolError as error:
+                self._drop(key, error)
+                answerer.refuse(f"{topic.name}: {error}")
+                answerer.end()
+                return
+            # A tool may ask with `**`, which no template parses: then we were asked for all that we serve.
+            asked = topic.parse(self._namespace, key) or dict.fromkeys(topic.fields, "*") | concrete
+            post(Asked(topic, asked, request, answerer))
+
+        queryable = self._session.declare_queryable(
+            topic.expression(self._namespace, **fields), zenoh.handlers.FifoChannel(_QUERY_BUFFER)
+        )
+        self._read(queryable, arrive, f"serve-{topic.name}")
+
+    def ask(
+        self,
+        topic: Topic,
+        request: Message,
+        post: Post,
+        *,
+        tag: str,
+        timeout_s: float = 2.0,
+        **fields: str | int,
+    ) -> None:
+        replies = 0
+        failure: str | None = None
+
+        def arrive(reply: zenoh.Reply) -> None:
+            nonlocal replies, failure
+            if reply.ok is None:
+                failure = reply.err.payload.to_bytes().decode("utf-8", "replace") if reply.err else "error"
+                failure = "timeout" if failure == "Timeout" else failure
+                return
+            key = str(reply.ok.key_expr)
+            try:
+                message = decode_either(reply.ok.payload.to_bytes(), topic.message, topic.bulk)
+                named = self._fields(topic, key)
+            except ProtocolError as error:
+                self._drop(key, error)
+                return
+            replies += 1
+            self._count("messages_in")
+            post(Replied(tag, topic, named, message))
+
+        def finish() -> None:
+            post(AskEnded(tag, topic, replies, failure))
+
+        if self._closed:
+            finish()
+            return
+        self._count("messages_out")
+        self._session.get(
+            topic.expression(self._namespace, **fields),
+            zenoh.handlers.Callback(arrive, finish, indirect=False),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            payload=encode(request),
+            priority=_PRIORITIES[topic.priority],
+        )
+
+    def declare_alive(self, peer: Peer) -> None:
+        self._own_peers.append(peer)
+        key = ALIVE_KEY.format(role=peer.role, id=peer.id, incarnation=peer.incarnation)
+        self._entities.append(self._session.liveliness().declare_token(f"{self._namespace}/{key}"))
+
+    def watch_alive(self, post: Post, role: str = "*") -> None:
+        def arrive(sample: zenoh.Sample) -> None:
+            try:
+                peer = _peer(str(sample.key_expr))
+            except ProtocolError as error:
+                self._drop(str(sample.key_expr), error)
+                return
+            if peer in self._own_peers:
+                return  # our own token falls with the link; that we are alive needs no telling
+            post(Appeared(peer) if sample.kind == zenoh.SampleKind.PUT else Disappeared(peer))
+
+        key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
+        subscriber = self._session.liveliness().declare_subscriber(
+            f"{self._namespace}/{key}", zenoh.handlers.FifoChannel(_TOKEN_BUFFER), history=True
+        )
+        self._read(subscriber, arrive, "alive")
+
+    def watch_links(self, post: Post) -> None:
+        def arrive(event: Any) -> None:
+            post(LinkChanged(up=event.kind == zenoh.SampleKind.PUT))
+
+        listener = self._session.info.declare_transport_events_listener(
+            zenoh.handlers.FifoChannel(1024), history=False
+        )
+        self._read(listener, arrive, "links")
+
+    def close(self) -> None:
+        """Leave the network, within seconds even if the router hangs and zenoh would wait for it."""
+        if self._closed:
+            return
+        self._closed = True
+        closer = threading.Thread(target=self._undeclare, name="close", daemon=True)
+        closer.start()
+        closer.join(_CLOSE_S)
+        if closer.is_alive():
+            log.warning("the router does not answer: left without saying goodbye")
+
+    def _undeclare(self) -> None:
+        for entity in reversed(self._entities):
+            entity.undeclare()
+        for thread in self._threads:
+            thread.join(timeout=2.0)
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, *, together: bool = False) -> None:
+        """Read an entity's channel on a thread of its own until it is undeclared.
+
+        together  hand over lists of all that waits, instead of one item at a time
+        """
+        self._entities.append(entity)
+        channel = entity.handler  # a thread waiting on the entity itself would keep it from being undeclared
+
+        def run() -> None:
+            try:
+                while True:
+                    arrive(_waiting(channel) if together else channel.recv())
+            except zenoh.ZError:
+                if not self._closed and entity in self._entities:
+                    log.exception("the %s channel ended by itself", name)
+
+        thread = threading.Thread(target=run, name=name, daemon=True)
+        thread.start()
+        self._threads.append(thread)
+
+    def _fields(self, topic: Topic, key: str) -> dict[str, str]:
+        fields = topic.parse(self._namespace, key)
+        if fields is None:
+            raise ProtocolError(f"{key} is not a key of topic {topic.name} ({topic.key})")
+        return fields
+
+    def _count(self, name: str, by: int = 1) -> None:
+        """Several of zenoh's threads count: adding is not atomic."""
+        with self._counting:
+            self._counts[name] += by
+
+    def _drop(self, key: str, error: ProtocolError) -> None:
+        self._count("payloads_dropped")
+        now_s = time.monotonic()
+        if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
+            if len(self._logged_s) > 10_000:  # a hostile sender may use a new key each time
+                self._logged_s.clear()
+            self._logged_s[key] = now_s
+            log.warning("dropped a payload on %s: %s", key, error)
+
+
+def _waiting(channel: Any) -> list[Any]:
+    """All that waits in a channel, one item at least. What is there already is taken without letting go of the
+    interpreter: a hand-over to another busy thread for each item would cost hundreds of times more."""
+    items = [channel.recv()]
+    while len(items) < _TOGETHER and (item := channel.try_recv()) is not None:
+        items.append(item)
+    return items
+
+
+def _peer(key: str) -> Peer:
+    *_, role, id, incarnation = key.split("/")
+    if not incarnation.isdecimal():
+        raise ProtocolError(f"incarnation {incarnation!r} of {key} is not a number")
+    return Peer(role, id, int(incarnation))
+
+
+class _ZenohAnswerer:
+    def __init__(
+        self, bus: ZenohBus, topic: Topic, query: zenoh.Query, concrete: dict[str, str], as_json: bool
+    ) -> None:
+        self._bus = bus
+        self._topic = topic
+        self._query: zenoh.Query | None = query
+        self._concrete = concrete
+        self._as_json = as_json
+
+    def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
+        if self._query is None:
+            raise RuntimeError("answered after the end")
+        key = self._topic.keyed(self._bus.namespace, **{**self._concrete, **fields})
+        if self._bus._closed or not self._query.key_expr.intersects(zenoh.KeyExpr(key)):
+            return
+        self._bus._count("messages_out")
+        if self._as_json:
+            self._query.reply(key, encode_readable(message), encoding=zenoh.Encoding.APPLICATION_JSON)
+        else:
+            self._query.reply(key, encode(message))
+
+    def refuse(self, reason: str) -> None:
+        if self._query is not None and not self._bus._closed:
+            self._query.reply_err(reason.encode())
+
+    def end(self) -> None:
+        # Zenoh ends a query when its last handle goes; `drop` does it now, not at the next garbage collection.
+        if self._query is not None:
+            self._query.drop()  # type: ignore[no-untyped-call]
+            self._query = None

@@ -1,0 +1,142 @@
+"""Reading a scenario: TOML to checked, frozen settings, with paths anchored at the file."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import tomllib
+from pathlib import Path
+
+import msgspec
+
+from swarm.config.explain import explain, nearest
+from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ZoneConfig
+from swarm.errors import ConfigError
+
+
+def load_scenario(path: Path) -> Scenario:
+    """Read and check a scenario. Raises ConfigError that names the file and the key."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot read scenario {path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"scenario {path} is not text: {error.reason} at byte {error.start}") from error
+    return parse_scenario(text, str(path), base=path.parent)
+
+
+def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
+    """As `load_scenario`, of a text. Relative files in it are taken relative to `base`."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source}: not TOML: {error}") from error
+    try:
+        scenario = msgspec.convert(raw, Scenario)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{source}: {explain(str(error), raw, Scenario)}") from error
+    _check(scenario, source)
+    return scenario if base is None else _anchored(scenario, base)
+
+
+def _check(scenario: Scenario, source: str) -> None:
+    ids = scenario.target_ids
+    doubled = sorted({id for id in ids if ids.count(id) > 1})
+    if doubled:
+        raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    for key, zones in (
+        ("cost.zones", scenario.cost.zones),
+        ("terrain.hidden.zones", scenario.terrain.hidden.zones),
+    ):
+        for n, zone in enumerate(zones):
+            if zone.polygon_m is None and zone.mask is None:
+                raise ConfigError(f"{source}: {key}[{n}]: missing required field `polygon_m` (or `mask`)")
+            if zone.polygon_m is not None and zone.mask is not None:
+                raise ConfigError(f"{source}: {key}[{n}]: polygon_m and mask exclude each other")
+    if scenario.cost.directional:
+        _check_directional(scenario.planner, source)
+    names = [group.name for group in scenario.groups]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
+    for name in names:
+        longer = [other for other in names if other.startswith(f"{name}.")]
+        if longer:  # the id of an author begins with its group and a point
+            raise ConfigError(
+                f"{source}: groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
+            )
+    for group in scenario.groups:
+        for id in group.targets:
+            if id not in ids:
+                raise ConfigError(
+                    f"{source}: groups: {group.name} chases {id!r}, which is no target{nearest(id, ids)}"
+                )
+        for key in ("reads", "writes"):
+            for name in getattr(group, key):
+                if name != "*" and name not in names:
+                    where = f"{source}: groups: {group.name}: {key}"
+                    raise ConfigError(f"{where} names {name!r}, which is no group{nearest(name, names)}")
+    for key in ("listen", "connect", "peers"):
+        for endpoint in getattr(scenario.network, key):
+            check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
+
+
+def _check_directional(planner: PlannerConfig, source: str) -> None:
+    if planner.strategy not in ("auto", "full"):
+        raise ConfigError(
+            f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
+            " and rings know one cost per cell; expected 'auto' or 'full', which grow whole trees"
+        )
+    if planner.length_weight:
+        raise ConfigError(
+            f"{source}: planner.length_weight: {planner.length_weight:g} does not go with cost.directional = true;"
+            " leave it out"
+        )
+
+
+def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
+    """Beyond loopback only mutual TLS will do. Raises ConfigError."""
+    match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
+    if match is None or int(match[3]) > 65535:
+        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint such as tcp/127.0.0.1:7447 or tls/host:7447")
+    protocol, host = match[1], match[2].strip("[]")
+    if protocol == "tls" and not has_tls:
+        raise ConfigError(f"{where}: {endpoint} needs network.tls with ca, certificate and key")
+    if protocol == "tcp" and not _loopback(host):
+        raise ConfigError(
+            f"{where}: {endpoint} leaves this machine in the clear; use tls/{host}:{match[3]} with network.tls"
+        )
+
+
+def _loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _anchored(scenario: Scenario, base: Path) -> Scenario:
+    """Relative paths of a scenario file, made relative to where it lies."""
+    terrain = scenario.terrain
+    source = terrain.source
+    if source not in BUILT_IN_TERRAINS:
+        source = str(base / source)
+    photo = None if terrain.photo is None else str(base / terrain.photo)
+    labels = None if terrain.labels is None else str(base / terrain.labels)
+    hidden = msgspec.structs.replace(terrain.hidden, zones=_anchored_zones(terrain.hidden.zones, base))
+    cost = msgspec.structs.replace(scenario.cost, zones=_anchored_zones(scenario.cost.zones, base))
+    network = scenario.network
+    if network.tls is not None:
+        tls = network.tls
+        tls = TlsConfig(ca=str(base / tls.ca), certificate=str(base / tls.certificate), key=str(base / tls.key))
+        network = msgspec.structs.replace(network, tls=tls)
+    terrain = msgspec.structs.replace(terrain, source=source, photo=photo, labels=labels, hidden=hidden)
+    return msgspec.structs.replace(scenario, terrain=terrain, cost=cost, network=network)
+
+
+def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConfig, ...]:
+    return tuple(
+        zone if zone.mask is None else msgspec.structs.replace(zone, mask=str(base / zone.mask)) for zone in zones
+    )
+
+
+BUILT_IN_TERRAINS = ("jacksboro", "synthetic")

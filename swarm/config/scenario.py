@@ -1,0 +1,327 @@
+"""A scenario: frozen settings, read once from a TOML file and handed down by section.
+
+Every number that a user may turn has its home here, with its unit in its name. A wrong key, type or value is
+refused with the file, the key, what was found and what is allowed.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0, le=1e12)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
+Count = Annotated[int, Meta(ge=1, le=100_000)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
+GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
+Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Point = tuple[Metres, Metres]
+
+Strategy = Literal[
+    "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
+]
+
+ClassName = Literal["unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow"]
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of the sections of a scenario."""
+
+
+class ZoneConfig(Section, frozen=True, kw_only=True):
+    """A polygon painted on the terrain.
+
+    kind       forbidden is lethal; preferred halves the pace; road sets the road pace; rough doubles the pace
+    polygon_m  [east, south] corners in metres from the north-west corner of the terrain
+    mask       instead of a polygon: an image as large as the terrain, painted wherever it is not 0
+    """
+
+    kind: Literal["forbidden", "preferred", "road", "rough"]
+    polygon_m: Annotated[tuple[Point, ...], Meta(min_length=3)] | None = None
+    mask: str | None = None
+    name: str = ""
+
+
+class HiddenConfig(Section, frozen=True, kw_only=True):
+    """What is true of the terrain and missing from the map: vehicles find it out."""
+
+    closed_roads: Annotated[int, Meta(ge=0, le=1000)] = 0
+    rubble_fields: Annotated[int, Meta(ge=0, le=10_000)] = 0
+    flooded_share: Annotated[float, Meta(ge=0, le=0.3)] = 0.0
+    zones: tuple[ZoneConfig, ...] = ()
+
+
+class TerrainConfig(Section, frozen=True, kw_only=True):
+    """Where elevation and photo come from.
+
+    source        "jacksboro" (built in), "synthetic", or a file: .tif, .hgt, .asc, .npz, .png, .map or a ROS .yaml
+    photo         a colour GeoTIFF on the same ground, or nothing
+    labels        a TOML file of labelled polygons and points, from which to learn what the photo shows
+    resolution_m  cell size to bring everything to; the source's own if not given
+    crs           coordinate system of the source where the file does not say it, such as "EPSG:32632"
+    height_scale  metres per unit of height, where the file does not say it (.png)
+    nodata        voids are lethal, or filled from their surroundings
+    roads         how many roads to lay between seeded places, as there is no map of them
+    rows, cols    size of a synthetic terrain; relief_m from its lowest to its highest cell, rivers across it
+    """
+
+    source: Annotated[str, Meta(min_length=1)] = "jacksboro"
+    photo: str | None = None
+    labels: str | None = None
+    resolution_m: Positive | None = None
+    crs: str | None = None
+    height_scale: Positive | None = None
+    nodata: Literal["lethal", "fill"] = "lethal"
+    roads: Annotated[int, Meta(ge=0, le=200)] = 0
+    rows: Annotated[int, Meta(ge=1, le=16384)] = 256
+    cols: Annotated[int, Meta(ge=1, le=16384)] = 256
+    relief_m: Annotated[float, Meta(ge=0, le=20_000)] = 400.0
+    rivers: Annotated[int, Meta(ge=0, le=50)] = 0
+    hidden: HiddenConfig = HiddenConfig()
+
+
+class CostConfig(Section, frozen=True, kw_only=True):
+    """How terrain becomes pace. `flat_speed_m_per_s` is driven on level open ground, `road_speed_m_per_s` on roads.
+
+    slope_rule     linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
+                   Tobler's hiking function; energy is a wheeled vehicle of constant power
+    directional    uphill is not downhill: a step costs by what it climbs along its way, instead of a cell by how
+                   steep it is; the planner grows whole trees then (strategy auto or full)
+    max_slope_deg  steeper ground is lethal
+    rough_per_m    how much a metre of roughness (neighbours off the even slope) adds to the pace, as a share of it
+    classes        whether what covers the ground (water, forest, rock ...) counts
+    class_factor   pace of a class relative to open ground, or "lethal", instead of the built-in factors
+    """
+
+    flat_speed_m_per_s: Positive = 10.0
+    road_speed_m_per_s: Positive = 20.0
+    slope_rule: Literal["linear", "quadratic", "tobler", "energy"] = "quadratic"
+    directional: bool = False
+    steep_factor: Annotated[float, Meta(ge=1)] = 6.0
+    max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
+    rough_per_m: NotNegative = 0.0
+    classes: bool = True
+    class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
+    vehicle_radius_m: NotNegative = 0.0
+    zones: tuple[ZoneConfig, ...] = ()
+
+
+class TargetConfig(Section, frozen=True, kw_only=True):
+    """A target, or `count` alike. Ids are `name` for one, `name0, name1, ...` for several.
+
+    walk      still; random: a new heading now and then; waypoints: to random places by the cheapest way;
+              evade: away from the nearest vehicles; external: somebody else publishes its pose
+    tracker   always: its pose is published all the time; sighted: only vehicles that have it in sight tell where
+              it is, and planners go by what they saw last
+    caught    jump: a captured target turns up elsewhere; stay: it goes on as before
+    start     [row, col]; a random passable cell if not given
+    """
+
+    name: Name = "t"
+    count: Annotated[int, Meta(ge=1, le=1000)] = 1
+    walk: Literal["still", "random", "waypoints", "evade", "external"] = "waypoints"
+    speed_m_per_s: NotNegative = 4.0
+    tracker: Literal["always", "sighted"] = "always"
+    caught: Literal["jump", "stay"] = "jump"
+    start: tuple[int, int] | None = None
+
+
+class GroupConfig(Section, frozen=True, kw_only=True):
+    """Vehicles that belong together.
+
+    targets  ids they may chase; all if empty
+    start    spread over the terrain, or clustered around one random place
+    cells    explicit [row, col] places for the first vehicles
+    reads    groups whose marks and positions its vehicles take in, besides their own; "*" is all
+    writes   groups that may take in its marks and positions; both must agree
+    """
+
+    name: Name = "all"
+    vehicles: Count = 100
+    targets: tuple[Name, ...] = ()
+    start: Literal["spread", "cluster"] = "spread"
+    cells: tuple[tuple[int, int], ...] = ()
+    reads: tuple[GroupName, ...] = ("*",)
+    writes: tuple[GroupName, ...] = ("*",)
+
+
+class VehicleConfig(Section, frozen=True, kw_only=True):
+    """How vehicles behave.
+
+    sense_range_m     radius within which the simulated sensor sees the true ground
+    sighting_lasts_s  what they tell of a target that they saw ends by itself after so long
+    capture_range_m   a target this near is captured
+    route_cells       steps of a route asked for at a time; 0 is the whole route
+    claim_cells       cells ahead that a vehicle claims
+    patience_s        after so long without a step, it looks for a way around
+    reassign_s        how often it asks which target is the cheapest
+    hysteresis        another target must be cheaper by this share to be worth a change
+    """
+
+    per_agent: Annotated[int, Meta(ge=1, le=1000)] = 25
+    tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
+    sense_range_m: Positive = 300.0
+    sighting_lasts_s: Positive = 30.0
+    capture_range_m: Positive = 150.0
+    route_cells: Annotated[int, Meta(ge=0)] = 0
+    claim_cells: Annotated[int, Meta(ge=1, le=16)] = 3
+    patience_s: Positive = 1.0
+    reassign_s: Positive = 5.0
+    hysteresis: NotNegative = 0.15
+
+
+class PlannerConfig(Section, frozen=True, kw_only=True):
+    """How a planner keeps its tree.
+
+    edge           octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
+    length_weight  lambda of the paper's length-aware key, seconds per metre
+    k_min          smallest block exponent: the paper's windows are 2**(k+2)+1 cells wide, others twice as wide
+    full_every     rotation: a full growth every so many moves, on small maps sooner
+    cpu_budget     auto: share of one core that this planner may use
+    max_gap        rotation, auto: a served route whose certified gap exceeds this asks for a full growth
+    push_s         newer routes are pushed to a vehicle at most this often
+    """
+
+    strategy: Strategy = "auto"
+    tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
+    edge: Literal["octile", "paper"] = "octile"
+    neighbours: Literal[4, 8] = 8
+    corner_cutting: bool = False
+    length_weight: NotNegative = 0.0
+    k_min: Annotated[int, Meta(ge=0, le=12)] = 3
+    full_every: Annotated[int, Meta(ge=1)] = 10
+    cpu_budget: Annotated[float, Meta(gt=0, le=1)] = 0.1
+    max_gap: Annotated[float, Meta(ge=1)] = 1.5
+    push_s: Positive = 1.0
+
+
+class MapConfig(Section, frozen=True, kw_only=True):
+    """How the shared map is replicated.
+
+    interest            all: agents hold all marks; near: those of the regions within interest_m of their vehicles
+                        only. Planners, keepers and the monitor hold all
+    publish_hz          a tile's set is put at most this often by its author
+    digest_s            every replica tells this often what it holds
+    author_marks_per_s  who changes more cells than this for ten seconds is heard with delay, and named
+    total_marks_per_s   the same of all authors together; then those above an equal share of it wait
+    fold_after_s        an author of whom a keeper has heard nothing for so long is taken for dead, and what it said
+                        is folded with what other dead authors said; longer than a partition is likely to last
+    fold_keep_s         what was folded can be put back for so long
+    """
+
+    interest: Literal["all", "near"] = "all"
+    interest_m: Positive = 2000.0
+    publish_hz: Positive = 10.0
+    digest_s: Positive = 1.0
+    author_marks_per_s: Positive = 20_000.0
+    total_marks_per_s: Positive = 100_000.0
+    fold_after_s: Positive = 60.0
+    fold_keep_s: Positive = 86_400.0
+
+
+class TlsConfig(Section, frozen=True, kw_only=True):
+    """Mutual TLS: certificate files in PEM."""
+
+    ca: str
+    certificate: str
+    key: str
+
+
+class NetworkConfig(Section, frozen=True, kw_only=True):
+    """Where processes meet.
+
+    listen   what the router listens on; beyond loopback it must be tls/ with certificates
+    connect  which routers the other processes connect to
+    peers    other routers that a router connects to
+    lease_s  a silent peer counts as gone after this
+    """
+
+    namespace: Name = "swarm"
+    listen: Annotated[tuple[str, ...], Meta(min_length=1)] = ("tcp/127.0.0.1:7447",)
+    connect: Annotated[tuple[str, ...], Meta(min_length=1)] = ("tcp/127.0.0.1:7447",)
+    peers: tuple[str, ...] = ()
+    lease_s: Annotated[float, Meta(ge=0.5, le=60)] = 2.0
+    connect_timeout_s: Positive = 10.0
+    tls: TlsConfig | None = None
+
+
+class MonitorConfig(Section, frozen=True, kw_only=True):
+    """The live view. Ports are on loopback; 0 picks a free one."""
+
+    live: bool = True
+    grpc_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
+    web_port: Annotated[int, Meta(ge=0, le=65535)] = 9090
+    frame_hz: Annotated[float, Meta(gt=0, le=60)] = 10.0
+    memory_mib: Annotated[int, Meta(ge=16)] = 256
+
+
+class Scenario(Section, frozen=True, kw_only=True):
+    """One run, whole.
+
+    seconds     how long the run lasts
+    time_scale  seconds on the terrain per second of the run: motion is that much faster than real
+    """
+
+    name: Name = "unnamed"
+    seed: Annotated[int, Meta(ge=0, le=2**53)] = 1
+    seconds: Positive = 60.0
+    time_scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
+    terrain: TerrainConfig = TerrainConfig()
+    cost: CostConfig = CostConfig()
+    targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1)] = (TargetConfig(),)
+    groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1)] = (GroupConfig(),)
+    vehicles: VehicleConfig = VehicleConfig()
+    planner: PlannerConfig = PlannerConfig()
+    map: MapConfig = MapConfig()
+    network: NetworkConfig = NetworkConfig()
+    monitor: MonitorConfig = MonitorConfig()
+
+    @property
+    def target_ids(self) -> list[str]:
+        return [id for target in self.targets for id in ids_of(target)]
+
+    @property
+    def untracked(self) -> frozenset[str]:
+        """Targets of which nobody knows more than vehicles see."""
+        return frozenset(id for target in self.targets if target.tracker == "sighted" for id in ids_of(target))
+
+    @property
+    def vehicle_count(self) -> int:
+        return sum(group.vehicles for group in self.groups)
+
+
+def ids_of(target: TargetConfig) -> list[str]:
+    if target.count == 1:
+        return [target.name]
+    return [f"{target.name}{n}" for n in range(target.count)]
+
+
+class AgentPlan(msgspec.Struct, frozen=True):
+    """Which vehicles an agent process hosts: `count` of a group, from its `first` on."""
+
+    id: str
+    group: GroupConfig
+    first: int
+    count: int
+
+    @property
+    def vehicle_ids(self) -> list[str]:
+        return [f"{self.id}-{n:02d}" for n in range(self.count)]
+
+
+def agent_of(vehicle: str) -> str:
+    """The agent that hosts a vehicle, by the vehicle's id; one whose id names no agent is its own."""
+    return vehicle.rpartition("-")[0] or vehicle
+
+
+def plan_agents(scenario: Scenario) -> list[AgentPlan]:
+    """The agent processes of a scenario. An agent serves one group."""
+    agents: list[AgentPlan] = []
+    for group in scenario.groups:
+        for first in range(0, group.vehicles, scenario.vehicles.per_agent):
+            count = min(scenario.vehicles.per_agent, group.vehicles - first)
+            agents.append(AgentPlan(f"a{len(agents)}", group, first, count))
+    return agents

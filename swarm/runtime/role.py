@@ -1,0 +1,46 @@
+"""What a role is started with, the same for every role, live or simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from swarm.config.scenario import Scenario
+from swarm.grid import GridSpec
+from swarm.wire.messages.processes import RunInfo
+
+
+@dataclass(frozen=True, slots=True)
+class RoleSetup:
+    """One process of a run.
+
+    incarnation  nanoseconds at its start: a later start of the same (role, id) has a larger one
+    run_dir      where this machine keeps the run: prepared terrain, the keeper's store, logs; None if nowhere
+    """
+
+    scenario: Scenario
+    run_id: str
+    role: str
+    id: str
+    incarnation: int
+    started_ns: int
+    run_dir: Path | None = None
+
+    def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
+        return RunInfo(
+            run_id=self.run_id,
+            role=self.role,
+            id=self.id,
+            incarnation=self.incarnation,
+            scenario=self.scenario.name,
+            terrain=terrain_digest,
+            rows=grid.rows,
+            cols=grid.cols,
+            resolution_m=grid.resolution_m,
+            started_ns=self.started_ns,
+        )
+
+    @property
+    def author(self) -> str:
+        """Name under which this incarnation writes marks: nobody else ever writes under it."""
+        return f"{self.id}.{self.incarnation:x}"

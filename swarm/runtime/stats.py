@@ -1,0 +1,108 @@
+"""Counters and mergeable histograms that every process publishes about itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET
+
+_BASE = 1.04
+_LOG_BASE = math.log(_BASE)
+
+
+class Histogram:
+    """Positive values in logarithmic buckets 4 % wide: merged by adding, quantiles within 2 %.
+
+    A plain sample reservoir cannot be merged across processes, and fixed buckets (as of Prometheus) are too
+    coarse for latencies from microseconds to seconds.
+    """
+
+    def __init__(self, buckets: Mapping[int, int] | None = None) -> None:
+        self.buckets: dict[int, int] = dict(buckets or {})
+
+    def add(self, value: float, times: int = 1) -> None:
+        """Count a value: what is not positive as zero, what is not finite not at all."""
+        if not math.isfinite(value):
+            return
+        bucket = ZERO_BUCKET if value <= 0 else min(round(math.log(value) / _LOG_BASE), TOP_BUCKET)
+        self.buckets[bucket] = self.buckets.get(bucket, 0) + times
+
+    def add_all(self, values: NDArray[np.float64]) -> None:
+        """As `add`, of many."""
+        values = values[np.isfinite(values)]
+        positive = values[values > 0]
+        found = np.minimum(np.rint(np.log(positive) / _LOG_BASE), TOP_BUCKET).astype(np.int64)
+        buckets, counts = np.unique(found, return_counts=True)
+        self.merge(dict(zip(buckets.tolist(), counts.tolist(), strict=True)))
+        if positive.size < values.size:
+            self.merge({ZERO_BUCKET: values.size - positive.size})
+
+    def merge(self, buckets: Mapping[int, int]) -> None:
+        for bucket, count in buckets.items():
+            self.buckets[bucket] = self.buckets.get(bucket, 0) + count
+
+    @property
+    def count(self) -> int:
+        return sum(self.buckets.values())
+
+    def quantile(self, q: float) -> float | None:
+        """The value below which a share `q` of all values lies; None of nothing."""
+        total = self.count
+        if total == 0:
+            return None
+        rank = min(total - 1, int(q * total))
+        seen = 0
+        for bucket in sorted(self.buckets):
+            seen += self.buckets[bucket]
+            if seen > rank:
+                return _value(bucket)
+        raise AssertionError("unreachable")
+
+    def mean(self) -> float | None:
+        total = self.count
+        if total == 0:
+            return None
+        # In order, so that the sum does not depend on the order of merging.
+        return math.fsum(_value(bucket) * count for bucket, count in sorted(self.buckets.items())) / total
+
+
+def _value(bucket: int) -> float:
+    return 0.0 if bucket == ZERO_BUCKET else math.exp(bucket * _LOG_BASE)
+
+
+def merged(parts: Iterable[Mapping[int, int]]) -> Histogram:
+    """One histogram of many processes'."""
+    whole = Histogram()
+    for part in parts:
+        whole.merge(part)
+    return whole
+
+
+class Counters:
+    """What a process counts, gauges and times, by name. Names carry units: `route_query_ms`."""
+
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = {}
+        self.gauges: dict[str, float] = {}
+        self.histograms: dict[str, Histogram] = {}
+
+    def count(self, name: str, by: int = 1) -> None:
+        self.counts[name] = self.counts.get(name, 0) + by
+
+    def gauge(self, name: str, value: float) -> None:
+        """Note the present value; what is not finite is no value."""
+        if math.isfinite(value):
+            self.gauges[name] = value
+        else:
+            self.gauges.pop(name, None)
+
+    def observe(self, name: str, value: float) -> None:
+        self.histograms.setdefault(name, Histogram()).add(value)
+
+    def observe_all(self, name: str, values: NDArray[np.float64]) -> None:
+        if values.size:
+            self.histograms.setdefault(name, Histogram()).add_all(values)

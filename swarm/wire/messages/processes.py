@@ -1,0 +1,67 @@
+"""Messages about processes: which run they belong to, what they counted, notes for people."""
+
+from __future__ import annotations
+
+from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET, Cell, Natural, check_finite, check_id
+from swarm.wire.fields import column as column
+from swarm.wire.fields import pack_column as pack_column
+from swarm.wire.messages.base import Message, schema_of
+from swarm.wire.routes import Route as Route
+from swarm.wire.routes import Routes as Routes
+from swarm.wire.routes import RouteStatus as RouteStatus
+from swarm.wire.statements import FOREVER as FOREVER
+from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
+from swarm.wire.statements import TILE_AREA as TILE_AREA
+from swarm.wire.statements import MarkKind as MarkKind
+
+
+class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
+    """What a process answers when asked which run it belongs to. `terrain` is a digest of grid, prior pace and
+    cost rules: processes with different ones must not share a map."""
+
+    run_id: str
+    role: str
+    id: str
+    incarnation: Natural
+    scenario: str
+    terrain: str
+    rows: Natural
+    cols: Natural
+    resolution_m: float
+    started_ns: Natural
+
+
+class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
+    """Everything a process has counted since its incarnation began. Histograms as in `swarm.runtime.stats`."""
+
+    role: str
+    id: str
+    incarnation: Natural
+    stamp_ns: Natural
+    counts: dict[str, Natural]
+    gauges: dict[str, float]
+    histograms: dict[str, dict[int, Natural]]
+
+    def __post_init__(self) -> None:
+        check_id("role", self.role)
+        check_id("id", self.id)
+        check_finite("a gauge", *self.gauges.values())
+        for name, buckets in self.histograms.items():
+            for bucket in buckets:
+                if not ZERO_BUCKET <= bucket <= TOP_BUCKET:
+                    raise ValueError(f"histogram {name[:80]} has a bucket {bucket}")
+
+
+class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):
+    """Something worth telling a person: a capture, a restart, a closure found. `cell` says where, if anywhere."""
+
+    role: str
+    id: str
+    stamp_ns: Natural
+    kind: str
+    text: str
+    cell: Cell | None = None
+
+    def __post_init__(self) -> None:
+        check_id("role", self.role)
+        check_id("id", self.id)

@@ -1,0 +1,206 @@
+"""Every key expression of the wire, with its message, rate and quality of service. `docs/wire.md` is made
+of this."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+from swarm.errors import ProtocolError
+from swarm.wire.codec import prime
+from swarm.wire.messages.base import Message, Nothing
+from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.planning import (
+    CostReply,
+    CostRequest,
+    PlannerStatus,
+    PushedRoute,
+    RouteReply,
+    RouteRequest,
+)
+from swarm.wire.messages.processes import Note, RunInfo, Stats
+from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.vehicles import Claims, Fleet, Followed, Grounds
+
+
+class Priority(Enum):
+    """Zenoh's priorities that we use."""
+
+    INTERACTIVE = "interactive"
+    DATA = "data"
+    BACKGROUND = "background"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One row of the wire.
+
+    key       template below the namespace; `{name}` stands for one chunk
+    message   what is put, or what a query is answered with
+    request   for a queryable: what is asked; None for a topic that is only published
+    bulk      for a queryable: what may carry many values in one reply, to those who ask for it so
+    newest    each value says all there is under its key, so a reader may skip to the newest
+    buffer    samples that a slow reader keeps; the oldest are dropped first
+    """
+
+    name: str
+    key: str
+    message: type[Message]
+    what: str
+    rate: str
+    request: type[Message] | None = None
+    bulk: type[Message] | None = None
+    published: bool = True
+    newest: bool = True
+    priority: Priority = Priority.DATA
+    buffer: int = 1024
+    fields: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
+    _said_twice: tuple[str, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.key))
+        object.__setattr__(self, "_pattern", re.compile(pattern))
+        for message_type in (self.message, self.request, self.bulk):
+            if message_type is not None:
+                prime(message_type)  # before there are threads to meet it half described
+        object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
+        said_twice = tuple(name for name in self.fields if name in self.message.__struct_fields__)
+        object.__setattr__(self, "_said_twice", said_twice)
+
+    def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
+        """All fields as chunks of a key; those not given become `*`.
+
+        Raises TypeError on a field that the topic has not, ValueError on what is not one chunk.
+        """
+        named = {name: _chunk(fields[name]) if name in fields else "*" for name in self.fields}
+        if len(fields) > len(named) or any(name not in named for name in fields):
+            unknown = next(name for name in fields if name not in named)
+            raise TypeError(f"topic {self.name} has no field {unknown}; it has {', '.join(named)}")
+        return named
+
+    def one(self, fields: Mapping[str, str | int]) -> dict[str, str]:
+        """All fields of one value: every one must be given, and none may be a wildcard."""
+        named = self.every(fields)
+        for name, chunk in named.items():
+            if chunk == "*":
+                raise TypeError(f"topic {self.name} needs the field {name}")
+        return named
+
+    def expression(self, namespace: str, **fields: str | int) -> str:
+        """The key expression: fields that are not given become `*`."""
+        return f"{namespace}/{self.key.format(**self.every(fields))}"
+
+    def keyed(self, namespace: str, **fields: str | int) -> str:
+        """The key of one value."""
+        return f"{namespace}/{self.key.format(**self.one(fields))}"
+
+    def parse(self, namespace: str, key: str) -> dict[str, str] | None:
+        """The fields of a key, None of a key that is not this topic's."""
+        if not key.startswith(namespace + "/"):
+            return None
+        match = self._pattern.fullmatch(key, len(namespace) + 1)
+        return match.groupdict() if match else None
+
+    def check_key(self, fields: Mapping[str, str], message: Message) -> None:
+        """Raise ProtocolError where a message that was put says it is another's than its key says: access is
+        granted by key, so nobody may speak for somebody else under its own."""
+        for name in self._said_twice:
+            said = str(getattr(message, name))
+            if said != fields[name]:
+                raise ProtocolError(f"{name} is {said[:80]!r} in the message and {fields[name]!r} in its key")
+
+
+_CHUNK = re.compile(r"[^/*$?#\s]+|\*")
+
+
+def _chunk(value: str | int) -> str:
+    chunk = str(value)
+    if isinstance(value, int):
+        return chunk
+    if _CHUNK.fullmatch(chunk) is None:
+        raise ValueError(f"{chunk!r} cannot be a part of a key: no '/', '*', '$', '?', '#' or blanks")
+    return chunk
+
+
+RUN = Topic(
+    "run", "run/{role}/{id}", RunInfo, "which run and terrain a process belongs to", "asked at every start",
+    request=Nothing, published=False,
+)  # fmt: skip
+MARKS = Topic(
+    "marks", "marks/{region}/{tile}/{author}", MarkSet,
+    "an author's whole set for a tile; the author and the keeper answer for it",
+    "on change, at most 10 Hz a tile", request=MarksRequest, bulk=MarkSets, buffer=8192,
+)  # fmt: skip
+DIGEST = Topic(
+    "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",
+    priority=Priority.BACKGROUND,
+)  # fmt: skip
+BASE_MAP = Topic(
+    "base-map", "base/{keeper}", BaseMap, "what a keeper has of the terrain, for those who lack its files",
+    "asked at a start", request=Nothing, published=False, priority=Priority.BACKGROUND,
+)  # fmt: skip
+BASE_TILES = Topic(
+    "base-tiles", "base/{keeper}/tiles", BaseMapTile, "the terrain itself, by layer and region",
+    "asked at a start", request=BaseMapRequest, published=False, priority=Priority.BACKGROUND,
+)  # fmt: skip
+FLEET = Topic(
+    "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
+)  # fmt: skip
+CLAIMS = Topic(
+    "claims", "claims/{agent}", Claims,
+    "which cells vehicles hold and want, for neighbours and witnesses; who heard an agent answers with its last",
+    "every tick, on change", request=Nothing, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+GROUNDS = Topic(
+    "grounds", "grounds/{agent}", Grounds,
+    "in which plots agents claim cells: asked of all before one is entered", "on change", request=Grounds,
+    published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+FOLLOWED = Topic(
+    "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
+    "per new route", newest=False, priority=Priority.BACKGROUND,
+)  # fmt: skip
+PUSHED_ROUTE = Topic(
+    "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,
+    "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
+)  # fmt: skip
+POSE = Topic("pose", "target/{target}/pose", TargetPose, "where a target is", "every tick")
+TRUE_POSE = Topic(
+    "true-pose", "world/target/{target}/pose", TargetPose,
+    "where a target is that nobody tracks: for simulated sensors, not for planners", "every tick",
+)  # fmt: skip
+SIGHTED = Topic(
+    "sighted", "sighted/{target}/{author}", Sighted, "where a vehicle of this author saw a target",
+    "while it is in sight, at most 2 Hz",
+)  # fmt: skip
+ROUTE = Topic(
+    "route", "target/{target}/route", RouteReply, "routes from cells to the target", "asked",
+    request=RouteRequest, published=False,
+)  # fmt: skip
+COST = Topic(
+    "cost", "target/{target}/cost", CostReply, "cost-to-go of a batch of cells", "asked",
+    request=CostRequest, published=False,
+)  # fmt: skip
+STATUS = Topic(
+    "status", "target/{target}/status", PlannerStatus, "how a planner is doing", "2 Hz",
+    priority=Priority.BACKGROUND,
+)  # fmt: skip
+STATS = Topic(
+    "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz", priority=Priority.BACKGROUND,
+)  # fmt: skip
+NOTE = Topic(
+    "note", "note/{role}/{id}", Note, "something worth telling a person", "as it happens",
+    newest=False, priority=Priority.BACKGROUND,
+)  # fmt: skip
+
+TOPICS = (
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CLAIMS, GROUNDS, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED,
+    TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
+)  # fmt: skip
+
+ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
+"""Liveliness tokens, one per process."""

@@ -1,0 +1,127 @@
+"""How soon replicas are equal again after loss, partitions and coming and going, on the memory bus, seeded.
+
+By hand, as in docs/map-figures.md: `python tests/laws/test_map_convergence.py`"""
+
+from __future__ import annotations
+
+import json
+import random
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from support.map_strategies import FeedService, LossyLinks, MapSwarm
+
+from shared_map.keeper.service import KeeperService
+from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.wire.statements import MarkKind
+
+STEP_S = 0.1
+Services = Sequence[FeedService | KeeperService]
+
+
+def equal(services: Services) -> bool:
+    return len({service.replica.fingerprint() for service in services}) == 1
+
+
+def until_equal_s(swarm: MapSwarm, services: Services, at_most_s: float = 60.0) -> float:
+    waited_s = 0.0
+    while not equal(services):
+        assert waited_s < at_most_s, "not equal in time"
+        swarm.run(STEP_S)
+        waited_s += STEP_S
+    return round(waited_s, 1)
+
+
+def scribble(swarm: MapSwarm, chance: random.Random, author: FeedService, marks: int) -> None:
+    """Say something about cells of one place, as a vehicle does."""
+    grid = swarm.terrain.grid
+    row, col = chance.randrange(grid.rows), chance.randrange(grid.cols)
+    near = [(row + chance.randrange(32), col + chance.randrange(32)) for _ in range(marks)]
+    cells = [grid.cell(min(r, grid.rows - 1), min(c, grid.cols - 1)) for r, c in near]
+    kinds = [chance.choice((MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE)) for _ in cells]
+    author.feed.publish(author.replica.write(cells, kinds, 2.0, swarm.now_ns))
+
+
+def after_loss_s(seed: int) -> float:
+    """4 authors, a planner and a keeper write for 10 s at 30 % lost, 10 % doubled, 500 ms jitter; then quiet, with
+    the links as bad as before."""
+    chance = random.Random(seed)
+    swarm = MapSwarm(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
+    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
+    authors = [swarm.writer(f"a{n}.1") for n in range(4)]
+    listener = swarm.listener("p")
+    for _ in range(50):
+        scribble(swarm, chance, chance.choice(authors), 5)
+        swarm.run(0.2)
+    return until_equal_s(swarm, [keeper, listener, *authors])
+
+
+def after_partition_s(seed: int) -> float:
+    """Writes on both sides of a partition of 30 s; from its healing on."""
+    chance = random.Random(seed)
+    links = LossyLinks(seed)
+    swarm = MapSwarm(links)
+    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
+    authors = [swarm.writer(f"a{n}.1") for n in range(4)]
+    listener = swarm.listener("p")
+    swarm.run(2 + chance.random())
+    links.far_side = {"a2.1", "a3.1", "p"}
+    for _ in range(100):
+        scribble(swarm, chance, chance.choice(authors), 5)
+        swarm.run(0.3)
+    links.far_side = set()
+    return until_equal_s(swarm, [keeper, listener, *authors])
+
+
+def lost_while_coming_and_going(seed: int, marks: int, agents: int = 6) -> dict[str, float]:
+    """Agents start, write and are killed all the time; at the end nothing that any of them published is missing."""
+    chance = random.Random(seed)
+    swarm = MapSwarm(LossyLinks(seed, dropped=0.02, jitter_ms=20), terrain_of_pace(np.ones((512, 512), np.float32)))
+    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
+    listener = swarm.listener("p")
+    living: dict[str, FeedService] = {}
+    said: dict[str, FeedService] = {}
+    written = 0
+    while written < marks:
+        while len(living) < agents:
+            name = f"a{len(said)}.1"
+            living[name] = said[name] = swarm.writer(name)
+        for author in living.values():
+            scribble(swarm, chance, author, 200)
+            written += 200
+        swarm.run(0.1)
+        if chance.random() < 0.3:
+            name = chance.choice(list(living))
+            swarm.run(0.3)  # what it wrote is out; nothing says that anybody has it
+            swarm.kill(name)
+            del living[name]
+    equal_s = until_equal_s(swarm, [keeper, listener, *living.values()])
+    swarm.run(5)  # and what only one of them heard of the dead has been passed on
+    lost = 0
+    for replica in (keeper.replica, listener.replica, *(each.replica for each in living.values())):
+        for name, author in said.items():
+            lost += len(author.replica.ahead_of(replica.digest(), [name]))
+    return {"marks": written, "agents": len(said), "equal_after_s": equal_s, "sets_lost": lost}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_after_loss_and_after_a_partition_replicas_are_equal_within_seconds(seed: int) -> None:
+    assert after_loss_s(seed) <= 3
+    assert after_partition_s(seed) <= 2
+
+
+def test_nothing_is_lost_while_agents_come_and_go() -> None:
+    assert lost_while_coming_and_going(3, marks=8_000)["sets_lost"] == 0
+
+
+if __name__ == "__main__":
+    found = {}
+    for name, measure in (("after_loss_s", after_loss_s), ("after_partition_s", after_partition_s)):
+        times = sorted(measure(seed) for seed in range(20))
+        found[name] = {"p50": times[10], "max_of_20": times[-1]}
+        sys.stdout.write(json.dumps({name: found[name]}) + "\n")
+    found = lost_while_coming_and_going(1, marks=100_000)
+    sys.stdout.write(json.dumps({"lost_while_coming_and_going": found}) + "\n")

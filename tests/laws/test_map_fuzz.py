@@ -1,0 +1,142 @@
+"""Garbage on the keys of the map: nothing falls over, and what gets through merges by the same rules everywhere.
+
+By hand, more: MAP_MUTATIONS=1000000 pytest tests/laws/test_map_fuzz.py"""
+
+from __future__ import annotations
+
+import os
+import random
+
+import msgspec
+import numpy as np
+import pytest
+from support.map_strategies import GRID, Composite, MapSwarm, held_winners, naive_winners, set_of
+
+from shared_map.keeper.store import KeeperStore
+from shared_map.replication.mark_sets import packed, unpacked
+from shared_map.replication.marks import fault
+from shared_map.replication.replica import MapReplica
+from swarm.errors import ProtocolError
+from swarm.wire.codec import decode, decode_many, encode
+from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import DIGEST, MARKS
+
+MUTATIONS = int(os.environ.get("MAP_MUTATIONS", "20000"))
+FEW = MarksRequest(authors=["a1.1"], tiles=[0, 1])
+
+
+def examples() -> list[MarkSet]:
+    some: dict[int, tuple[int, float, int]] = {
+        0: (MarkKind.LETHAL, 0.0, 5),
+        3: (MarkKind.PACE, 2.0, 6),
+        9: (MarkKind.CLEAR, 0.0, 7),
+    }
+    return [set_of(author, tile, 1, some) for author in ("a1.1", "b2.2") for tile in range(3)]
+
+
+def mutated(payload: bytes, chance: random.Random) -> bytes:
+    """A payload with a few bytes changed, taken out, doubled or cut off."""
+    garbled = bytearray(payload)
+    for _ in range(chance.randint(1, 4)):
+        at = chance.randrange(len(garbled)) if garbled else 0
+        match chance.randrange(5):
+            case 0 | 1 if garbled:
+                garbled[at] ^= 1 << chance.randrange(8)
+            case 2 if garbled:
+                garbled[at] = chance.randrange(256)
+            case 3:
+                garbled[at:at] = bytes(garbled[at : at + chance.randint(1, 9)])
+            case _:
+                del garbled[at : at + chance.randint(1, 9)]
+    return bytes(garbled)
+
+
+def test_mutated_sets_merge_by_the_rules_or_not_at_all() -> None:
+    chance = random.Random(4)
+    payloads = [encode(each) for each in examples()]
+    through: list[MarkSet] = []
+    for _ in range(MUTATIONS):
+        try:
+            through.append(decode(mutated(chance.choice(payloads), chance), MarkSet))
+        except ProtocolError:
+            continue
+    assert len(through) > MUTATIONS // 100, "too few came through to say anything"
+    replicas = []
+    for order in (through, through[::-1]):
+        replica = MapReplica(GRID, Composite())
+        for each in order:
+            replica.merge(each)
+        replicas.append(replica)
+    lasting = [each for each in through if fault(each, GRID) is None]
+    if not any(each.untils_ns for each in lasting):
+        assert held_winners(replicas[0]) == naive_winners(lasting)
+    assert replicas[0].answer(MarksRequest()) == replicas[1].answer(MarksRequest())
+    assert held_winners(replicas[0]) == held_winners(replicas[1])
+
+
+def test_mutated_messages_of_many_sets_merge_by_the_rules_or_not_at_all() -> None:
+    chance = random.Random(6)
+    payloads = [encode(message) for message in packed(examples())]
+    through: list[MarkSet] = []
+    for _ in range(MUTATIONS):
+        try:
+            through.extend(unpacked(decode(mutated(chance.choice(payloads), chance), MarkSets)))
+        except ProtocolError:
+            continue
+    assert len(through) > MUTATIONS // 100, "too few came through to say anything"
+    singly, together = MapReplica(GRID, Composite()), MapReplica(GRID, Composite())
+    for each in through:
+        each.check()  # what the columns pass, each set passes by itself
+        singly.merge(each)
+    for first in range(0, len(through), 500):
+        together.merge_many(through[first : first + 500])
+    assert together.answer(MarksRequest()) == singly.answer(MarksRequest())
+    assert held_winners(together) == held_winners(singly)
+
+
+def test_mutated_payloads_that_wait_together_pass_the_door_as_each_would_alone() -> None:
+    chance = random.Random(7)
+    payloads = [encode(each) for each in examples()]
+    for _ in range(MUTATIONS // 1000):
+        some = [mutated(chance.choice(payloads), chance) if n % 3 else payloads[0] for n in range(50)]
+        for payload, found in zip(some, decode_many(some, MarkSet), strict=True):
+            try:
+                assert decode(payload, MarkSet) == found
+            except ProtocolError:
+                assert isinstance(found, ProtocolError)
+
+
+@pytest.mark.parametrize("topic", [MARKS, DIGEST])
+def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_from_it(topic: object) -> None:
+    chance = random.Random(5)
+    swarm = MapSwarm()
+    store = KeeperStore(":memory:")
+    keeper = swarm.keeper("keeper", store)
+    author, listener = swarm.writer("a1.1"), swarm.listener("p")
+    hostile = swarm.network.bus("hostile")
+    rows = np.array([(0, 1, 5), (2, 1, 7), (5, 2, 0)], DIGEST_ROW).tobytes()
+    lies = [encode(Digest(author=a, role=r, held={"b2.2": rows, "a1.1": rows})) for a, r in
+            (("b2.2", "agent"), ("k.1", "keeper"))]  # fmt: skip
+    payloads = [encode(each) for each in examples()] if topic is MARKS else lies
+    for n in range(min(MUTATIONS, 20_000) // 10):
+        payload = mutated(chance.choice(payloads), chance) if n % 10 else chance.choice(payloads)
+        fields = {"region": "0", "tile": str(n % 6), "author": "b2.2"} if topic is MARKS else {"author": "b2.2"}
+        hostile.publish_bytes(topic, payload, fields)  # type: ignore[arg-type]
+        if n % 50 == 0:
+            swarm.run(0.1)
+    author.feed.publish(author.replica.write([5, 2700], MarkKind.LETHAL, 0.0, swarm.now_ns))
+    swarm.run(3)
+    for replica in (listener.replica, keeper.replica):
+        assert replica.answer(FEW) == author.replica.answer(FEW)
+    assert author.feed.unacknowledged == 0
+    assert len(list(store.load())) == len(keeper.replica.answer(MarksRequest()))
+
+
+def test_requests_for_what_nobody_has_are_answered_with_nothing() -> None:
+    replica = MapReplica(GRID)
+    for each in examples():
+        replica.merge(each)
+    odd = msgspec.structs.replace(FEW, authors=["x" * 64], tiles=[10**9])
+    assert replica.answer(odd) == []
+    assert replica.compare({"a1.1": np.array([(4_000_000_000, 9, 9)], DIGEST_ROW).tobytes()}) == []

@@ -1,0 +1,237 @@
+"""The laws of the tree under everything that happens to it, for every strategy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import slow_twins as naive
+from support.planner_strategies import (
+    RULES,
+    STRATEGIES,
+    Job,
+    Marks,
+    Move,
+    happenings,
+    paces,
+    planner_configs,
+    random_pace,
+)
+
+from planner_service.target_tree import GrownTree, TargetTree
+from planner_service.tree.windows import block_half
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec, Window
+from swarm.wire.routes import RouteStatus
+
+
+class Play:
+    """A tree, the map it is told of, and the job that a worker may have of it."""
+
+    def __init__(self, pace: np.ndarray, config: PlannerConfig) -> None:
+        self.pace = pace
+        self.config = config
+        self.grid = GridSpec(*pace.shape, 1.0)
+        self.tree = TargetTree(self.grid, config)
+        self.version = 0
+        self.target = int(np.flatnonzero(np.isfinite(pace))[0])
+        self.grown: GrownTree | None = None
+        self.since: list[Window] = []
+        self.rules = {
+            "neighbours": config.neighbours,
+            "edge": config.edge,
+            "corner_cutting": config.corner_cutting,
+        }
+        self.last = self.tree.update(self.pace, self.target, [], 0)
+
+    def happen(self, event: Move | Marks | Job) -> None:
+        if isinstance(event, Move):
+            row, col = self.grid.row_col(self.target)
+            row = min(max(row + event.rows, 0), self.grid.rows - 1)
+            col = min(max(col + event.cols, 0), self.grid.cols - 1)
+            self.target = row * self.grid.cols + col
+            self.last = self.tree.update(self.pace, self.target, [], self.version)
+        elif isinstance(event, Marks):
+            window = self._mark(event)
+            self.since.append(window)
+            self.version += 1
+            self.tree.update(self.pace, self.target, [window], self.version)
+        elif event.what == "begin":
+            job = self.tree.full_job(self.pace.copy(), self.target, self.version)
+            self.grown = job()
+            self.since = []
+        elif event.what == "end" and self.grown is not None:
+            self.tree.adopt(
+                self.grown, self.pace, self.target, self.since, self.version, np.arange(self.grid.cells)
+            )
+            self.grown = None
+        elif event.what == "force":
+            self.tree.force(self.pace, [0, self.grid.cells - 1])
+
+    def _mark(self, event: Marks) -> Window:
+        rng = np.random.default_rng(event.seed)
+        window = Window(0, 0, 0, 0)
+        for _ in range(event.count):
+            row, col = int(rng.integers(self.grid.rows)), int(rng.integers(self.grid.cols))
+            self.pace[row, col] = rng.choice(np.array([np.inf, 0.5, 1.0, 20.0, 500.0], np.float32))
+            window = window.union(Window(row, col, row + 1, col + 1))
+        return window
+
+    def check(self) -> None:
+        """Laws (a) to (c), certificates and upper bounds, for a route from every cell."""
+        routes = self.tree.routes(self.pace, np.arange(self.grid.cells))
+        if not np.isfinite(self.pace.flat[self.target]):
+            assert all(route.status is RouteStatus.NO_TARGET for route in routes)
+            return
+        optimum = naive.cost_to_go(self.pace, self.target, **self.rules).reshape(-1)
+        lethal = ~np.isfinite(self.pace.reshape(-1))
+        for cell, route in enumerate(routes):
+            if lethal[cell]:
+                assert route.status is RouteStatus.LETHAL_START
+            elif not math.isfinite(optimum[cell]):
+                assert route.status is RouteStatus.UNREACHABLE
+            else:
+                assert route.status is RouteStatus.OK
+        served = np.isfinite(optimum) & ~lethal
+        cells = np.flatnonzero(served)
+        driven = np.empty(cells.size)
+        for n, cell in enumerate(cells.tolist()):
+            found = naive.follow(self.pace, cell, routes[cell].directions, **self.rules)
+            assert found is not None, "the route enters a lethal cell, squeezes or leaves the grid"
+            last, driven[n] = found
+            assert last == self.target
+        cost = np.array([routes[cell].cost_s for cell in cells])
+        bound = np.array([routes[cell].lower_bound_s for cell in cells])
+        upper = self.tree.cost_to_go_at(cells)
+        best = optimum[cells]
+        np.testing.assert_allclose(cost, driven, rtol=1e-6)
+        assert (bound <= best * (1 + 1e-12)).all()
+        assert (cost >= best * (1 - 1e-6)).all()
+        assert (upper >= driven * (1 - 1e-4)).all()
+        if self.config.strategy == "full":
+            np.testing.assert_allclose(cost, best, rtol=1e-5)
+
+
+@given(paces(), planner_configs(), happenings())
+@settings(max_examples=300, deadline=None)
+def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_hold(
+    pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job]
+) -> None:
+    play = Play(pace, config)
+    play.check()
+    for event in events:
+        play.happen(event)
+        play.check()
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_a_long_walk_with_marks_keeps_the_laws(strategy: str) -> None:
+    rng = np.random.default_rng(5)
+    pace = random_pace(rng, 40, 37, 10.0, 0.15)
+    config = PlannerConfig(strategy=strategy, k_min=1, cpu_budget=1e-9, full_every=5)  # type: ignore[arg-type]
+    play = Play(pace, config)
+    for step in range(60):
+        play.happen(Move(int(rng.integers(-1, 2)), int(rng.integers(-1, 2))))
+        if step % 3 == 0:
+            play.happen(Marks(step, 2))
+        if step % 10 == 5:
+            play.happen(Job("begin"))
+        if step % 10 == 8:
+            play.happen(Job("end"))
+        if step % 6 == 0:
+            play.check()
+    play.check()
+
+
+@pytest.mark.parametrize("jump", [5, 8, 16, 30])
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_after_a_jump_every_route_arrives(strategy: str, jump: int) -> None:
+    pace = random_pace(np.random.default_rng(jump), 48, 48, 5.0, 0.2)
+    play = Play(pace, PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9))  # type: ignore[arg-type]
+    for rows, cols in ((jump, 0), (0, jump), (-jump, -jump), (47, 47)):
+        play.happen(Move(rows, cols))
+        play.check()
+
+
+def printed_half(grid: GridSpec, old: int, new: int) -> int:
+    """The paper's rule as it is printed: a block must be crossed in row and column at once."""
+    (row, col), (old_row, old_col) = grid.row_col(new), grid.row_col(old)
+    crossed = [k for k in range(1, 10) if row >> k != old_row >> k and col >> k != old_col >> k]
+    return 2 << max(crossed, default=1)
+
+
+def test_the_printed_rule_never_widens_for_a_move_along_an_axis() -> None:
+    grid = GridSpec(512, 512, 1.0)
+    old, new = grid.cell(256, 255), grid.cell(256, 256)
+    assert printed_half(grid, old, new) == 4
+    assert block_half(grid, old, new, 1) == 512
+    assert printed_half(grid, grid.cell(255, 255), new) == 512
+
+
+@pytest.mark.parametrize("outside", [-1, 10**6])
+def test_a_growth_for_a_target_that_was_outside_is_made_up_for_once_it_is_back(outside: int) -> None:
+    play = Play(random_pace(np.random.default_rng(3), 20, 20, 5.0, 0.1), PlannerConfig(strategy="rotation"))
+    play.tree.update(play.pace, outside, [], 0)
+    grown = play.tree.full_job(play.pace, outside, 0)()
+    assert play.tree.adopt(grown, play.pace, play.target, [], 0, np.arange(400)).kind == "full"
+    play.check()
+
+
+def test_what_got_cheaper_while_a_worker_grew_lowers_the_bounds_that_its_tree_gives() -> None:
+    """A ring road: the target in the west drives on south, so that the way around the south becomes the better one
+    for those in the east, of which the tree does not know. Their road gets cheaper while a worker grows."""
+    pace = np.full((41, 41), np.inf, np.float32)
+    pace[[10, 30], 5:36] = 10.0
+    pace[10:31, [5, 35]] = 10.0
+    play = Play(pace, PlannerConfig(strategy="rotation", k_min=0))
+    play.target = play.grid.cell(20, 5)
+    play.happen(Move(0, 0))
+    play.happen(Job("begin"))
+    pace[14:27, 35] = 1.0
+    play.since.append(Window(14, 35, 27, 36))
+    play.version += 1
+    play.tree.update(pace, play.target, play.since, play.version)
+    play.happen(Job("end"))
+    for _ in range(3):
+        play.happen(Move(1, 0))
+    assert play.last.kind == "window"
+    play.check()
+
+
+def test_a_forced_full_growth_is_a_full_growth() -> None:
+    play = Play(
+        random_pace(np.random.default_rng(4), 40, 40, 5.0, 0.1), PlannerConfig(strategy="rotation", k_min=0)
+    )
+    while play.last.kind != "window":
+        play.happen(Move(1, 1))
+    assert play.tree.force(play.pace, [0]).kind == "full"
+    assert play.tree.force(play.pace, [0]).kind == "none", "there is nothing better to be had"
+
+
+@given(st.integers(0, 63), st.integers(0, 63), st.integers(0, 63), st.integers(0, 63), st.integers(0, 5))
+def test_a_window_reaches_at_least_as_far_as_the_target_moved(a: int, b: int, c: int, d: int, k: int) -> None:
+    grid = GridSpec(64, 64, 1.0)
+    old, new = grid.cell(a, b), grid.cell(c, d)
+    window = grid.around(new, block_half(grid, old, new, k))
+    assert window.contains(a, b)
+    assert window.contains(c, d)
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_repaired_trees_equal_grown_ones_in_every_cost_and_parent(rules: dict) -> None:
+    rng = np.random.default_rng(7)
+    for trial in range(60):
+        pace = random_pace(rng, 20, 23, [1.0, 4.0, 100.0][trial % 3], 0.2)
+        play = Play(pace, PlannerConfig(strategy="full", **rules))
+        for n in range(6):
+            play.happen(Marks(trial * 100 + n, 3))
+            if not play.tree.ready:
+                break
+            fresh = Play(play.pace.copy(), play.config)
+            fresh.tree.update(fresh.pace, play.target, [], 0)
+            mine, other = play.tree._tree, fresh.tree._tree
+            np.testing.assert_array_equal(mine.inner(mine.cost), other.inner(other.cost))
+            np.testing.assert_array_equal(mine.inner(mine.parent), other.inner(other.parent))

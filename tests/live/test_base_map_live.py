@@ -1,0 +1,131 @@
+"""A machine without the terrain's file, played by a folder without it: it drives on what the keeper sends."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from live.test_by_hand import Hands
+from live.test_by_hand import hands as hands
+from rasterio.transform import from_origin
+from support.live_swarm import ask, client, swarm, write_scenario
+from support.processes import eventually
+
+from swarm.config.load import load_scenario
+from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import ROUTE
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+ROWS, COLS = 300, 280
+
+
+def write_ridge(path: Path) -> None:
+    """A hill of 300 m, as a GeoTIFF of 30 m cells."""
+    south, east = np.mgrid[0:ROWS, 0:COLS].astype(np.float32)
+    height_m = 300 * np.exp(-((south - 150) ** 2 + (east - 140) ** 2) / 2 / 60**2).astype(np.float32)
+    with rasterio.open(
+        path, "w", driver="GTiff", height=ROWS, width=COLS, count=1, dtype="float32", crs="EPSG:32632",
+        transform=from_origin(500_000, 5_000_000, 30, 30),
+    ) as out:  # fmt: skip
+        out.write(height_m, 1)
+
+
+def scenario_of_a_file(folder: Path) -> Path:
+    """The small scenario, on `ridge.tif` beside it."""
+    folder.mkdir(exist_ok=True)
+    path = folder / "small.toml"
+    text = write_scenario(folder).read_text()
+    head, rest = text.split("[terrain]")
+    hidden = rest.index("[terrain.hidden]")
+    path.write_text(f'{head}[terrain]\nsource = "ridge.tif"\n\n{rest[hidden:]}')
+    return path
+
+
+def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands: Hands) -> None:
+    here = scenario_of_a_file(hands.folder / "here")
+    write_ridge(here.parent / "ridge.tif")
+    there = hands.folder / "there" / "small.toml"
+    there.parent.mkdir()
+    there.write_text(here.read_text())
+    hands.network = load_scenario(here).network
+    endpoint = hands.network.connect[0]
+
+    hands.start("router", str(here), "--run-id", "far")
+    eventually(lambda: swarm("status", "--connect", endpoint).returncode == 0, 30, "the router")
+    impatient = there.with_name("impatient.toml")
+    impatient.write_text(there.read_text().replace("[network]", "[network]\nconnect_timeout_s = 2"))
+    told = swarm("planner", impatient, "--target", "t0", "--runs", there.parent / "runs", timeout_s=90)
+    assert told.returncode == 3
+    assert told.stderr.strip().splitlines()[-1] == (
+        f"swarm: there is no file {there.parent / 'ridge.tif'}, and the base map cannot be fetched: no keeper in "
+        "namespace swarm answered within 4 s; start one where the file is"
+    )
+
+    hands.start("keeper", str(here))
+    hands.start("targets", str(here))
+    eventually(lambda: len(hands.members()) == 3, 60, "those with the file")
+    elsewhere = hands.folder / "elsewhere"  # another machine keeps its runs elsewhere
+    for role in (("planner", "--target", "t0"), ("agent", "--id", "a0")):
+        hands.start(role[0], str(there), *role[1:], runs=elsewhere)
+    eventually(lambda: len(hands.members()) == 5, 60, "all five")
+    assert "there is no file" in hands.logs()
+    assert "terrain.json" in {path.name for path in (elsewhere / "far").iterdir()}
+
+    def is_served() -> bool:
+        with client(hands.network) as bus:
+            replies = ask(bus, ROUTE, RouteRequest(row=8, col=8), target="t0")
+        return bool(replies) and replies[0].routes[0].status is RouteStatus.OK
+
+    eventually(is_served, 60, "a route")
+    status = json.loads(swarm("status", "--connect", endpoint, "--json").stdout)
+    (agent,) = (process for process in status["processes"] if process["role"] == "agent")
+    assert agent["counts"]["payloads_dropped"] == 0
+
+    there.write_text(here.read_text() + "\n[cost]\nmax_slope_deg = 20\n")
+    told = swarm("agent", there, "--id", "a1", "--runs", there.parent / "runs", timeout_s=90)
+    assert told.returncode == 3
+    assert "are the [cost] sections of the scenarios the same?" in told.stderr
+    assert "Traceback" not in told.stderr
+
+
+def test_several_keepers_by_name_agree_and_the_second_outlives_the_first(hands: Hands) -> None:
+    scenario = str(hands.path)
+    endpoint = hands.network.connect[0]
+    hands.start("router", scenario, "--run-id", "two")
+    eventually(lambda: swarm("status", "--connect", endpoint).returncode == 0, 30, "the router")
+    first = hands.start("keeper", scenario)
+    for role in (
+        ("targets",),
+        ("planner", "--target", "t0"),
+        ("planner", "--target", "t1"),
+        ("agent", "--id", "a0"),
+    ):
+        hands.start(role[0], scenario, *role[1:])
+
+    def sets(store: str) -> dict[str, int]:
+        path = hands.folder / "runs" / "two" / store
+        told = swarm("map", "inspect", path, "--json")
+        if told.returncode:
+            return {}
+        return {author: held["marks"] for author, held in json.loads(told.stdout)["authors"].items()}
+
+    eventually(lambda: sets("map.sqlite"), 90, "marks in the first keeper's store")
+    second = hands.start("keeper", scenario, "--id", "east")
+    eventually(lambda: sets("map-east.sqlite"), 60, "marks in the second keeper's store")
+    first.kill()
+    first.wait(10)
+    before = sets("map.sqlite")
+    eventually(
+        lambda: all(sets("map-east.sqlite").get(author, 0) >= marks for author, marks in before.items()),
+        30,
+        "the second keeper to have what the first had",
+    )
+    assert second.poll() is None
+    told = swarm("keeper", scenario, "--id", "no/name", "--runs", hands.folder / "runs")
+    assert told.returncode == 2
+    assert "--id 'no/name' is not 1 to 64 of letters" in told.stderr

@@ -1,0 +1,92 @@
+"""Every role started by hand, as on several machines, and a part of a swarm that joins the rest."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.live_swarm import SWARM, ask, client, swarm, write_scenario
+from support.processes import eventually
+
+from swarm.config.load import load_scenario
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import ROUTE, RUN
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+
+class Hands:
+    """Processes started one by one."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = write_scenario(folder)
+        self.network = load_scenario(self.path).network
+        self.started: list[subprocess.Popen[str]] = []
+
+    def start(self, *arguments: str, runs: Path | None = None) -> subprocess.Popen[str]:
+        name = "-".join(arguments[:3]).replace("/", "_")
+        with (self.folder / f"{name}.log").open("w") as log:
+            process = subprocess.Popen(
+                [*SWARM, *arguments, "--runs", str(runs or self.folder / "runs")], stdout=log, stderr=log, text=True
+            )
+        self.started.append(process)
+        return process
+
+    def members(self) -> list[tuple[str, str, str]]:
+        with client(self.network) as bus:
+            return sorted((info.role, info.id, info.run_id) for info in ask(bus, RUN, Nothing(), timeout_s=1.0))
+
+    def logs(self) -> str:
+        return "\n".join(f"{path.name}:\n{path.read_text()}" for path in self.folder.glob("*.log"))
+
+
+@pytest.fixture
+def hands(tmp_path: Path) -> Iterator[Hands]:
+    hands = Hands(tmp_path)
+    yield hands
+    for process in hands.started:
+        process.kill()
+        process.wait(10)
+
+
+def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) -> None:
+    scenario = (str(hands.path),)
+    hands.start("router", *scenario, "--run-id", "by-hand")
+    eventually(lambda: swarm("status", "--connect", hands.network.connect[0]).returncode == 0, 30, "the router")
+    for role in (("keeper",), ("targets",), ("planner", "--target", "t0")):
+        hands.start(*role, *scenario)
+    eventually(lambda: len(hands.members()) == 4, 60, "all four")
+    assert {run_id for _, _, run_id in hands.members()} == {"by-hand"}
+
+    def is_served() -> bool:
+        with client(hands.network) as bus:
+            replies = ask(bus, ROUTE, RouteRequest(row=8, col=8), target="t0")
+        return bool(replies) and replies[0].routes[0].status in (RouteStatus.OK, RouteStatus.LETHAL_START)
+
+    eventually(is_served, 30, "a route")
+    part = hands.start("up", str(hands.path), "--connect", hands.network.connect[0], "--only", "agent", "--plain")
+    eventually(lambda: ("agent", "a1", "by-hand") in hands.members(), 60, "the agents")
+    told = swarm("agent", "--id", "a1", *scenario, "--runs", hands.folder / "runs")
+    assert told.returncode == 5
+    assert told.stderr.endswith("swarm: agent a1 takes part in run by-hand already; stop it first\n")
+    status = json.loads(swarm("status", "--connect", hands.network.connect[0], "--json").stdout)
+    assert status["run_id"] == "by-hand"
+    for process in (part, *reversed([p for p in hands.started if p is not part])):
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0, hands.logs()
+
+
+def test_a_role_without_a_router_says_so(hands: Hands) -> None:
+    path = hands.folder / "impatient.toml"
+    path.write_text(hands.path.read_text().replace("[network]", "[network]\nconnect_timeout_s = 1"))
+    told = swarm("keeper", path, "--runs", hands.folder / "runs")
+    assert told.returncode == 4
+    assert "cannot reach a router at" in told.stderr
+    assert "Traceback" not in told.stderr

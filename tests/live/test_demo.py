@@ -1,0 +1,54 @@
+"""The README's first command, without a screen, and what must hold of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from support.live_swarm import SWARM, LiveSwarm
+from support.processes import eventually, session_of
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+
+def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
+    command = [*SWARM, "demo", "--port", "0", "--seconds", "15", "--runs", str(tmp_path), "--json"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        out, err = process.communicate(timeout=200)
+    assert process.returncode == 0, err
+    eventually(lambda: not session_of(process.pid), 5, "the end of all")
+    (run_dir,) = tmp_path.iterdir()
+    printed, report = json.loads(out), json.loads((run_dir / "report.json").read_text())
+    assert {name: report[name] for name in printed} == printed
+    assert (report["scenario"], report["vehicles"], report["targets"]) == ("jacksboro", 100, 10)
+    assert (report["processes"], report["restarts"]) == (18, 0)
+    assert report["seconds"] == pytest.approx(15, abs=1.5)
+    assert report["vehicles_routed"] == 100
+    assert (report["collisions"], report["lethal_entries"], report["lost"]) == (0, 0, 0)
+    for name in ("captures", "marks", "reroute_requests", "routes_served", "startup_s"):
+        assert report[name] > 0, name
+    for name in ("growth_ms", "route_query_ms", "mark_to_tree_ms"):
+        assert 0 < report[name]["p50"] <= report[name]["p99"], name
+    assert 1.0 <= report["gap"]["mean"] <= report["gap"]["max"] < 1.5
+    assert report["payloads_dropped"] == 0
+    for name in ("run.rrd", "report.png", "router-0.log", "monitor-0.log", "agent-a3.log", "planner-t9.log"):
+        assert (run_dir / name).stat().st_size > 0, name
+    assert "live view: http://127.0.0.1:" in err
+
+
+def test_kill_9_of_the_launcher_leaves_no_process_of_the_swarm(tmp_path: Path) -> None:
+    live = LiveSwarm(tmp_path)
+    try:
+        live.wait_until_up()
+        assert len(session_of(live.process.pid)) == 11  # launcher, tracker, forkserver, eight roles
+        os.kill(live.process.pid, signal.SIGKILL)
+        live.process.wait()
+        eventually(lambda: not session_of(live.process.pid), 8, "the end of all")
+    finally:
+        live.kill()

@@ -1,0 +1,126 @@
+"""kill -9 of a keeper process at random instants under load, over real zenoh: what its digests acknowledged is in
+its file. By hand, more often: `python tests/live/test_keeper_kill.py 200`."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import random
+import signal
+import socket
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared_map.keeper.service import KeeperService
+from shared_map.keeper.store import KeeperStore
+from shared_map.replication.marks import Statements, mark_set
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import Event, Heard
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.clock import MonotonicClock
+from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.marks import DIGEST_ROW, FOLDS, Digest
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import DIGEST, MARKS
+
+SIDE = 256
+TILES = 64
+PER_TILE = 20
+
+
+def keeper_process(endpoint: str, path: str) -> None:
+    network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
+    setup = RoleSetup(
+        Scenario(network=network, map=MapConfig(digest_s=0.05)), "run", "keeper", "k", time.time_ns(), 0
+    )
+    terrain = terrain_of_pace(np.ones((SIDE, SIDE), np.float32))
+    with KeeperStore(path) as store, open_bus(network) as bus:
+        inbox = Inbox()
+        Process(KeeperService(setup, terrain, bus, inbox.post, store), inbox, MonotonicClock(), tick_hz=50).run()
+
+
+class Load:
+    """An author that puts sets as fast as it can and notes what the keeper acknowledged."""
+
+    def __init__(self, bus: ZenohBus) -> None:
+        self.acknowledged: dict[int, int] = {}
+        self.put = 0
+        self._bus = bus
+        bus.subscribe(DIGEST, self._hear)
+
+    def _hear(self, event: Event) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Digest):
+            for rows in event.message.held.values():
+                for tile, _, seq in np.frombuffer(rows, DIGEST_ROW).tolist():
+                    self.acknowledged[tile] = max(seq, self.acknowledged.get(tile, 0))
+
+    def run(self, until_s: float) -> None:
+        cells = np.arange(PER_TILE, dtype=np.uint16)
+        kinds = np.full(PER_TILE, MarkKind.LETHAL, np.uint8)
+        paces = np.zeros(PER_TILE, np.float32)
+        while time.monotonic() < until_s:
+            for tile in range(TILES):
+                self.put += 1
+                stamps = np.full(PER_TILE, self.put, np.int64)
+                each = mark_set("load.1", "all", tile, 1, self.put * FOLDS, Statements(cells, kinds, paces, stamps))
+                self._bus.publish(MARKS, each, region=0, tile=tile, author="load.1")
+            time.sleep(0.002)
+
+
+def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
+    """Kill a keeper so often; returns how much was put, acknowledged and lost."""
+    chance = random.Random(seed)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
+    spawning = multiprocessing.get_context("forkserver")
+    spawning.set_forkserver_preload([__name__ if __name__ != "__main__" else "test_keeper_kill"])
+    path = folder / "map.sqlite"
+    found = {"rounds": rounds, "sets_put": 0, "acknowledgements": 0, "lost": 0}
+    with open_bus(network, mode="router"), open_bus(network) as bus:
+        load = Load(bus)
+        for _ in range(rounds):
+            before = dict(load.acknowledged)
+            child = spawning.Process(target=keeper_process, args=(endpoint, str(path)))
+            child.start()
+            deadline = time.monotonic() + 30
+            while load.acknowledged == before:
+                load.run(time.monotonic() + 0.02)
+                assert child.is_alive(), f"the keeper ended by itself: {child.exitcode}"
+                assert time.monotonic() < deadline, "the keeper acknowledges nothing"
+            load.run(time.monotonic() + chance.random() * 0.3)
+            assert child.pid is not None
+            os.kill(child.pid, signal.SIGKILL)
+            child.join()
+            time.sleep(0.05)  # for digests under way: what they acknowledge counts as well
+            acknowledged = dict(load.acknowledged)
+            with KeeperStore(path) as store:
+                on_disk = {}
+                for each in store.load():
+                    on_disk[each.tile] = each.seq
+            found["acknowledgements"] += sum(acknowledged[t] != before.get(t) for t in acknowledged)
+            found["lost"] += sum(on_disk.get(tile, -1) < seq for tile, seq in acknowledged.items())
+        found["sets_put"] = load.put
+    return found
+
+
+@pytest.mark.network
+def test_what_was_acknowledged_survives_kill_9_of_the_keeper_at_any_instant(tmp_path: Path) -> None:
+    found = kill_rounds(4, tmp_path)
+    assert found["lost"] == 0
+    assert found["acknowledgements"] >= 4 * TILES // 2
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as name:
+        sys.stdout.write(json.dumps(kill_rounds(int(sys.argv[1]), Path(name))) + "\n")

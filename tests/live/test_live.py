@@ -1,0 +1,177 @@
+"""One small swarm of real processes, and all that may happen to it. The tests build on each other's order."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.live_swarm import LiveSwarm, ask, client, swarm
+from support.processes import eventually, session_of
+
+from swarm.bus.zenoh_bus import ZenohBus
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import ALIVE_KEY, ROUTE, RUN, TOPICS
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
+    live = LiveSwarm(tmp_path_factory.mktemp("live"))
+    try:
+        live.wait_until_up()
+        yield live
+    finally:
+        live.kill()
+
+
+@pytest.fixture
+def bus(live: LiveSwarm) -> Iterator[ZenohBus]:
+    with client(live.network) as bus:
+        yield bus
+
+
+def served_cell(bus: ZenohBus, target: str = "t0") -> tuple[int, int]:
+    """A cell from which there is a way to the target, by asking along the diagonal."""
+    for n in range(4, 92, 4):
+        (reply,) = ask(bus, ROUTE, RouteRequest(row=n, col=n), target=target)
+        if reply.routes[0].status is RouteStatus.OK:
+            return n, n
+    raise AssertionError("no route from anywhere")
+
+
+def incarnation(bus: ZenohBus, row: int, col: int) -> int | None:
+    """Of the planner that serves a route now; None if nobody does."""
+    for reply in ask(bus, ROUTE, RouteRequest(row=row, col=col), timeout_s=0.5, target="t0"):
+        if reply.routes[0].status is RouteStatus.OK:
+            return int(reply.incarnation)
+    return None
+
+
+def test_everybody_answers_with_the_same_run_and_terrain(live: LiveSwarm, bus: ZenohBus) -> None:
+    members = ask(bus, RUN, Nothing())
+    roles = sorted((info.role, info.id) for info in members)
+    assert roles == [
+        *(("agent", "a0"), ("agent", "a1"), ("keeper", "0"), ("monitor", "0")),
+        *(("planner", "t0"), ("planner", "t1"), ("router", "0"), ("targets", "0")),
+    ]
+    assert len({(info.run_id, info.terrain) for info in members}) == 1
+
+
+def test_a_person_asks_for_a_route_and_for_the_status(live: LiveSwarm, bus: ZenohBus) -> None:
+    row, col = served_cell(bus)
+    told = swarm("route", "--target", "t0", "--row", row, "--col", col, "--connect", live.endpoint)
+    assert told.returncode == 0, told.stderr
+    assert f"from row {row}, col {col} to t0 in " in told.stdout
+    told = swarm("route", "--target", "t0", "--row", row, "--col", col, "--connect", live.endpoint, "--json")
+    assert json.loads(told.stdout)["routes"][0]["cells_row_col"][0] == [row, col]
+    place = ("--target", "t0", "--row", row, "--col", col, "--connect", live.endpoint)
+    told = swarm("route", *place, "--steps", 1)
+    assert "\n1 steps, " in told.stdout or "\n0 steps, " in told.stdout  # there already
+    told = swarm("route", *place, "--cost")
+    assert told.stdout.startswith(f"from row {row}, col {col} to t0 in ")
+    assert told.stdout.count("\n") == 1
+    told = swarm("route", "--target", "t0", "--row", 4000, "--col", 1, "--connect", live.endpoint)
+    assert told.stdout.startswith("outside: ")
+    told = swarm("route", "--target", "t7", "--row", row, "--col", col, "--connect", live.endpoint)
+    assert (told.returncode, told.stdout) == (4, "")
+    assert told.stderr.startswith("swarm: no planner of target 't7' answers")
+    status = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)
+    assert len(status["processes"]) == 8
+    assert [planner["target"] for planner in status["planners"]] == ["t0", "t1"]
+    assert "planner-t1" in swarm("status", "--connect", live.endpoint).stdout
+
+
+def test_any_zenoh_session_gets_a_readable_route(live: LiveSwarm, bus: ZenohBus) -> None:
+    row, col = served_cell(bus)
+    (reply,) = bus.session.get(f"swarm/target/t0/route?format=json;row={row};col={col}")
+    assert json.loads(reply.ok.payload.to_string())["routes"][0]["status"] == "ok"
+
+
+def test_garbage_on_every_key_is_counted_and_dropped(live: LiveSwarm, bus: ZenohBus) -> None:
+    garbage = (b"", b"\xc1", b"\x00" * 4000, b"\xff" * 17, b"\x80", b'{"schema": "run/1"}', b"\xdd\xff\xff\xff\xff")
+    fields = {name: "0" for topic in TOPICS for name in topic.fields} | {"target": "t0", "agent": "a0"}
+    for topic in TOPICS:
+        key = topic.keyed("swarm", **{name: fields[name] for name in topic.fields})
+        for payload in garbage:
+            bus.session.put(key, payload)
+            if topic.request is not None:
+                list(bus.session.get(topic.expression("swarm"), payload=payload, timeout=1.0))
+    bus.session.put(f"swarm/{ALIVE_KEY.format(role='agent', id='a0', incarnation='soon')}", b"")
+    token = bus.session.liveliness().declare_token("swarm/alive/agent/a9/yesterday")
+    time.sleep(2.5)
+    token.undeclare()
+    status = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)
+    dropped = {f"{p['role']}-{p['id']}": p["counts"]["payloads_dropped"] for p in status["processes"]}
+    assert all(count > 0 for count in dropped.values()), dropped
+    assert live.said("0 restarts")
+    assert not live.said("starts again")
+
+
+def test_a_second_swarm_in_the_namespace_is_refused_and_the_first_goes_on(live: LiveSwarm, tmp_path: Path) -> None:
+    told = swarm("up", live.path, "--connect", live.endpoint, "--runs", tmp_path, "--plain")
+    assert told.returncode == 5, told.stdout + told.stderr
+    assert "belongs to run" in told.stderr
+    assert told.stderr.count("\n") == 1
+    assert not live.said("starts again")
+
+
+def test_a_second_router_on_the_port_is_refused(live: LiveSwarm, tmp_path: Path) -> None:
+    told = swarm("up", live.path, "--runs", tmp_path, "--plain")
+    assert told.returncode == 4
+    assert "is taken; choose others with --port" in told.stderr
+
+
+def test_another_terrain_in_the_namespace_is_refused(live: LiveSwarm, tmp_path: Path) -> None:
+    other = tmp_path / "other.toml"
+    text = live.path.read_text().replace("relief_m = 300", "relief_m = 310").replace("count = 2", "count = 3")
+    other.write_text(text)
+    told = swarm("planner", "--target", "t2", other, "--connect", live.endpoint, "--runs", tmp_path)
+    assert told.returncode == 5, told.stderr
+    assert "terrain files or cost rules differ" in told.stderr
+    assert "Traceback" not in told.stderr
+
+
+def test_a_planner_killed_with_9_serves_routes_again_within_3_s(live: LiveSwarm, bus: ZenohBus) -> None:
+    row, col = served_cell(bus)
+    before = incarnation(bus, row, col)
+    os.kill(live.pid_of("planner-t0"), signal.SIGKILL)
+    began_s = time.monotonic()
+    eventually(lambda: incarnation(bus, row, col) not in (None, before), 10, "a route from the new planner")
+    assert time.monotonic() - began_s <= 3.0
+    eventually(lambda: live.said("planner-t0: killed by SIGKILL; starts again in 0.2 s"), 5)
+
+
+def test_a_router_killed_with_9_comes_back_and_the_swarm_goes_on(live: LiveSwarm, bus: ZenohBus) -> None:
+    row, col = served_cell(bus)
+    os.kill(live.pid_of("router-0"), signal.SIGKILL)
+    eventually(lambda: live.said("router-0: killed by SIGKILL"), 5)
+    eventually(lambda: incarnation(bus, row, col), 10, "a route through the new router")
+    eventually(lambda: len(ask(bus, RUN, Nothing())) == 8, 10, "everybody")
+
+
+def test_an_agent_killed_with_9_goes_on_with_its_vehicles(live: LiveSwarm, bus: ZenohBus) -> None:
+    os.kill(live.pid_of("agent-a0"), signal.SIGKILL)
+    eventually(lambda: live.said("agent-a0: killed by SIGKILL"), 5)
+    eventually(lambda: len(ask(bus, RUN, Nothing())) == 8, 10, "everybody")
+
+
+def test_a_ctrl_c_ends_all_in_order_and_leaves_the_report(live: LiveSwarm) -> None:
+    time.sleep(3.0)
+    assert live.end() == 0, live.output.read_text()
+    report = json.loads((live.run_dir / "report.json").read_text())
+    assert report["restarts"] == 3
+    assert report["startup_s"] > 0
+    assert (report["collisions"], report["lethal_entries"]) == (0, 0)
+    assert report["vehicles_routed"] == 12
+    assert report["payloads_dropped"] > 0
+    for name in ("report.png", "run.rrd", "router-0.log", "planner-t1.log", "launcher.log"):
+        assert (live.run_dir / name).stat().st_size > 0
+    eventually(lambda: not session_of(live.process.pid), 5, "the end of all")

@@ -1,0 +1,140 @@
+"""What a person sees: the live view in a real browser, and in rerun's own viewer."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import os
+import subprocess
+import time
+import urllib.parse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from numpy.typing import NDArray
+from support.devtools import CHROMIUM, Browser, BrowserError
+from support.fake_run import fake_run
+from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
+
+from launch_scripts.monitor.blueprint import BACKGROUND
+from launch_scripts.monitor.web import viewer_program
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+SIZE = (1280, 800)
+VULKAN = [path for folder in ("/usr/share", "/etc") for path in Path(folder, "vulkan/icd.d").glob("*.json")]
+
+
+@pytest.fixture(scope="module")
+def shown() -> Iterator[Rig]:
+    """A run that was, and a monitor that still serves it."""
+    scenario, terrain = little_scenario(), little_terrain()
+    rig = Rig(scenario, terrain, None, config=LIVE)
+    rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
+    yield rig
+    rig.close()
+
+
+def seen(picture: bytes) -> dict[str, int]:
+    """Pixels of the 3D view by what they show; small things are small."""
+    pixels: NDArray[np.int_] = (imread(io.BytesIO(picture), format="png")[..., :3] * 255).astype(int)
+    view = pixels[40:-60, : round(pixels.shape[1] * 0.68)]
+    red, green, blue = view[..., 0], view[..., 1], view[..., 2]
+    background = (np.abs(view - np.array(BACKGROUND)) < 12).all(axis=-1)
+    return {
+        "background": int(background.sum()),
+        "ground": int((~background).sum()),
+        "vehicles": int(((green > 150) & (green > red + 60) & (green > blue + 30)).sum()),
+        "targets": int(((red > 150) & (red > green + 80) & (red > blue + 80)).sum()),
+    }
+
+
+def complete(picture: bytes) -> bool:
+    counts = seen(picture)
+    return (
+        counts["background"] > 10_000
+        and counts["ground"] > 30_000
+        and counts["vehicles"] > 20
+        and counts["targets"] > 20
+    )
+
+
+def until_complete(screenshot: Callable[[], bytes], folder: Path, within_s: float) -> bytes:
+    deadline_s = time.monotonic() + within_s
+    while True:
+        picture = b""
+        with contextlib.suppress(BrowserError):
+            picture = screenshot()
+        if picture and complete(picture):
+            return picture
+        if time.monotonic() > deadline_s:
+            (folder / "last.png").write_bytes(picture)
+            pytest.fail(f"after {within_s:g} s the view is not complete; see {folder / 'last.png'}")
+        time.sleep(1.0)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
+def test_a_browser_shows_the_ground_green_vehicles_and_red_targets_and_asks_nobody_else(
+    shown: Rig, tmp_path: Path
+) -> None:
+    assert shown.outlets.live_url is not None
+    browser = Browser(tmp_path / "profile", SIZE)
+    try:
+        browser.open(shown.outlets.live_url)
+        until_complete(browser.screenshot, tmp_path, within_s=200)
+        hosts = {urllib.parse.urlparse(url).hostname for url in browser.reached if url.startswith("http")}
+        assert hosts == {"127.0.0.1"}
+        elsewhere = [url for url in browser.requested if url.startswith("http") and "//127.0.0.1" not in url]
+        assert sorted(elsewhere) == sorted(browser.refused), "what wants out is stopped by the page's policy"
+    finally:
+        browser.close()
+
+
+@pytest.mark.skipif(not VULKAN, reason="needs a Vulkan driver: apt-get install mesa-vulkan-drivers")
+@pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="needs rerun's viewer")
+def test_the_native_viewer_shows_the_same(shown: Rig, tmp_path: Path) -> None:
+    from rerun.experimental import ViewerClient
+
+    location = shown.outlets.stream_url
+    assert location is not None
+    port = free_port()
+    viewer = subprocess.Popen(
+        [viewer_program(), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1280x800",
+         location],
+        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path), "CI": "1", "RUST_LOG": "error"},
+    )  # fmt: skip
+    try:
+        client = connected(ViewerClient, f"rerun+http://127.0.0.1:{port}/proxy")
+
+        def screenshot() -> bytes:
+            client.save_screenshot(str(tmp_path / "view.png"))
+            return (tmp_path / "view.png").read_bytes()
+
+        until_complete(screenshot, tmp_path, within_s=100)
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+def connected(client_type: Any, url: str) -> Any:
+    deadline_s = time.monotonic() + 30
+    while True:
+        try:
+            return client_type.connect(url)
+        except Exception:  # it says so in many ways that nobody listens yet
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(0.2)
+
+
+def free_port() -> int:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

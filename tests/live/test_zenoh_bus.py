@@ -1,0 +1,254 @@
+"""Real sessions through a real router do what every bus does, and what only a real one can."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import zenoh
+from support.bus_behaviour import *  # noqa: F403
+from support.bus_behaviour import Box, answering, asked, pose, run_info
+
+from swarm.bus.bus import Asked, AskEnded, Heard, LinkChanged, Replied
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.config.scenario import NetworkConfig
+from swarm.errors import BusError
+from swarm.wire.codec import encode
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.planning import CostReply, CostRequest
+from swarm.wire.topics import COST, POSE, RUN, Topic
+
+pytestmark = pytest.mark.network
+
+ROUTER = """
+import sys
+from swarm.config.scenario import NetworkConfig
+from swarm.bus.zenoh_bus import open_bus
+with open_bus(NetworkConfig(listen=(sys.argv[1],)), mode="router"):
+    print("up", flush=True)
+    sys.stdin.read()
+"""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Router:
+    """A router in a process of its own, to be killed, stalled and started again."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.endpoint = endpoint
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", ROUTER, self.endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == b"up\n"
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+
+class ZenohWorld:
+    def __init__(self, router: Router) -> None:
+        self.router = router
+        self.buses: list[ZenohBus] = []
+
+    def network(self, namespace: str = "swarm", lease_s: float = 1.0) -> NetworkConfig:
+        return NetworkConfig(namespace=namespace, connect=(self.router.endpoint,), lease_s=lease_s)
+
+    def bus(self, name: str, namespace: str = "swarm") -> ZenohBus:
+        self.buses.append(open_bus(self.network(namespace)))
+        return self.buses[-1]
+
+    def put_bytes(self, bus: ZenohBus, topic: Topic, payload: bytes, **fields: str) -> None:
+        bus.session.put(topic.keyed(bus.namespace, **fields), payload)
+
+    def until(self, true: Callable[[], object], within_s: float = 5.0) -> None:
+        deadline_s = time.monotonic() + within_s
+        while not true():
+            assert time.monotonic() < deadline_s, f"not within {within_s} s"
+            time.sleep(0.005)
+
+    def settle(self) -> None:
+        time.sleep(0.15)
+
+    def cut(self, bus: ZenohBus) -> None:
+        self.router.kill()
+
+    def heal(self, bus: ZenohBus) -> None:
+        self.router.start()
+
+    def close(self) -> None:
+        for bus in self.buses:
+            bus.close()
+        if self.router.process.poll() is not None:
+            self.router.start()
+
+
+@pytest.fixture(scope="module")
+def router() -> Iterator[Router]:
+    router = Router(f"tcp/127.0.0.1:{free_port()}")
+    yield router
+    router.kill()
+
+
+@pytest.fixture
+def world(router: Router) -> Iterator[ZenohWorld]:
+    world = ZenohWorld(router)
+    yield world
+    world.close()
+
+
+def serve_cost(bus: ZenohBus, requests: list[CostRequest]) -> None:
+    reply = CostReply(
+        target="t0", incarnation=1, target_cell=3, map_version=1, tree_age_ms=1.0,
+        cost_to_go_s=pack_column([2.5, float("inf")], "<f4"),
+    )  # fmt: skip
+
+    def post(event: object) -> None:
+        assert isinstance(event, Asked)
+        requests.append(event.request)
+        event.answer(reply)
+        event.end()
+
+    bus.serve(COST, post, target="t0")
+
+
+def test_any_zenoh_session_gets_a_readable_answer(world):
+    requests: list[CostRequest] = []
+    serve_cost(world.bus("planner"), requests)
+    stranger = world.bus("stranger").session
+    world.settle()
+    replies = list(stranger.get("swarm/target/*/cost?row=4;col=5;format=json", timeout=2.0))
+    assert [str(reply.ok.key_expr) for reply in replies] == ["swarm/target/t0/cost"]
+    assert json.loads(replies[0].ok.payload.to_bytes())["cost_to_go_s"] == [2.5, None]
+    assert replies[0].ok.encoding == zenoh.Encoding.APPLICATION_JSON
+    assert requests == [CostRequest(row=4, col=5)]
+
+
+def test_a_query_for_everything_is_answered_and_harms_nobody(world):
+    """`**` fits no template: the thread that serves must survive it."""
+    requests: list[CostRequest] = []
+    serve_cost(world.bus("planner"), requests)
+    stranger = world.bus("stranger").session
+    world.settle()
+    for expression in ("**", "swarm/**", "swarm/target/**/cost", "swarm/target/t0/cost"):
+        replies = list(stranger.get(expression, timeout=2.0))
+        assert [str(reply.ok.key_expr) for reply in replies] == ["swarm/target/t0/cost"], expression
+    assert len(requests) == 4
+
+
+def test_a_bad_request_is_refused_in_words_and_counted(world):
+    requests: list[CostRequest] = []
+    planner = world.bus("planner")
+    serve_cost(planner, requests)
+    stranger = world.bus("stranger").session
+    world.settle()
+    for selector, payload, complaint in (
+        ("swarm/target/t0/cost?rwo=4", None, b"unknown parameter 'rwo'"),
+        ("swarm/target/t0/cost?row=4", None, b"both row and col"),
+        ("swarm/target/t0/cost", b"garbage", b"cost: "),
+        ("swarm/target/t0/cost", encode(Nothing()), b"schema"),
+    ):
+        (reply,) = stranger.get(selector, payload=payload, timeout=2.0)
+        assert complaint in reply.err.payload.to_bytes()
+    assert requests == []
+    assert planner.counts["payloads_dropped"] == 4
+
+
+def test_garbage_is_logged_once_per_key(world, caplog):
+    a, b, box = world.bus("a"), world.bus("b"), Box()
+    b.subscribe(POSE, box)
+    world.settle()
+    for _ in range(20):
+        world.put_bytes(a, POSE, b"garbage", target="t0")
+        world.put_bytes(a, POSE, b"garbage", target="t1")
+    world.until(lambda: b.counts["payloads_dropped"] == 40)
+    told = [record.getMessage() for record in caplog.records if "dropped" in record.getMessage()]
+    assert len(told) == 2
+    assert told[0].startswith("dropped a payload on swarm/target/t0/pose")
+
+
+def test_a_router_killed_and_started_again_is_found_by_everybody(world):
+    a, b = world.bus("a"), world.bus("b")
+    links, heard = Box(), Box()
+    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    a.watch_links(links)
+    a.subscribe(POSE, heard)
+    world.settle()
+    for times in (1, 2):
+        world.router.kill()
+        world.until(lambda: links[-1:] == [LinkChanged(False)])
+        world.router.start()
+        world.until(lambda: links[-1:] == [LinkChanged(True)], within_s=10)
+        world.until(lambda: asked(world, a, RUN, Nothing()).of(Replied), within_s=10)
+        b.publish(POSE, pose(seq=times), target="t0")
+        world.until(lambda times=times: len(heard) == times)
+        assert heard[-1] == Heard(POSE, {"target": "t0"}, pose(seq=times))
+
+
+def test_closing_takes_seconds_at_most_though_the_router_hangs(world):
+    a, links = world.bus("a"), Box()
+    a.watch_links(links)
+    a.watch_alive(Box())
+    a.serve(RUN, Box(), role="agent", id="a")
+    world.settle()
+    os.kill(world.router.process.pid, signal.SIGSTOP)
+    try:
+        world.until(lambda: LinkChanged(False) in links)
+        world.until(lambda: len(asked(world, a, RUN, Nothing(), timeout_s=0.2).of(AskEnded)) == 1)
+        began_s = time.monotonic()
+        a.close()
+        assert time.monotonic() - began_s < 4.0
+    finally:
+        os.kill(world.router.process.pid, signal.SIGCONT)
+
+
+def test_nobody_to_reach_is_a_sentence(world):
+    network = NetworkConfig(connect=(f"tcp/127.0.0.1:{free_port()}",), connect_timeout_s=0.3)
+    with pytest.raises(
+        BusError, match=r"cannot reach a router at tcp/127.0.0.1:\d+: .*is `swarm router` running there"
+    ):
+        open_bus(network)
+
+
+def test_a_port_that_is_taken_is_a_sentence(world):
+    network = NetworkConfig(listen=(world.router.endpoint,))
+    with pytest.raises(BusError, match=r"cannot listen on tcp/127.0.0.1:\d+: .*is the port taken"):
+        open_bus(network, mode="router")
+
+
+def test_a_slow_reader_keeps_the_newest_and_nobody_waits(world):
+    a, b = world.bus("a"), world.bus("b")
+    seen: list[int] = []
+
+    def slow(event: object) -> None:
+        assert isinstance(event, Heard)
+        time.sleep(0.002)
+        seen.append(event.message.seq)
+
+    b.subscribe(POSE, slow)
+    world.settle()
+    began_s = time.monotonic()
+    for seq in range(5000):
+        a.publish(POSE, pose(seq=seq), target="t0")
+    assert time.monotonic() - began_s < 5.0
+    world.until(lambda: seen and seen[-1] == 4999, within_s=30)
+    assert seen == sorted(seen)
+    assert len(seen) < 5000

@@ -1,0 +1,268 @@
+"""zenohd and its storage-manager plugin as router and store. Opt-in: `ZENOHD=/opt/zenohd pytest -m zenohd`, or
+zenohd on PATH with the plugin beside it; `docs/deploy.md` says how to install them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.processes import eventually
+
+from launch_scripts.deploy.certificates import issue
+from launch_scripts.deploy.zenohd import zenohd_config
+from launch_scripts.launcher.options import free_ports, listening
+from shared_map.replication.marks import mark_set, statements
+from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.sync import MapFeed
+from swarm.bus.bus import Asked, Event, Replied
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.clock import MonotonicClock
+from swarm.config.scenario import MapConfig, NetworkConfig, TlsConfig
+from swarm.errors import BusError
+from swarm.grid import GridSpec
+from swarm.runtime.inbox import Inbox
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.marks import FOLDS, Digest
+from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.vehicles import Claims
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import CLAIMS, DIGEST, MARKS, STATS
+
+pytestmark = [pytest.mark.network, pytest.mark.zenohd]
+
+PLUGIN = "libzenoh_plugin_storage_manager.so"
+GRID = GridSpec(256, 256, 10.0)
+
+
+def installed() -> tuple[str, str]:
+    """(zenohd, folder of the plugin); skips where there is none."""
+    root = os.environ.get("ZENOHD")
+    found = shutil.which("zenohd", path=None if root is None else str(Path(root) / "bin"))
+    if found is None:
+        pytest.skip("there is no zenohd on PATH, and ZENOHD names no folder with bin/zenohd")
+    for folder in (Path(found).parent, Path(found).parents[1] / "lib"):
+        if (folder / PLUGIN).is_file():
+            return found, str(folder)
+    pytest.skip(f"there is a zenohd, but no {PLUGIN} beside it or in ../lib")
+
+
+class Router:
+    """zenohd, under way."""
+
+    def __init__(self, folder: Path, network: NetworkConfig, **names: list[str]) -> None:
+        zenohd, plugins = installed()
+        self.network = network
+        config = folder / "zenohd.json5"
+        config.write_text(json.dumps(zenohd_config(network, plugins=plugins, **names)))
+        self.log = folder / "zenohd.log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen([zenohd, "-c", str(config)], stdout=log, stderr=log)
+        eventually(lambda: listening(network.listen[0]), 20, "zenohd to listen")
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.wait(10)
+
+
+class Participant:
+    """One process's part in the map, driven by hand."""
+
+    def __init__(self, bus: ZenohBus, author: str | None = None) -> None:
+        self.bus = bus
+        self.replica = MapReplica(GRID, author=author)
+        self.inbox = Inbox()
+        self.clock = MonotonicClock()
+        self.feed = MapFeed(self.replica, bus, self.inbox.post, MapConfig(), "agent" if author else "planner")
+        self.feed.start(self.clock.now_ns())
+
+    def run(self, seconds: float) -> None:
+        until_s = time.monotonic() + seconds
+        while time.monotonic() < until_s:
+            event = self.inbox.take(0.01)
+            if event is not None:
+                self.feed.handle(event, self.clock.now_ns())
+            self.feed.tick(self.clock.now_ns())
+
+    def write(self, cells: object, kind: MarkKind) -> None:
+        self.feed.publish(self.replica.write(np.asarray(cells), kind, 0.0, time.time_ns()))
+
+
+@pytest.fixture
+def router(tmp_path: Path) -> Iterator[Router]:
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    router = Router(tmp_path, NetworkConfig(listen=(endpoint,), connect=(endpoint,)))
+    yield router
+    router.stop()
+
+
+def test_who_comes_late_gets_everything_from_the_storages_of_zenohd_alone(router: Router) -> None:
+    authors = {}
+    for name in ("a0.1", "red.a1.1"):
+        with open_bus(router.network) as bus:
+            author = Participant(bus, name)
+            author.run(0.3)
+            author.write(np.arange(0, GRID.cells, 11 if name == "a0.1" else 13), MarkKind.LETHAL)
+            author.run(1.5)
+            author.write(np.arange(0, GRID.cells, 22), MarkKind.CLEAR)
+            author.run(1.5)
+            # Zenoh drops puts where a link is congested, and a storage tells nobody what it has: without a keeper,
+            # which would ask again, what was dropped is only there if it is said again.
+            for tile in author.replica.tiles:
+                own = [PublishSet(each) for each in author.replica.sets(tile) if each.author == name]
+                author.feed.publish(own)
+                author.run(0.01)
+            authors[name] = author
+    with open_bus(router.network) as bus:  # nobody else is left
+        late = Participant(bus)
+        eventually(lambda: late.run(0.2) or late.feed.joined, 20, "the late join")
+        assert sum(len(late.replica.sets(tile)) for tile in late.replica.tiles) == 2 * GRID.tiles
+        for name, author in authors.items():
+            own = {tile: each for tile in author.replica.tiles for each in author.replica.sets(tile)}
+            for tile in late.replica.tiles:
+                for each in late.replica.sets(tile):
+                    if each.author == name:
+                        assert (each.epoch, each.seq, each.cells) == (
+                            own[tile].epoch,
+                            own[tile].seq,
+                            own[tile].cells,
+                        )
+
+
+def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_is_applied(router: Router) -> None:
+    """The storage goes by the time of arrival; replicas go by (epoch, seq)."""
+    everything = statements(mark_set("a0.1", "all", 0, 1, 0, MapReplica(GRID).winners(0)))
+    newer, older = (mark_set("a0.1", "all", 0, 1, n * FOLDS, everything) for n in (5, 2))
+    with open_bus(router.network) as bus:
+        replica = Participant(bus)
+        replica.run(0.5)
+        for each in (newer, older):
+            bus.publish(MARKS, each, region=0, tile=0, author="a0.1")
+            replica.run(0.3)
+        late = Participant(bus)
+        late.run(2.0)
+        assert [each.seq for each in late.replica.sets(0)] == [2 * FOLDS]  # what the storage has
+        assert [each.seq for each in replica.replica.sets(0)] == [5 * FOLDS]
+        bus.publish(MARKS, newer, region=0, tile=0, author="a0.1")  # as the author or a keeper says it again
+        late.run(0.5)
+        assert [each.seq for each in late.replica.sets(0)] == [5 * FOLDS]
+
+
+def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_nothing(tmp_path: Path) -> None:
+    certs = tmp_path / "certs"
+    for name, hosts in (
+        ("router", ["127.0.0.1", "localhost"]),
+        ("keeper", []),
+        ("blue.a0", []),
+        ("red.a1", []),
+        ("x", []),
+    ):
+        issue(certs, name, hosts, 2)
+    endpoint = f"tls/localhost:{free_ports(1)[0]}"
+
+    def network(name: str) -> NetworkConfig:
+        files = TlsConfig(
+            ca=str(certs / "ca.pem"), certificate=str(certs / f"{name}.pem"), key=str(certs / f"{name}.key")
+        )
+        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=files)
+
+    router = Router(tmp_path, network("router"), trusted=["keeper", "router"], agents=["blue.a0", "red.a1"])
+    try:
+        with (
+            open_bus(network("keeper")) as trusted,
+            open_bus(network("blue.a0")) as own,
+            open_bus(network("x")) as stranger,
+        ):
+            heard: list[str] = []
+            trusted.subscribe(DIGEST, lambda event: heard.append(event.message.author))  # type: ignore[union-attr]
+            listener = Participant(trusted)
+            author = Participant(own, "blue.a0.1")
+            listener.run(0.5)
+            author.write([1, 2, 3], MarkKind.LETHAL)
+            forged = mark_set("red.a1.1", "all", 0, 1, FOLDS, statements(author.replica.sets(0)[0]))
+            for bus in (own, stranger):
+                bus.publish(MARKS, forged, region=0, tile=0, author="red.a1.1")
+                bus.publish(DIGEST, Digest(author="red.a1.1", role="agent", held={}), author="red.a1.1")
+                stats = Stats(role="agent", id="a1", incarnation=1, stamp_ns=1, counts={}, gauges={}, histograms={})
+                bus.publish(STATS, stats, role="agent", id="a1")
+            for _ in range(10):
+                author.run(0.1)
+                listener.run(0.1)
+            assert list(listener.replica.digest()) == ["blue.a0.1"]
+            assert set(heard) == {"blue.a0.1"}
+            spy = Participant(stranger)
+            spy.run(1.5)
+            assert spy.replica.digest() == {}
+        with open_bus(network("keeper")) as trusted:
+            late = Participant(trusted)
+            eventually(lambda: late.run(0.2) or late.replica.digest(), 10, "the storage's answer")
+            assert list(late.replica.digest()) == ["blue.a0.1"]
+    finally:
+        router.stop()
+
+
+def test_with_certificates_an_agent_that_starts_again_is_told_where_its_vehicles_stood(tmp_path: Path) -> None:
+    certs = tmp_path / "certs"
+    for name, hosts in (("router", ["127.0.0.1", "localhost"]), ("all.a0", []), ("all.a1", [])):
+        issue(certs, name, hosts, 2)
+    endpoint = f"tls/localhost:{free_ports(1)[0]}"
+
+    def network(name: str) -> NetworkConfig:
+        files = (str(certs / file) for file in ("ca.pem", f"{name}.pem", f"{name}.key"))
+        tls = TlsConfig(**dict(zip(("ca", "certificate", "key"), files, strict=True)))
+        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=tls)
+
+    def claims(agent: str) -> Claims:
+        return Claims(agent=agent, incarnation=1, seq=3, clock=0, holds={f"{agent}-00": [7]}, wants=[], seen={})
+
+    def answer(event: Event) -> None:
+        assert isinstance(event, Asked)
+        for agent in ("a0", "a1"):
+            event.answer(claims(agent), agent=agent)
+        event.end()
+
+    router = Router(tmp_path, network("router"), trusted=["router"], agents=["all.a0", "all.a1"])
+    try:
+        with open_bus(network("all.a0")) as neighbour, open_bus(network("all.a1")) as starting:
+            neighbour.serve(CLAIMS, answer)
+            heard: list[Event] = []
+
+            def told() -> list[Claims]:
+                starting.ask(CLAIMS, Nothing(), heard.append, tag="claims", timeout_s=1.0)
+                time.sleep(0.3)
+                return [event.message for event in heard if isinstance(event, Replied)]
+
+            eventually(lambda: claims("a1") in told(), 5, "the last words of the agent that starts again")
+    finally:
+        router.stop()
+
+
+def test_without_a_certificate_of_the_swarms_nobody_gets_in(tmp_path: Path) -> None:
+    certs, others = tmp_path / "certs", tmp_path / "others"
+    issue(certs, "router", ["localhost"], 2)
+    issue(others, "router", ["localhost"], 2)
+    endpoint = f"tls/localhost:{free_ports(1)[0]}"
+
+    def network(folder: Path) -> NetworkConfig:
+        names = (str(folder / name) for name in ("ca.pem", "router.pem", "router.key"))
+        files = TlsConfig(**dict(zip(("ca", "certificate", "key"), names, strict=True)))
+        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=files, connect_timeout_s=2.0)
+
+    router = Router(tmp_path, network(certs))
+    try:
+        with open_bus(network(certs)):
+            pass
+        with pytest.raises(BusError, match="cannot reach a router"), open_bus(network(others)):
+            pass
+        mixed = msgspec.structs.replace(network(others).tls, ca=str(certs / "ca.pem"))  # trusts, is not trusted
+        with pytest.raises(BusError), open_bus(msgspec.structs.replace(network(others), tls=mixed)):
+            pass
+    finally:
+        router.stop()

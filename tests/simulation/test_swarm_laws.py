@@ -1,0 +1,184 @@
+"""The laws hold in the whole swarm, whatever the network and the processes do: a failing seed replays exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.simulated_swarm import SMALL, Laws, missing, planned, replica_of, seeded
+
+from launch_scripts.simulation import simulate as simulate_module
+from launch_scripts.simulation.faults import Crash, FaultPlan, Partition
+from launch_scripts.simulation.simulate import Simulation, simulate
+from swarm.config.load import load_scenario
+from vehicle_agent.agent import Agent
+from vehicle_agent.service import AgentService
+
+SCENARIOS = Path(simulate_module.__file__).parents[1] / "scenarios"
+SECONDS = 24.0
+SETTLED_S = 4.0
+"""What was said so long ago has reached everybody, once all is quiet."""
+
+
+def run_with_laws(simulation: Simulation) -> Laws:
+    """Run to the end; what agents had said a while before must be everywhere then."""
+    laws = Laws(simulation)
+    simulation.run_until(SECONDS - SETTLED_S)
+    said = laws.said()
+    simulation.run_until(SECONDS)
+    for name, held in laws.held().items():
+        assert missing(held, said) == [], name
+    return laws
+
+
+def agent_of(simulation: Simulation, name: str) -> Agent:
+    service = simulation.nodes[name].service
+    assert isinstance(service, AgentService)
+    return service.agent
+
+
+def silence_agents(simulation: Simulation) -> None:
+    for node in simulation.nodes.values():
+        if node.spec.role == "agent":
+            node.crash()
+
+
+def check_all(simulation: Simulation, laws: Laws) -> None:
+    assert laws.collisions == []
+    assert laws.lethal == []
+    assert missing(laws.stored(), laws.acknowledged) == []
+    # With nobody left who says anything new, all who remain come to hold the same.
+    silence_agents(simulation)
+    simulation.run_until(SECONDS + 6)
+    left = {
+        node.name: replica
+        for node in simulation.nodes.values()
+        if node.service is not None and (replica := replica_of(node)) is not None
+    }
+    assert sorted(left) == ["keeper-0", "planner-t0", "planner-t1"]
+    assert len({replica.fingerprint() for replica in left.values()}) == 1
+    assert missing(laws.stored(), laws.acknowledged) == []
+    planners: list[np.ndarray] = [
+        simulation.nodes[name].service._cost_map.pace_s_per_m  # type: ignore[union-attr]
+        for name in ("planner-t0", "planner-t1")
+    ]
+    np.testing.assert_array_equal(*planners)
+    simulation.finish()
+
+
+def test_a_run_in_which_nothing_goes_wrong_keeps_every_law_and_does_its_work():
+    simulation = Simulation(seeded(1))
+    check_all(simulation, run_with_laws(simulation))
+    report = simulation.report(SECONDS)
+    assert report["vehicles_routed"] == report["vehicles"] == 10
+    assert report["captures"] > 0
+    assert report["marks"] > 0
+    assert report["reroute_requests"] > 0
+    assert report["collisions"] == report["lethal_entries"] == 0
+    assert report["lost"] == report["restarts"] == report["payloads_dropped"] == 0
+    assert report["startup_s"] < 3.0
+    assert report["gap"]["mean"] >= 1.0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_laws_hold_under_seeded_faults(seed):
+    simulation = Simulation(seeded(seed), faults=planned(seed, SECONDS))
+    check_all(simulation, run_with_laws(simulation))
+    report = simulation.report(SECONDS)
+    assert report["vehicles_routed"] == 10
+    assert report["captures"] > 0
+    assert report["lethal_entries"] == report["payloads_dropped"] == 0
+
+
+def test_nothing_acknowledged_is_lost_though_the_keeper_dies_again_and_again():
+    crashes = tuple(Crash(2 + 1.3 * n, "keeper-0") for n in range(8))
+    plan = FaultPlan(drop=0.05, duplicate=0.05, jitter_ms=10, quiet_s=16, crashes=crashes)
+    simulation = Simulation(seeded(5), faults=plan)
+    laws = run_with_laws(simulation)
+    check_all(simulation, laws)
+    assert sum(seq for _, seq in laws.acknowledged.values()) > 10
+    assert simulation.nodes["keeper-0"].crashes >= 4
+
+
+def test_agents_that_die_again_and_again_collide_with_nobody():
+    crashes = tuple(Crash(3 + 0.9 * n, f"agent-a{n % 3}") for n in range(12))
+    plan = FaultPlan(drop=0.05, jitter_ms=20, reorder=0.05, quiet_s=16, crashes=crashes)
+    simulation = Simulation(seeded(6), faults=plan)
+    check_all(simulation, run_with_laws(simulation))
+
+
+def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
+    plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), quiet_s=16)
+    simulation = Simulation(seeded(2), faults=plan)
+    laws = Laws(simulation)
+    simulation.run_until(4)
+    agent = agent_of(simulation, "agent-a1")
+    simulation.run_until(4.2)  # what was echoed before the cut may still be granted
+    held = {id: [*agent.rights.holds(id), *agent.rights.wants(id)] for id in agent.vehicles}
+    simulation.run_until(12)
+    assert all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
+    simulation.run_until(20)
+    assert not all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
+    assert laws.collisions == []
+
+
+def test_an_agent_restarted_while_cut_off_waits_until_somebody_tells_where_its_vehicles_stood():
+    plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), crashes=(Crash(9, "agent-a1"),), quiet_s=16)
+    simulation = Simulation(seeded(1), faults=plan)
+    laws = Laws(simulation)
+    simulation.run_until(8.9)
+    stood = {id: vehicle.cell for id, vehicle in agent_of(simulation, "agent-a1").vehicles.items()}
+    simulation.run_until(12)
+    assert agent_of(simulation, "agent-a1").vehicles == {}
+    simulation.run_until(13)
+    back = {id: vehicle.cell for id, vehicle in agent_of(simulation, "agent-a1").vehicles.items()}
+    assert back.keys() == stood.keys()
+    assert max(simulation.terrain.grid.distance_cells(cell, stood[id]) for id, cell in back.items()) <= 8
+    simulation.run_until(20)
+    assert laws.collisions == []
+
+
+def test_a_planner_killed_under_way_serves_routes_again_within_three_seconds():
+    simulation = Simulation(seeded(3), faults=FaultPlan(crashes=(Crash(8, "planner-t0"),)))
+    laws = Laws(simulation)
+    simulation.run_until(8 - 0.001)
+    simulation.run_until(11)
+    service = simulation.nodes["planner-t0"].service
+    assert service is not None
+    assert service.counters.counts["routes_served"] > 0
+    simulation.run_until(14)
+    simulation.finish()
+    assert simulation.report(14)["lost"] == 0
+    assert simulation.report(14)["restarts"] == 1
+    assert laws.collisions == []
+
+
+def test_targets_that_evade_jump_or_stand_still_are_caught():
+    """Every walk at once, in one small world."""
+    walks = ("still", "random", "waypoints", "evade")
+    target = SMALL.targets[0]
+    targets = tuple(
+        msgspec.structs.replace(target, name=walk, count=1, walk=walk, caught=caught)
+        for walk, caught in zip(walks, ("jump", "stay", "jump", "stay"), strict=True)
+    )
+    result = simulate(msgspec.structs.replace(SMALL, targets=targets), seed=4, seconds=15)
+    assert result.report["captures"] > 0
+    assert result.report["collisions"] == result.report["lethal_entries"] == 0
+    assert result.report["targets"] == 4
+
+
+@pytest.mark.slow
+def test_the_demo_on_real_terrain_routes_everybody_and_captures():
+    scenario = load_scenario(SCENARIOS / "jacksboro.toml")
+    simulation = Simulation(scenario)
+    laws = Laws(simulation)
+    simulation.run_until(10)
+    simulation.finish()
+    report = simulation.report(10)
+    assert report["vehicles_routed"] == report["vehicles"] == 100
+    assert report["captures"] > 0
+    assert report["marks"] > 0
+    assert report["collisions"] == report["lethal_entries"] == report["lost"] == 0
+    assert laws.collisions == laws.lethal == []

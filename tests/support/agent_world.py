@@ -1,0 +1,333 @@
+"""Agents on a simulated network, with planners and targets that are as simple as can be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from support.slow_tree import naive_tree
+
+from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.bus.bus import Asked, Event, Heard
+from swarm.bus.memory_bus import LinkModel, MemoryBus, MemoryNetwork, PerfectLinks
+from swarm.bus.scheduler import Scheduler
+from swarm.clock import NS_PER_S, ManualClock
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import AgentPlan, Scenario, plan_agents
+from swarm.grid import STEP_COL, STEP_ROW
+from swarm.liveness import Peer
+from swarm.runtime.role import RoleSetup
+from swarm.wire.fields import column, pack_column
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
+from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
+from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.service import AgentService
+
+START_NS = 1_000 * NS_PER_S
+
+
+def pace_of(picture: Sequence[str], pace: float = 0.1) -> NDArray[np.float32]:
+    """Pace from a picture: '#' is lethal, '~' is three times as slow, anything else is level ground."""
+    values = {"#": math.inf, "~": 3 * pace}
+    return np.array([[values.get(sign, pace) for sign in line] for line in picture], np.float32)
+
+
+def places(picture: Sequence[str], sign: str) -> list[tuple[int, int]]:
+    return [(r, c) for r, line in enumerate(picture) for c, found in enumerate(line) if found == sign]
+
+
+class FakePlanner:
+    """Serves exact routes and costs to one target from a tree that is grown anew for every question."""
+
+    def __init__(self, world: AgentWorld, target: str, incarnation: int = 1) -> None:
+        self.world = world
+        self.target = target
+        self.pace = np.array(world.terrain.pace_s_per_m)
+        self.cell: int | None = None
+        self.requests: list[RouteRequest] = []
+        self.mute = False
+        self.incarnation = incarnation
+        self._tree: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None
+        self.bus = world.network.bus(f"planner-{target}-{incarnation}")
+        self.bus.subscribe(POSE, self.handle, target=target)
+        self.bus.subscribe(MARKS, self.handle)
+        self.bus.serve(ROUTE, self.handle, target=target)
+        self.bus.serve(COST, self.handle, target=target)
+        self.bus.declare_alive(Peer("planner", target, incarnation))
+
+    def handle(self, event: Event) -> None:
+        match event:
+            case Heard(message=TargetPose() as pose):
+                if pose.cell != self.cell:
+                    self._tree = None
+                self.cell = pose.cell
+            case Heard(message=MarkSet() as marks):
+                self._mark(marks)
+            case Asked(request=RouteRequest() as request):
+                if not self.mute:
+                    self.requests.append(request)
+                    event.answer(self._routes(request))
+                event.end()
+            case Asked(request=CostRequest() as costs):
+                if not self.mute:
+                    event.answer(self._costs(costs))
+                event.end()
+            case _:
+                pass
+
+    def _mark(self, marks: MarkSet) -> None:
+        window = self.world.terrain.grid.tile_window(marks.tile)
+        prior = self.world.terrain.pace_s_per_m
+        for inner, kind, pace in zip(
+            column(marks.cells, "<u2"), marks.kinds, column(marks.paces, "<f4"), strict=True
+        ):
+            row, col = window.row0 + int(inner) // 32, window.col0 + int(inner) % 32
+            value = {MarkKind.PACE: float(pace), MarkKind.LETHAL: math.inf}.get(MarkKind(kind), prior[row, col])
+            self.pace[row, col] = value
+        self._tree = None
+
+    def tree(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]] | None:
+        if self.cell is None:
+            return None
+        if self._tree is None:
+            self._tree = naive_tree(self.pace, self.cell, self.world.terrain.grid.resolution_m)
+        return self._tree
+
+    def route(self, start: int, max_cells: int = 0) -> Route:
+        tree = self.tree()
+        if tree is None:
+            return Route(status=RouteStatus.NO_TARGET, start=start)
+        cost, parent = tree
+        if not math.isfinite(cost[start]):
+            return Route(status=RouteStatus.UNREACHABLE, start=start)
+        cols = self.world.terrain.grid.cols
+        codes: list[int] = []
+        cell = start
+        while cell != self.cell and (not max_cells or len(codes) < max_cells):
+            code = int(parent[cell])
+            codes.append(code)
+            cell += STEP_ROW[code] * cols + STEP_COL[code]
+        return Route(
+            status=RouteStatus.OK,
+            start=start,
+            directions=bytes(codes),
+            cost_s=float(cost[start]),
+            lower_bound_s=float(cost[start]),
+            remaining_s=float(cost[cell]),
+        )
+
+    def _routes(self, request: RouteRequest) -> RouteReply:
+        grid = self.world.terrain.grid
+        return RouteReply(
+            target=self.target,
+            incarnation=self.incarnation,
+            target_cell=self.cell,
+            map_version=0,
+            tree_age_ms=0.0,
+            rows=grid.rows,
+            cols=grid.cols,
+            routes=RouteBatch.of([self.route(cell, request.max_cells) for cell in request.cells]).columns(),
+        )
+
+    def _costs(self, request: CostRequest) -> CostReply:
+        tree = self.tree()
+        costs = [math.inf] * len(request.cells) if tree is None else [tree[0][cell] for cell in request.cells]
+        return CostReply(
+            target=self.target,
+            incarnation=self.incarnation,
+            target_cell=self.cell,
+            map_version=0,
+            tree_age_ms=0.0,
+            cost_to_go_s=pack_column(costs, "<f4"),
+        )
+
+
+class AgentWorld:
+    """A terrain, its agents, a planner per target, and a watchman who sees every vehicle at every tick."""
+
+    def __init__(
+        self,
+        scenario: str,
+        prior: NDArray[np.float32],
+        truth: NDArray[np.float32] | None = None,
+        links: LinkModel | None = None,
+        resolution_m: float = 10.0,
+    ) -> None:
+        self.scenario: Scenario = parse_scenario(scenario)
+        self.terrain: Terrain = terrain_of_pace(prior, resolution_m)
+        self.truth = np.array(self.terrain.ground_s_per_m if truth is None else truth, np.float32)
+        self.scheduler = Scheduler(ManualClock(START_NS))
+        self.network = MemoryNetwork(self.scheduler, links or PerfectLinks())
+        self.agents: dict[str, AgentService] = {}
+        self.buses: dict[str, MemoryBus] = {}
+        self.planners: dict[str, FakePlanner] = {}
+        self.poses: dict[str, TargetPose] = {}
+        self.fleets: list[Fleet] = []
+        self.followed: list[Followed] = []
+        self.ghosts: dict[str, dict[str, int]] = {}
+        self.meetings: list[str] = []
+        self.lethal: list[str] = []
+        self._watch = self.network.bus("watch")
+        self._watch.subscribe(FLEET, self._hear)
+        self._watch.subscribe(FOLLOWED, self._hear)
+
+    @property
+    def now_ns(self) -> int:
+        return self.scheduler.clock.now_ns()
+
+    def _hear(self, event: Event) -> None:
+        match event:
+            case Heard(message=Fleet() as fleet):
+                self.fleets.append(fleet)
+            case Heard(message=Followed() as followed):
+                self.followed.append(followed)
+            case _:
+                pass
+
+    # --- who is there ---------------------------------------------------------------------------------------
+
+    @property
+    def plans(self) -> list[AgentPlan]:
+        return plan_agents(self.scenario)
+
+    def start_all(self) -> None:
+        for target in self.scenario.target_ids:
+            self.start_planner(target)
+        for plan in self.plans:
+            self.start_agent(plan.id)
+
+    def start_planner(self, target: str, incarnation: int = 1) -> FakePlanner:
+        self.planners[target] = FakePlanner(self, target, incarnation)
+        return self.planners[target]
+
+    def stop_planner(self, target: str) -> None:
+        self.planners.pop(target).bus.close()
+
+    def start_agent(self, id: str) -> AgentService:
+        incarnation = self.now_ns
+        setup = RoleSetup(self.scenario, "run", "agent", id, incarnation, START_NS)
+        bus = self.network.bus(f"agent-{id}")
+        service: AgentService
+
+        def post(event: Event) -> None:
+            if not bus.closed:
+                service.handle(event, self.now_ns)
+
+        service = AgentService(setup, self.terrain, self.truth, bus, post)
+        self.agents[id], self.buses[id] = service, bus
+        service.start(self.now_ns)
+        period_ns = int(NS_PER_S / self.scenario.vehicles.tick_hz)
+
+        def tick() -> None:
+            if not bus.closed:
+                service.tick(self.now_ns)
+                self._look_around()
+                self.scheduler.after(period_ns, tick)
+
+        # Agents tick at different moments.
+        self.scheduler.after(period_ns * (1 + len(self.agents)) // 7, tick)
+        return service
+
+    def crash_agent(self, id: str) -> None:
+        """The process is gone; its vehicles stand where they were."""
+        service = self.agents.pop(id)
+        if service.agent.vehicles:
+            self.ghosts[id] = {v.id: v.cell for v in service.agent.vehicles.values()}
+        self.buses.pop(id).close()
+
+    def _look_around(self) -> None:
+        where: dict[int, str] = {}
+        standing = [(vehicle.id, vehicle.cell) for vehicle in self.vehicles()]
+        for agent, vehicles in list(self.ghosts.items()):
+            if agent in self.agents and self.agents[agent].agent.vehicles:
+                del self.ghosts[agent]  # they are vehicles again
+            else:
+                standing += vehicles.items()
+        for id, cell in standing:
+            if cell in where:
+                self.meetings.append(f"{where[cell]} and {id} on {cell} at {self.now_ns}")
+            where[cell] = id
+            if not math.isfinite(self.truth.reshape(-1)[cell]):
+                self.lethal.append(f"{id} on {cell}")
+
+    # --- targets and time -----------------------------------------------------------------------------------
+
+    def put_target(self, target: str, row: int, col: int, *, jumped: bool = False) -> None:
+        """A target is somewhere, and says so ten times a second from now on."""
+        known = self.poses.get(target)
+        cell = self.terrain.grid.cell(row, col)
+        x_m, y_m = self.terrain.grid.centre_m(cell)
+        self.poses[target] = TargetPose(
+            target=target,
+            incarnation=1,
+            seq=0 if known is None else known.seq,
+            stamp_ns=self.now_ns,
+            cell=cell,
+            x_m=x_m,
+            y_m=y_m,
+            jumps=0 if known is None else known.jumps + jumped,
+        )
+        if known is None:
+            self._tell(target)
+
+    def _tell(self, target: str) -> None:
+        old = self.poses[target]
+        self.poses[target] = TargetPose(
+            target=target,
+            incarnation=1,
+            seq=old.seq + 1,
+            stamp_ns=self.now_ns,
+            cell=old.cell,
+            x_m=old.x_m,
+            y_m=old.y_m,
+            jumps=old.jumps,
+        )
+        self._watch.publish(POSE, self.poses[target], target=target)
+        self.scheduler.after(NS_PER_S // 10, lambda: self._tell(target))
+
+    def run_s(self, seconds: float) -> None:
+        self.scheduler.run_until(self.now_ns + int(seconds * NS_PER_S))
+
+    def until(self, true: object, within_s: float) -> float:
+        """Run until a condition holds; returns the seconds that it took."""
+        assert callable(true)
+        began_ns = self.now_ns
+        while not true():
+            if self.now_ns - began_ns > within_s * NS_PER_S:
+                raise AssertionError(f"not within {within_s} s: {self.describe()}")
+            self.run_s(0.1)
+        return (self.now_ns - began_ns) / NS_PER_S
+
+    # --- what there is to see -------------------------------------------------------------------------------
+
+    def vehicles(self) -> list[Vehicle]:
+        return [vehicle for service in self.agents.values() for vehicle in service.agent.vehicles.values()]
+
+    def states(self) -> dict[str, VehicleState]:
+        return {vehicle.id: vehicle.state for vehicle in self.vehicles()}
+
+    def all_in(self, state: VehicleState) -> bool:
+        states = self.states()
+        return len(states) == self.scenario.vehicle_count and all(found is state for found in states.values())
+
+    def count(self, name: str) -> int:
+        return sum(service.counters.counts.get(name, 0) for service in self.agents.values())
+
+    def where(self) -> dict[str, tuple[int, int]]:
+        grid = self.terrain.grid
+        return {vehicle.id: grid.row_col(vehicle.cell) for vehicle in self.vehicles()}
+
+    def describe(self) -> str:
+        states = self.states()
+        return ", ".join(f"{id} {states[id].name} at {place}" for id, place in self.where().items())
+
+    def assert_lawful(self) -> None:
+        assert self.meetings == []
+        assert self.lethal == []

@@ -1,0 +1,59 @@
+"""Roles that do next to nothing, each in the way that a test of the launcher needs."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Callable
+
+from swarm.errors import ConfigError
+from swarm.runtime.process import end_with
+from swarm.runtime.role import RoleSetup
+
+StopWhen = Callable[[], None] | None
+
+
+def quiet(setup: RoleSetup, stop_when: StopWhen) -> None:
+    """Runs until SIGTERM, and writes down when it began and ended."""
+    assert setup.run_dir is not None
+    ended: list[int] = []  # an Event would deadlock if the signal came in the middle of its wait
+    signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))
+    if stop_when is not None:
+        end_with(stop_when, lambda: ended.append(0))
+    with (setup.run_dir / "order.txt").open("a") as order:
+        order.write(f"+{setup.role}-{setup.id}\n")
+    sys.stdout.write(f"hello from {setup.id}\n")
+    while not ended:
+        time.sleep(0.05)
+    with (setup.run_dir / "order.txt").open("a") as order:
+        order.write(f"-{setup.role}-{setup.id}\n")
+
+
+def crash_twice(setup: RoleSetup, stop_when: StopWhen) -> None:
+    assert setup.run_dir is not None
+    tries = setup.run_dir / "tries.txt"
+    with tries.open("a") as file:
+        file.write("x")
+    if len(tries.read_text()) <= 2:
+        raise ZeroDivisionError("a bug of ours")
+    quiet(setup, stop_when)
+
+
+def refuse(setup: RoleSetup, stop_when: StopWhen) -> None:
+    raise ConfigError("the scenario is not to my liking")
+
+
+def stubborn(setup: RoleSetup, stop_when: StopWhen) -> None:
+    """Neither SIGTERM nor the end of the launcher moves it."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    time.sleep(1000)
+
+
+def fail_at_the_end(setup: RoleSetup, stop_when: StopWhen) -> None:
+    quiet(setup, stop_when)
+    raise RuntimeError("could not write the last page")
+
+
+def leave_early(setup: RoleSetup, stop_when: StopWhen) -> None:
+    sys.exit(0)

@@ -1,0 +1,140 @@
+"""A whole swarm of real processes for the tests beside this file."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from support.processes import eventually, session_of
+
+from launch_scripts.launcher.options import free_ports
+from swarm.bus.bus import AskEnded, Replied
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.config.load import load_scenario
+from swarm.config.scenario import NetworkConfig, Scenario
+from swarm.runtime.inbox import Inbox
+from swarm.wire.messages.base import Message
+from swarm.wire.topics import Topic
+
+SWARM = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
+
+_SCENARIO = """
+name = "small"
+seed = 3
+seconds = 300
+time_scale = 10
+
+[terrain]
+source = "synthetic"
+rows = 96
+cols = 128
+resolution_m = 30
+relief_m = 300
+roads = 4
+
+[terrain.hidden]
+rubble_fields = 5
+
+[[targets]]
+count = 2
+walk = "waypoints"
+
+[[groups]]
+vehicles = 12
+
+[vehicles]
+per_agent = 6
+
+[network]
+listen = ["tcp/127.0.0.1:{port}"]
+connect = ["tcp/127.0.0.1:{port}"]
+
+[monitor]
+grpc_port = 0
+web_port = 0
+"""
+
+
+def write_scenario(folder: Path) -> Path:
+    """A small scenario on a free port."""
+    path = folder / "small.toml"
+    path.write_text(_SCENARIO.format(port=free_ports(1)[0]))
+    return path
+
+
+def swarm(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """Run the command `swarm` to its end."""
+    command = [*SWARM, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+class LiveSwarm:
+    """`swarm up` under way, in a session of its own."""
+
+    def __init__(self, folder: Path, *options: object) -> None:
+        self.path = write_scenario(folder)
+        self.scenario: Scenario = load_scenario(self.path)
+        self.output = folder / "output.txt"
+        self.runs = folder / "runs"
+        command = [*SWARM, "up", self.path, "--runs", self.runs, "--plain", *options]
+        with self.output.open("w") as output:
+            self.process = subprocess.Popen(
+                list(map(str, command)), stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            )
+
+    @property
+    def network(self) -> NetworkConfig:
+        return self.scenario.network
+
+    @property
+    def endpoint(self) -> str:
+        return self.network.connect[0]
+
+    @property
+    def run_dir(self) -> Path:
+        (run_dir,) = self.runs.iterdir()
+        return run_dir
+
+    def said(self, text: str) -> bool:
+        assert self.process.poll() is None, self.output.read_text()
+        return text in self.output.read_text()
+
+    def wait_until_up(self) -> None:
+        eventually(lambda: self.said("all processes are alive"), 90, "the start of the swarm")
+
+    def pid_of(self, name: str) -> int:
+        """Of the newest incarnation, from its log."""
+        log = (self.run_dir / f"{name}.log").read_text()
+        return int(re.findall(r"starts, pid (\d+)", log)[-1])
+
+    def end(self) -> int:
+        """Ctrl-C, as a terminal sends it: to everybody."""
+        os.killpg(self.process.pid, signal.SIGINT)
+        return self.process.wait(60)
+
+    def kill(self) -> None:
+        """For the end of a test that failed."""
+        if session_of(self.process.pid):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        self.process.wait(10)
+
+
+def ask(bus: ZenohBus, topic: Topic, request: Message, timeout_s: float = 2.0, **fields: str) -> list[Any]:
+    """All replies to one question."""
+    inbox = Inbox()
+    bus.ask(topic, request, inbox.post, tag="test", timeout_s=timeout_s, **fields)
+    replies = []
+    while not isinstance(event := inbox.take(timeout_s + 5), AskEnded):
+        assert isinstance(event, Replied), event
+        replies.append(event.message)
+    return replies
+
+
+def client(network: NetworkConfig) -> ZenohBus:
+    return open_bus(msgspec.structs.replace(network, connect_timeout_s=5.0))

@@ -1,0 +1,128 @@
+"""A monitor on a memory bus, and somebody else who speaks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.service import MonitorService
+from launch_scripts.monitor.sinks import Outlets
+from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.bus.bus import Event
+from swarm.bus.memory_bus import MemoryBus, MemoryNetwork, PerfectLinks
+from swarm.bus.scheduler import Scheduler
+from swarm.clock import NS_PER_S, ManualClock
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import MonitorConfig, Scenario
+from swarm.liveness import Peer
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Note, Stats
+from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.vehicles import Fleet, Followed
+from swarm.wire.topics import FLEET, FOLLOWED, MARKS, NOTE, POSE, SIGHTED, STATS, STATUS
+
+SILENT = MonitorConfig(live=False)
+LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0, memory_mib=16)
+FRAME_NS = NS_PER_S // 10
+
+
+def little_scenario() -> Scenario:
+    return parse_scenario(
+        'name = "little"\nseed = 3\nseconds = 6.0\ntime_scale = 10\n[[targets]]\nname = "t"\ncount = 2\n'
+        "[[groups]]\nvehicles = 10\n[monitor]\nlive = false\n"
+    )
+
+
+def little_terrain() -> Terrain:
+    rows, cols = np.mgrid[0:80, 0:100].astype(np.float32)
+    elevation_m = (40 * np.sin(rows / 9) + 30 * np.cos(cols / 7)).astype(np.float32)
+    return terrain_of_pace(np.full((80, 100), 0.1, np.float32), 25.0, elevation_m)
+
+
+def hidden_truth(terrain: Terrain) -> NDArray[np.float32]:
+    """A wall across the middle of the little terrain."""
+    truth = np.array(terrain.pace_s_per_m)
+    truth[30:34, 20:80] = np.inf
+    return truth
+
+
+class Rig:
+    """A monitor on a memory bus, and somebody else who speaks."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        terrain: Terrain,
+        path: Path | None,
+        live_url: str | None = None,
+        config: MonitorConfig = SILENT,
+    ) -> None:
+        self.scheduler = Scheduler(ManualClock(0))
+        self.said: set[str] = set()
+
+        def trace(now_ns: int, source: str, destination: str, what: str, payload: bytes) -> None:
+            if source == "monitor":
+                self.said.add(what)
+
+        network = MemoryNetwork(self.scheduler, PerfectLinks(), trace)
+        self.speaker, bus = network.bus("speaker"), network.bus("monitor")
+        self.network, self.terrain, self.scenario = network, terrain, scenario
+        setup = RoleSetup(scenario, "run", "monitor", "0", incarnation=1, started_ns=0)
+        ground = Ground(terrain)
+        self.outlets = Outlets("run.1", path, config, make_blueprint(ground))
+
+        def post(event: Event) -> None:
+            self.service.handle(event, self.scheduler.clock.now_ns())
+
+        self.service = MonitorService(setup, terrain, bus, post, self.outlets.rec, ground=ground, live_url=live_url)
+        self.service.start(0)
+
+    def play(self, told: Iterable[tuple[int, Message | Peer]]) -> None:
+        for now_ns, message in told:
+            self.until(now_ns)
+            if isinstance(message, Peer):
+                self.speaker.declare_alive(message)
+            else:
+                say(self.speaker, self.terrain, message)
+        self.until(self.scheduler.clock.now_ns() + NS_PER_S)
+
+    def until(self, end_ns: int) -> None:
+        """Frames up to a moment."""
+        while self.scheduler.clock.now_ns() < end_ns:
+            now_ns = self.scheduler.clock.now_ns()
+            self.scheduler.run_until(min(now_ns + FRAME_NS - now_ns % FRAME_NS, end_ns))
+            if self.scheduler.clock.now_ns() % FRAME_NS == 0:
+                self.service.tick(self.scheduler.clock.now_ns())
+
+    def close(self) -> None:
+        self.service.stop(self.scheduler.clock.now_ns())
+        self.outlets.close()
+
+
+def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
+    match message:
+        case Fleet():
+            bus.publish(FLEET, message, region=message.region, author=message.author)
+        case TargetPose():
+            bus.publish(POSE, message, target=message.target)
+        case PlannerStatus():
+            bus.publish(STATUS, message, target=message.target)
+        case Stats():
+            bus.publish(STATS, message, role=message.role, id=message.id)
+        case Note():
+            bus.publish(NOTE, message, role=message.role, id=message.id)
+        case Followed():
+            bus.publish(FOLLOWED, message, agent="a0", vehicle=message.vehicle)
+        case Sighted():
+            bus.publish(SIGHTED, message, target=message.target, author=message.author)
+        case MarkSet():
+            region = terrain.grid.region_of_tile(message.tile)
+            bus.publish(MARKS, message, region=region, tile=message.tile, author=message.author)

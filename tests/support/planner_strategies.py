@@ -1,0 +1,98 @@
+"""What hypothesis draws for the planner: terrains, rules, and what happens to a tree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from swarm.config.scenario import PlannerConfig
+
+STRATEGIES = (
+    "full",
+    "variable_range",
+    "rotation",
+    "multi_resolution",
+    "variable_range+multi_resolution",
+    "auto",
+)
+
+RULES: tuple[dict[str, Any], ...] = (
+    {"neighbours": 8, "edge": "octile", "corner_cutting": False},
+    {"neighbours": 8, "edge": "octile", "corner_cutting": True},
+    {"neighbours": 8, "edge": "paper", "corner_cutting": False},
+    {"neighbours": 8, "edge": "paper", "corner_cutting": True},
+    {"neighbours": 4, "edge": "octile", "corner_cutting": False},
+)
+
+
+def random_pace(rng: np.random.Generator, rows: int, cols: int, ratio: float, walls: float) -> NDArray[np.float32]:
+    """Paces between 1 and `ratio`, log-uniform, with a share of lethal cells; the first passable cell is sure."""
+    pace = np.exp(rng.random((rows, cols)) * np.log(ratio)).astype(np.float32)
+    pace[rng.random((rows, cols)) < walls] = np.inf
+    if not np.isfinite(pace).any():
+        pace[rng.integers(rows), rng.integers(cols)] = 1.0
+    return pace
+
+
+@st.composite
+def paces(draw: st.DrawFn, most: int = 14) -> NDArray[np.float32]:
+    rows = draw(st.integers(1, most))
+    cols = draw(st.integers(1, most))
+    ratio = draw(st.sampled_from([1.0, 3.0, 100.0, 1e4, 1e8]))
+    walls = draw(st.sampled_from([0.0, 0.1, 0.3, 0.5]))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return random_pace(rng, rows, cols, ratio, walls)
+
+
+@dataclass(frozen=True)
+class Move:
+    """The target steps or jumps: by so many rows and cols, as far as the grid goes."""
+
+    rows: int
+    cols: int
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Cells (seeded) become lethal, passable, dearer or cheaper."""
+
+    seed: int
+    count: int
+
+
+@dataclass(frozen=True)
+class Job:
+    """A worker begins or ends a full growth; a forced range."""
+
+    what: str
+
+
+def happenings(most: int = 12) -> st.SearchStrategy[list[Move | Marks | Job]]:
+    step = st.integers(-1, 1)
+    jump = st.integers(-16, 16)
+    return st.lists(
+        st.one_of(
+            st.builds(Move, step, step),
+            st.builds(Move, jump, jump),
+            st.builds(Marks, st.integers(0, 2**31), st.integers(1, 6)),
+            st.builds(Job, st.sampled_from(["begin", "end", "force"])),
+        ),
+        max_size=most,
+    )
+
+
+def planner_configs() -> st.SearchStrategy[PlannerConfig]:
+    return st.builds(
+        lambda strategy, rules, k_min, full_every, budget: PlannerConfig(
+            strategy=strategy, k_min=k_min, full_every=full_every, cpu_budget=budget, **rules
+        ),
+        st.sampled_from(STRATEGIES),
+        st.sampled_from(RULES),
+        st.integers(0, 2),
+        st.integers(1, 4),
+        st.sampled_from([1e-9, 0.5]),
+    )

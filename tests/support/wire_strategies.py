@@ -1,0 +1,277 @@
+"""Hypothesis strategies for every message of the wire, and one example of each."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+from hypothesis import strategies as st
+
+from shared_map.replication.mark_sets import packed
+from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET, pack_column
+from swarm.wire.messages.base import Message, Nothing
+from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.planning import (
+    CostReply,
+    CostRequest,
+    PlannerStatus,
+    PushedRoute,
+    RouteReply,
+    RouteRequest,
+)
+from swarm.wire.messages.processes import Note, RunInfo, Stats
+from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.vehicles import NO_TARGET, Claims, Fleet, Followed, Grounds, VehicleState, Want
+from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.statements import TILE_AREA, MarkKind
+
+naturals = st.integers(0, (1 << 62) - 1)
+cells = st.integers(-(1 << 31), (1 << 32) - 1)
+ids = st.text("abcXYZ019_.-", min_size=1, max_size=64)
+texts = st.text(max_size=40)
+finite = st.floats(allow_nan=False, allow_infinity=False)
+metres = st.floats(-1e9, 1e9)
+costs = st.floats(min_value=0, allow_nan=False)
+floats32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
+directions = st.lists(st.integers(0, 7), max_size=50).map(bytes)
+optional_cells = st.none() | cells
+gaps = st.none() | st.floats(min_value=1, allow_nan=False, allow_infinity=False)
+
+routes = st.builds(
+    Route,
+    status=st.sampled_from(RouteStatus),
+    start=cells,
+    directions=directions,
+    cost_s=costs,
+    lower_bound_s=costs,
+    length_m=costs,
+    remaining_s=costs,
+)
+
+
+@st.composite
+def mark_sets(draw: st.DrawFn) -> MarkSet:
+    where = sorted(draw(st.sets(st.integers(0, TILE_AREA - 1), max_size=20)))
+    n = len(where)
+    return MarkSet(
+        author=draw(ids),
+        group=draw(ids),
+        tile=draw(naturals),
+        epoch=draw(naturals),
+        seq=draw(naturals),
+        cells=pack_column(where, "<u2"),
+        kinds=bytes(draw(st.lists(st.sampled_from([int(kind) for kind in MarkKind]), min_size=n, max_size=n))),
+        paces=pack_column(draw(st.lists(st.floats(0.015625, 8192, width=32), min_size=n, max_size=n)), "<f4"),
+        stamps_ns=pack_column(draw(st.lists(st.integers(0, (1 << 62) - 1), min_size=n, max_size=n)), "<i8"),
+    )
+
+
+@st.composite
+def bulks(draw: st.DrawFn) -> MarkSets:
+    sets = draw(st.lists(mark_sets(), max_size=3))
+    [message] = packed(
+        msgspec.structs.replace(each, author="a", group="g", tile=tile) for tile, each in enumerate([*sets, EMPTY])
+    )
+    return message
+
+
+EMPTY = MarkSet(author="a", group="g", tile=0, epoch=0, seq=0, cells=b"", kinds=b"", paces=b"", stamps_ns=b"")
+
+
+@st.composite
+def digests(draw: st.DrawFn) -> Digest:
+    rows = st.lists(st.tuples(st.integers(0, (1 << 32) - 1), naturals, naturals), max_size=5)
+    held = draw(st.dictionaries(ids, rows, max_size=3))
+    packed = {author: np.array(given, DIGEST_ROW).tobytes() for author, given in held.items()}
+    return Digest(author=draw(ids), role=draw(texts), held=packed, seq=draw(naturals))
+
+
+@st.composite
+def fleets(draw: st.DrawFn) -> Fleet:
+    n = draw(st.integers(0, 6))
+    target_ids = draw(st.lists(ids, max_size=3))
+
+    def some(values: st.SearchStrategy[float]) -> list[float]:
+        return draw(st.lists(values, min_size=n, max_size=n))
+
+    return Fleet(
+        author=draw(ids),
+        group=draw(ids),
+        region=draw(naturals),
+        seq=draw(naturals),
+        stamp_ns=draw(naturals),
+        ids=draw(st.lists(ids, min_size=n, max_size=n)),
+        target_ids=target_ids,
+        cells=pack_column(some(st.integers(0, (1 << 32) - 1)), "<u4"),
+        east_m=pack_column(some(floats32), "<f4"),
+        south_m=pack_column(some(floats32), "<f4"),
+        heading_rad=pack_column(some(floats32), "<f4"),
+        states=bytes(draw(st.lists(st.sampled_from([int(s) for s in VehicleState]), min_size=n, max_size=n))),
+        targets=bytes(
+            draw(st.lists(st.sampled_from([*range(len(target_ids)), NO_TARGET]), min_size=n, max_size=n))
+        ),
+    )
+
+
+@st.composite
+def route_requests(draw: st.DrawFn) -> RouteRequest:
+    asked = draw(st.lists(cells, max_size=5))
+    place = draw(st.none() | st.tuples(cells, cells))
+    return RouteRequest(
+        cells=asked,
+        vehicles=draw(st.sampled_from([[], [f"a0-{n}" for n in range(len(asked))]])),
+        max_cells=draw(naturals),
+        force=draw(st.booleans()),
+        row=place[0] if place else None,
+        col=place[1] if place else None,
+    )
+
+
+claims = st.builds(
+    Claims, agent=ids, incarnation=naturals, seq=naturals, clock=naturals,
+    holds=st.dictionaries(ids, st.lists(cells, min_size=1, max_size=4), max_size=3),
+    wants=st.lists(st.builds(Want, vehicle=ids, cell=cells, ticket=naturals), max_size=3),
+    seen=st.dictionaries(ids, st.tuples(naturals, naturals), max_size=3),
+)  # fmt: skip
+
+MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
+    RunInfo: st.builds(
+        RunInfo, run_id=texts, role=ids, id=ids, incarnation=naturals, scenario=texts, terrain=texts, rows=naturals,
+        cols=naturals, resolution_m=finite, started_ns=naturals,
+    ),
+    Nothing: st.just(Nothing()),
+    MarkSet: mark_sets(),
+    MarkSets: bulks(),
+    Digest: digests(),
+    MarksRequest: st.builds(MarksRequest, authors=st.lists(ids, max_size=3), tiles=st.lists(naturals, max_size=3)),
+    BaseMap: st.builds(
+        BaseMap, keeper=ids, terrain=texts, rows=st.integers(1, 256), cols=st.integers(1, 256),
+        resolution_m=st.floats(0.01, 1e6), west_m=metres, north_m=metres, crs=texts,
+        digests=st.dictionaries(texts, st.binary(min_size=8, max_size=8), max_size=4),
+        notes=st.lists(texts, max_size=3),
+    ),
+    BaseMapRequest: st.builds(BaseMapRequest, layers=st.lists(texts, max_size=3), regions=st.lists(naturals)),
+    BaseMapTile: st.builds(BaseMapTile, layer=texts, region=naturals, data=st.binary(max_size=50)),
+    Fleet: fleets(),
+    Claims: claims,
+    Grounds: st.builds(
+        Grounds, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(naturals, max_size=3),
+        silent=st.lists(ids, max_size=2), words=st.lists(claims, max_size=2),
+    ),
+    Followed: st.builds(
+        Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite, lower_bound_s=finite
+    ),
+    TargetPose: st.builds(
+        TargetPose, target=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, cell=cells, x_m=metres,
+        y_m=metres, captures=naturals, jumps=naturals,
+    ),
+    Sighted: st.builds(
+        Sighted, author=ids, group=ids, target=ids, seq=naturals, stamp_ns=naturals, until_ns=naturals, cell=cells,
+        x_m=metres, y_m=metres, uncertainty_m=st.floats(0, 1e9),
+    ),
+    RouteRequest: route_requests(),
+    RouteReply: st.builds(
+        RouteReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=naturals,
+        tree_age_ms=finite, rows=naturals, cols=naturals,
+        routes=st.lists(routes, max_size=3).map(lambda some: RouteBatch.of(some).columns()),
+    ),
+    PushedRoute: st.builds(
+        PushedRoute, vehicle=ids, target=ids, incarnation=naturals, target_cell=cells, map_version=naturals,
+        route=routes,
+    ),
+    CostRequest: st.builds(CostRequest, cells=st.lists(cells, max_size=5), row=st.none(), col=st.none()),
+    CostReply: st.builds(
+        CostReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=naturals,
+        tree_age_ms=finite,
+        cost_to_go_s=st.lists(st.floats(0, width=32), max_size=5).map(lambda column: pack_column(column, "<f4")),
+    ),
+    PlannerStatus: st.builds(
+        PlannerStatus, target=ids, incarnation=naturals, stamp_ns=naturals, strategy=texts,
+        target_cell=optional_cells, map_version=naturals, tree_age_ms=finite,
+        window=st.sampled_from([[], [0, 0, 8, 8]]), growths=naturals, window_growths=naturals, growth_ms=finite,
+        routes_served=naturals, following=naturals, gap_mean=gaps, gap_p95=gaps, gap_max=gaps,
+    ),
+    Stats: st.builds(
+        Stats, role=ids, id=ids, incarnation=naturals, stamp_ns=naturals,
+        counts=st.dictionaries(texts, naturals, max_size=3), gauges=st.dictionaries(texts, finite, max_size=3),
+        histograms=st.dictionaries(
+            texts, st.dictionaries(st.integers(ZERO_BUCKET, TOP_BUCKET), naturals, max_size=3), max_size=2
+        ),
+    ),
+    Note: st.builds(Note, role=ids, id=ids, stamp_ns=naturals, kind=texts, text=texts, cell=optional_cells),
+}  # fmt: skip
+
+EXAMPLES: tuple[Message, ...] = (
+    RunInfo(
+        run_id="r1", role="agent", id="a0", incarnation=7, scenario="demo", terrain="0123456789abcdef", rows=344,
+        cols=403, resolution_m=90.0, started_ns=5,
+    ),
+    Nothing(),
+    MarkSet(
+        author="a0.7", group="all", tile=3, epoch=7, seq=2, cells=pack_column([5, 1023], "<u2"),
+        kinds=bytes([0, 1]), paces=pack_column([0.5, math.inf], "<f4"), stamps_ns=pack_column([10, 20], "<i8"),
+    ),
+    MarkSets(
+        author="a0.7", group="all", tiles=pack_column([3, 9], "<u4"), epochs=pack_column([7, 7], "<u8"),
+        seqs=pack_column([2, 0], "<u8"), counts=pack_column([2, 1], "<u2"), ending=bytes([0, 1]),
+        cells=pack_column([5, 1023, 0], "<u2"), kinds=bytes([0, 1, 1]),
+        paces=pack_column([0.5, math.inf, 0.0], "<f4"), stamps_ns=pack_column([10, 20, 30], "<i8"),
+        untils_ns=pack_column([40], "<i8"),
+    ),
+    Digest(author="a0.7", role="agent", held={"a0.7": np.array([(3, 7, 2)], DIGEST_ROW).tobytes()}),
+    MarksRequest(authors=["a0.7"], tiles=[3]),
+    BaseMap(
+        keeper="0", terrain="0123456789abcdef", rows=300, cols=200, resolution_m=10.0, west_m=0.0, north_m=0.0,
+        crs="local", digests={"ground": bytes(range(16))}, notes=["from somewhere"],
+    ),
+    BaseMapRequest(layers=["ground"], regions=[0, 1]),
+    BaseMapTile(layer="ground", region=1, data=b"packed"),
+    Fleet(
+        author="a0.7", group="all", region=0, seq=9, stamp_ns=10, ids=["a0-00", "a0-01"], target_ids=["t0"],
+        cells=pack_column([4, 5], "<u4"), east_m=pack_column([1.0, 2.0], "<f4"),
+        south_m=pack_column([1.0, 2.0], "<f4"), heading_rad=pack_column([0.0, 3.0], "<f4"), states=bytes([2, 0]),
+        targets=bytes([0, NO_TARGET]),
+    ),
+    Claims(
+        agent="a0", incarnation=7, seq=3, clock=4, holds={"a0-00": [4, 5]},
+        wants=[Want(vehicle="a0-00", cell=6, ticket=3)], seen={"a1": (7, 2)},
+    ),
+    Grounds(
+        agent="a0", incarnation=7, seq=2, plots=[0, 3], silent=["a1"],
+        words=[Claims(agent="a1", incarnation=7, seq=2, clock=1, holds={"a1-00": [9]}, wants=[], seen={})],
+    ),
+    Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
+    TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
+    Sighted(
+        author="all.a0.7", group="all", target="t0", seq=2, stamp_ns=10, until_ns=90, cell=9, x_m=1.5, y_m=-2.5,
+        uncertainty_m=8.0,
+    ),
+    RouteRequest(cells=[4, 5], vehicles=["a0-00", "a0-01"], max_cells=50, force=True),
+    RouteReply(
+        target="t0", incarnation=7, target_cell=9, map_version=3, tree_age_ms=12.5, rows=10, cols=10,
+        routes=RouteBatch.of([
+            Route(status=RouteStatus.OK, start=11, directions=bytes([2, 3]), cost_s=3.0, lower_bound_s=2.5),
+            Route(status=RouteStatus.UNREACHABLE, start=12),
+        ]).columns(),
+    ),
+    PushedRoute(
+        vehicle="a0-00", target="t0", incarnation=7, target_cell=9, map_version=3,
+        route=Route(status=RouteStatus.OK, start=4, directions=bytes([1]), cost_s=9.0, lower_bound_s=9.0),
+    ),
+    CostRequest(cells=[4, 5]),
+    CostReply(
+        target="t0", incarnation=7, target_cell=9, map_version=3, tree_age_ms=12.5,
+        cost_to_go_s=pack_column([3.0, math.inf], "<f4"),
+    ),
+    PlannerStatus(
+        target="t0", incarnation=7, stamp_ns=10, strategy="auto", target_cell=9, map_version=3, tree_age_ms=12.5,
+        window=[0, 0, 8, 8], growths=4, window_growths=2, growth_ms=2.0, routes_served=5, following=1,
+    ),
+    Stats(
+        role="agent", id="a0", incarnation=7, stamp_ns=10, counts={"marks": 3}, gauges={"lost": 0.0},
+        histograms={"tick_ms": {-3: 4}},
+    ),
+    Note(role="agent", id="a0", stamp_ns=10, kind="closure", text="road closed", cell=9),
+)  # fmt: skip

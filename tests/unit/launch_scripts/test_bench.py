@@ -1,0 +1,345 @@
+"""`swarm bench`: each command runs small, its JSON has the promised shape, its figures keep what must hold."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from launch_scripts.bench.cli import app
+from launch_scripts.bench.isolated import measure
+from launch_scripts.bench.planning import libraries as rivals
+from launch_scripts.bench.planning.chase import FEWEST, Plan, Tally, chase
+from launch_scripts.bench.planning.cold_start import tables
+from launch_scripts.bench.planning.fields import FIELDS, Field, make_field
+from launch_scripts.bench.planning.scale import points_of
+from swarm.config.scenario import PlannerConfig
+from swarm.errors import ConfigError, SwarmError, TerrainError
+from swarm.wire.routes import NO_TARGET, OK, RouteBatch
+
+STRATEGIES = (
+    "auto",
+    "full",
+    "rotation",
+    "variable_range",
+    "multi_resolution",
+    "variable_range+multi_resolution",
+)
+DEM = Path(__file__).parents[4] / "shared" / "data" / "dem"
+
+
+def bench(*words: str) -> dict[str, Any]:
+    done = CliRunner().invoke(app, [*words, "--json"], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+def words_of(*words: str) -> str:
+    done = CliRunner().invoke(app, list(words), catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def assert_fits(text: str) -> None:
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= 80, text
+    assert "…" not in text, text
+
+
+# --- peers -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_peers_agree_with_ours_and_every_ratio_is_that_of_the_times(field: str) -> None:
+    report = bench("peers", "--size", "96", "--field", field, "--repeats", "3", "--no-memory")
+    assert list(report)[:8] == [
+        *("size", "field", "ours_ms", "floor_ms", "peers", "ratios", "agreement", "memory_mb"),
+    ]
+    assert report["size"] == 96
+    assert report["field"] == field
+    peers = set(rivals.present_peers("paper"))
+    assert {"scipy.csgraph.dijkstra", "skimage.graph.MCP"} <= peers
+    assert peers == set(report["peers"]) == set(report["ratios"]) == set(report["agreement"])
+    for name in peers:
+        assert report["ratios"][name] == pytest.approx(report["peers"][name] / report["ours_ms"], rel=0.05)
+        assert report["agreement"][name] < (1e-3 if name.startswith("tcod") else 1e-5), name
+    assert report["over_floor"] == pytest.approx(report["ours_ms"] / report["floor_ms"], rel=0.1)
+
+
+def test_with_octile_edges_scipy_agrees() -> None:
+    report = bench("peers", "--size", "64", "--edge", "octile", "--repeats", "1", "--no-memory")
+    assert report["agreement"]["scipy.csgraph.dijkstra"] < 1e-5
+    assert not any(name.startswith("dijkstra3d") for name in report["peers"])
+
+
+@pytest.mark.slow
+def test_peers_show_a_table_with_versions_and_memory() -> None:
+    text = words_of("peers", "--size", "64", "--repeats", "1")
+    assert_fits(text)
+    assert rivals.versions()["scipy"] in text
+
+
+def test_a_peer_that_is_not_installed_is_said_to_be_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = rivals.importlib.util.find_spec
+    monkeypatch.setattr(
+        rivals.importlib.util, "find_spec", lambda name: None if name in rivals.EXTRA else find(name)
+    )
+    done = CliRunner().invoke(app, ["peers", "--size", "64", "--repeats", "1", "--no-memory", "--json"])
+    assert done.exit_code == 0
+    for name in rivals.EXTRA:
+        assert f"{name} is not installed, so it is not measured: `uv sync --extra bench` brings it." in done.stderr
+    report = json.loads(done.stdout)
+    assert report["missing"] == list(rivals.EXTRA)
+    assert set(report["peers"]) == {"scipy.csgraph.dijkstra", "skimage.graph.MCP"}
+
+
+def test_the_peak_of_memory_is_what_a_tree_needs(tmp_path: Path) -> None:
+    """Padded weights, costs and parents take 9 bytes a cell; no more than five times that is passed through."""
+    pace = make_field("uniform", 1024)
+    np.save(tmp_path / "pace.npy", pace)
+    found = measure("memory", str(tmp_path / "pace.npy"), "ours", "5000", "paper")["mb"]
+    if found is None:
+        pytest.skip("the system does not tell a process's peak of memory")
+    assert 9 * pace.size / 1e6 <= found <= 45 * pace.size / 1e6
+
+
+def test_a_process_that_fails_is_told_in_a_sentence() -> None:
+    with pytest.raises(SwarmError, match="exit code 1: expected memory FIELD"):
+        measure("nonsense")
+
+
+def test_costs_along_parents_are_sums_and_circles_cost_inf() -> None:
+    pace = np.array([[1, 2, 4, 8, 16]], np.float32)
+    parents = np.array([-1, 0, 1, 4, 3])
+    np.testing.assert_array_equal(rivals.costs_along(pace, parents, 0), [[0, 1, 3, np.inf, np.inf]])
+
+
+# --- fields ------------------------------------------------------------------------------------------------------
+
+
+def test_a_field_may_be_an_array_a_map_or_a_terrain(tmp_path: Path) -> None:
+    pace = np.array([[1, 2, np.inf], [3, 4, 5]], np.float64)
+    np.save(tmp_path / "pace.npy", pace)
+    np.testing.assert_array_equal(make_field(str(tmp_path / "pace.npy"), 9), pace.astype(np.float32))
+    (tmp_path / "a.map").write_text("type octile\nheight 2\nwidth 3\nmap\n..@\nT.G\n", encoding="ascii")
+    np.testing.assert_array_equal(
+        make_field(str(tmp_path / "a.map"), 9), np.array([[1, 1, np.inf], [np.inf, 1, 1]], np.float32)
+    )
+    rows = "\n".join(" ".join(str(row + col) for col in range(12)) for row in range(10))
+    (tmp_path / "a.asc").write_text(
+        f"ncols 12\nnrows 10\nxllcorner 0\nyllcorner 0\ncellsize 30\nNODATA_value -9999\n{rows}\n", encoding="ascii"
+    )
+    assert make_field(str(tmp_path / "a.asc"), 9).shape == (10, 12)
+
+
+@pytest.mark.parametrize(
+    ("array", "complaint"),
+    [
+        (np.array([[1.0, -2.0]]), "row 0, column 1: a pace of -2.0; expected more than 0"),
+        (np.array([[np.nan]]), "row 0, column 0: a pace of nan"),
+        (np.ones(3), r"shape \(3,\) of float64; expected rows x cols"),
+        (np.array([["a"]]), "of <U1; expected"),
+        (np.full((3, 3), np.inf), "every cell of the terrain is lethal"),
+    ],
+)
+def test_an_array_that_is_no_field_is_refused(tmp_path: Path, array: Any, complaint: str) -> None:
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(TerrainError, match=complaint):
+        Field(make_field(str(tmp_path / "a.npy"), 9))
+
+
+def test_a_file_that_is_no_array_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.npy").write_bytes(b"hello")
+    with pytest.raises(TerrainError, match=r"a\.npy is no \.npy array"):
+        make_field(str(tmp_path / "a.npy"), 9)
+
+
+# --- chases ------------------------------------------------------------------------------------------------------
+
+
+def test_full_growths_have_no_gap_and_no_strategy_beats_the_optimum() -> None:
+    report = bench("gap", "--dem", "uniform", "--frames", "12", "--runs", "1", "--walk", "random,waypoints,evade")
+    assert [(row["walk"], row["strategy"]) for row in report["rows"]] == [
+        (walk, strategy) for walk in ("random", "waypoints", "evade") for strategy in STRATEGIES
+    ]
+    for row in report["rows"]:
+        assert row["frames"] == 12
+        assert row["routes_judged"] > 12 * 190
+        assert 1 <= row["gap_p50"] <= row["gap_p95"] <= row["gap_max"]
+        assert row["gap_mean"] <= row["gap_max"]
+        assert 0 < row["frame_ms_p50"] <= row["frame_ms_max"]
+        if row["strategy"] == "full":
+            assert row["gap_max"] < 1 + 1e-5
+            assert row["updates"] == {"full": 12}
+        if row["strategy"] == "variable_range":
+            assert row["gap_max"] > 1.001, "a window cannot have kept the whole tree exact"
+
+
+@pytest.mark.parametrize("model", ["rmnp/rmnp-dem.tif", "jacksboro/jacksboro_fault_dem.npz"])
+def test_the_gap_on_real_elevation_stays_small(model: str) -> None:
+    if not (DEM / model).exists():
+        pytest.skip(f"{DEM / model} is not here")
+    report = bench("gap", "--dem", str(DEM / model), "--frames", "30", "--runs", "1", "--strategies", "rotation")
+    assert report["rows"][0]["gap_mean"] < 1.02
+    assert report["rows"][0]["proven_p50"] >= report["rows"][0]["gap_p50"]
+
+
+def test_all_strategies_see_the_same_moves_and_a_seed_repeats_them() -> None:
+    field = Field(make_field("terrain", 64))
+    plan = Plan(targets=2, vehicles=6, frames=12, seed=5)
+    one = chase(field, {"rotation": PlannerConfig(strategy="rotation")}, plan)
+    two = chase(
+        field, {name: PlannerConfig(strategy=name) for name in ("full", "variable_range", "rotation")}, plan
+    )
+    for a, b in zip(one["rotation"].gaps, two["rotation"].gaps, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_targets_that_do_not_fit_into_memory_are_run_in_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = Field(make_field("uniform", 48))
+    plan = Plan(targets=5, vehicles=10, frames=4, probes=20)
+    entrants = {"full": PlannerConfig(strategy="full")}
+    assert chase(field, entrants, plan)["full"].batches == 1
+    monkeypatch.setattr("launch_scripts.bench.planning.chase.memory_free", lambda: 0)
+    tally = chase(field, entrants, plan)["full"]
+    assert tally.batches == 5
+    assert len(tally.frame_ms) == 4
+    assert tally.updates == {"full": 20}
+
+
+def test_a_strategy_whose_time_is_up_still_gets_the_fewest_frames() -> None:
+    field = Field(make_field("uniform", 48))
+    tally = chase(field, {"full": PlannerConfig(strategy="full")}, Plan(frames=50, seconds=1e-9, targets=1))["full"]
+    assert len(tally.frame_ms) == FEWEST
+
+
+def test_only_routes_that_exist_are_judged() -> None:
+    tally = Tally(frame_ms=[1.0])
+    routes = RouteBatch(
+        np.array([OK, NO_TARGET, OK], np.uint8),
+        np.array([0, 1, 2]),
+        np.empty(0, np.uint8),
+        np.zeros(3, np.int64),
+        *(np.array(values) for values in ([3.0, np.inf, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0])),
+    )
+    tally.judge(routes, np.array([2.0, 1.0, 0.0], np.float32))
+    row = tally.row()
+    assert row["gap_mean"] == row["gap_max"] == 1.5
+    assert row["routes_judged"] == 1
+    assert row["proven_p95"] is None, "no bound is no number"
+
+
+def test_the_paper_s_tables_have_its_rows() -> None:
+    report = bench("paper", "--size", "48", "--frames", "6")
+    assert [(row["targets"], row["vehicles"]) for row in report["table_1"]] == [
+        (targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)
+    ]
+    assert {row["strategy"] for row in report["table_2"]} == set(STRATEGIES)
+    assert report["published"] is None
+    exact = next(row for row in report["table_2"] if row["strategy"] == "full")
+    assert exact["gap_max"] < 1 + 1e-5
+    assert exact["updates"] == {"full": 60}
+
+
+def test_scale_varies_one_thing_at_a_time_unless_all_is_wanted() -> None:
+    axes = ([512, 1024], [1, 10, 100], [10, 100])
+    assert points_of(*axes, full=False) == [
+        *((512, 1, 100), (512, 10, 10), (512, 10, 100), (512, 100, 100), (1024, 10, 100)),
+    ]
+    assert len(points_of(*axes, full=True)) == 12
+
+
+def test_scale_has_a_row_per_point_and_strategy_and_draws_them(tmp_path: Path) -> None:
+    picture = tmp_path / "scale.png"
+    report = bench(
+        *("scale", "--sizes", "32,128", "--targets", "1,3", "--vehicles", "5,20", "--frames", "5"),
+        *("--strategies", "full,rotation", "--picture", str(picture)),
+    )
+    found = [(row["size"], row["targets"], row["vehicles"], row["strategy"]) for row in report["rows"]]
+    assert len(found) == len(set(found)) == 2 * 4
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    larger = {
+        (row["size"], row["strategy"]): row["frame_ms_p50"] for row in report["rows"] if row["vehicles"] == 20
+    }
+    assert larger[128, "full"] > larger[32, "full"]
+
+
+def test_gap_draws_a_picture(tmp_path: Path) -> None:
+    picture = tmp_path / "gap.png"
+    bench(
+        *("gap", "--dem", "maze", "--frames", "4", "--runs", "2", "--strategies", "full,rotation"),
+        *("--walk", "random,evade", "--vehicles", "20", "--picture", str(picture)),
+    )
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("paper", "--size", "48", "--frames", "6"),
+        ("scale", "--sizes", "32", "--targets", "2", "--vehicles", "10", "--frames", "4"),
+        ("gap", "--dem", "uniform", "--frames", "4", "--runs", "1"),
+    ],
+    ids=["paper", "scale", "gap"],
+)
+def test_tables_fit_into_eighty_columns(words: tuple[str, ...]) -> None:
+    assert_fits(words_of(*words))
+
+
+@pytest.mark.slow
+def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
+    report = bench("start", "--size", "64", "--runs", "1", "--no-kernels")
+    cold, warm = report["rows"]
+    assert (cold["cache"], warm["cache"]) == ("cold", "warm")
+    assert cold["cpu_s"] > 1.5 * warm["cpu_s"] > 0
+    console = Console(width=80, record=True, file=io.StringIO())
+    for part in tables(report):
+        console.print(part)
+    assert_fits(console.export_text())
+
+
+# --- what a user may do wrong ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("peers", "--field", "moon"), "field 'moon' is neither of terrain, uniform, maze nor a file"),
+        (("peers", "--edge", "4"), "--edge is '4', expected paper or octile"),
+        (("gap", "--dem", "no/such.tif"), "field 'no/such.tif' is neither of"),
+        (("gap", "--walk", "fly"), "--walk 'fly' is not one of random, waypoints, evade"),
+        (("gap", "--strategies", "best"), "strategy 'best' is not one of auto, full"),
+        (("gap", "--strategies", ","), "--strategies is ','"),
+        (("gap", "--dem", "maze", "--vehicles", "999999"), "--vehicles is 999999; the field has"),
+        (("gap", "--picture", "no/such/gap.png"), "--picture is no/such/gap.png: there is no folder"),
+        (("scale", "--picture", "scale.pdf"), "expected a name that ends in .png"),
+        (("scale", "--sizes", "0"), "--sizes is '0', expected numbers of at least 16"),
+        (("scale", "--targets", "many"), "--targets is 'many', expected numbers of at least 1"),
+        (("scale", "--field", "a.tif"), "--field is 'a.tif', expected terrain, uniform, maze"),
+        (("scale", "--sizes", "16", "--targets", "999", "--vehicles", "1"), "--targets is 999; the field has"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
+)
+def test_bad_input_is_one_sentence(words: tuple[str, ...], complaint: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        CliRunner().invoke(app, list(words), catch_exceptions=False)
+    assert complaint in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize("words", [("peers", "--size", "0"), ("gap", "--frames", "0"), ("start", "--runs", "x")])
+def test_a_number_out_of_range_is_refused_by_name(words: tuple[str, ...]) -> None:
+    done = CliRunner().invoke(app, list(words))
+    assert done.exit_code == 2
+    assert words[1] in done.stderr
+
+
+@pytest.mark.parametrize("command", ["peers", "start", "paper", "scale", "gap"])
+def test_help_teaches_with_an_example(command: str) -> None:
+    assert f"swarm bench {command}" in words_of(command, "--help").replace(f"Usage: swarm bench {command}", "", 1)

@@ -1,0 +1,192 @@
+"""The command line: what a user may type, and what comes back. Mistakes get a sentence and an exit code."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from launch_scripts.cli import main
+from launch_scripts.launcher import options
+from swarm.config.scenario import Scenario, TlsConfig
+from swarm.errors import BusError, ConfigError, StoreError
+
+
+def swarm(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str
+) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["swarm", *arguments])
+    monkeypatch.setenv("COLUMNS", "120")
+    try:
+        code = main()
+    except SystemExit as end:
+        code = int(end.code or 0)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+    return lambda *arguments: swarm(capsys, monkeypatch, *arguments)
+
+
+def test_help_teaches_with_examples(run) -> None:  # type: ignore[no-untyped-def]
+    code, out, _ = run("--help")
+    assert code == 0
+    assert "swarm route --target t3 --row 40 --col 200" in out
+    for command in ("demo", "up", "router", "keeper", "planner", "agent", "targets", "monitor", "route", "status"):
+        assert command in out
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["demo", "up", "simulate", "route", "status", "router", "keeper", "planner", "agent", "targets", "monitor"],
+)
+def test_every_command_explains_itself(run, command: str) -> None:  # type: ignore[no-untyped-def]
+    code, out, _ = run(command, "--help")
+    assert code == 0
+    assert f"Usage: swarm {command}" in out
+
+
+def test_the_version_is_the_packages(run) -> None:  # type: ignore[no-untyped-def]
+    assert run("--version") == (0, f"swarm {version('terrain-swarm')}\n", "")
+
+
+def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:
+    program = "import launch_scripts.cli, sys; sys.exit('zenoh' in sys.modules or 'numpy' in sys.modules)"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_the_launcher_never_imports_numba_or_rerun() -> None:
+    program = "import launch_scripts.launcher.up, sys; sys.exit('numba' in sys.modules or 'rerun' in sys.modules)"
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_an_unknown_scenario_gets_the_nearest_name(run) -> None:  # type: ignore[no-untyped-def]
+    code, out, err = run("up", "jaksboro")
+    assert (code, out) == (2, "")
+    assert err.startswith("swarm: no scenario 'jaksboro' (did you mean 'jacksboro'?)")
+
+
+def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "mine.toml"
+    path.write_text("[vehicles]\nsense_rnge_m = 3\n")
+    code, _, err = run("up", str(path))
+    assert code == 2
+    assert str(path) in err
+    assert "vehicles.sense_rnge_m" in err
+    assert "'sense_range_m'" in err
+    assert err.count("\n") == 1
+
+
+def test_a_scenario_file_that_is_not_there(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    code, _, err = run("up", str(tmp_path / "gone.toml"))
+    assert (code, err.count("\n")) == (2, 1)
+    assert "No such file" in err
+
+
+def test_an_unknown_role_is_refused(run) -> None:  # type: ignore[no-untyped-def]
+    code, _, err = run("up", "synthetic", "--only", "driver")
+    assert (code, err) == (
+        2,
+        "swarm: --only: no role 'driver'; the roles are router, keeper, monitor, planner, targets, agent\n",
+    )
+
+
+def test_a_planner_for_a_target_that_the_scenario_does_not_have(run) -> None:  # type: ignore[no-untyped-def]
+    code, _, err = run("planner", "--target", "t9", "synthetic")
+    assert (code, err) == (2, "swarm: scenario synthetic has no planner 't9'; it has t0, t1\n")
+
+
+def test_a_port_that_is_taken_is_named_with_the_way_out(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        code, _, err = run("up", "synthetic", "--port", str(port), "--runs", str(tmp_path / "runs"))
+    assert code == 4
+    assert f"port {port}, which the router needs, is taken; choose others with --port N" in err
+    assert not (tmp_path / "runs").exists()
+
+
+def test_runs_where_nobody_may_write(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "runs").write_text("a file in the way")
+    code, _, err = run("up", "synthetic", "--port", "0", "--runs", str(tmp_path / "runs"))
+    assert code == 6
+    assert err.startswith(f"swarm: cannot make a run folder in {tmp_path / 'runs'}")
+    assert "Traceback" not in err
+
+
+def test_nobody_there_to_ask(run) -> None:  # type: ignore[no-untyped-def]
+    (port,) = options.free_ports(1)
+    code, _, err = run("status", "--connect", f"tcp/127.0.0.1:{port}")
+    assert code == 4
+    assert err.startswith(f"swarm: cannot reach a router at tcp/127.0.0.1:{port}")
+
+
+def test_an_endpoint_beyond_this_machine_needs_tls(run) -> None:  # type: ignore[no-untyped-def]
+    code, _, err = run("status", "--connect", "tcp/10.1.2.3:7447")
+    assert code == 2
+    assert "use tls/10.1.2.3:7447" in err
+
+
+def test_the_tls_options_belong_together() -> None:
+    assert options.tls_of(None, None, None) is None
+    with pytest.raises(ConfigError, match="belong together"):
+        options.tls_of("ca.pem", None, None)
+    with pytest.raises(ConfigError, match=r"no file ca\.pem"):
+        options.tls_of("ca.pem", "me.pem", "me.key")
+    assert options.tls_of(__file__, __file__, __file__) == TlsConfig(
+        ca=__file__, certificate=__file__, key=__file__
+    )
+
+
+def test_overrides_of_the_network_are_checked_like_the_file() -> None:
+    changed = options.with_network(Scenario(), connect="tcp/127.0.0.1:9", namespace="other").network
+    assert (changed.connect, changed.namespace) == (("tcp/127.0.0.1:9",), "other")
+    with pytest.raises(ConfigError, match="namespace"):
+        options.with_network(Scenario(), namespace="a/b")
+
+
+def test_a_port_gives_the_live_view_the_two_after_it_and_0_picks_free_ones() -> None:
+    scenario = options.with_port(Scenario(), 8000)
+    assert scenario.network.listen == scenario.network.connect == ("tcp/127.0.0.1:8000",)
+    assert (scenario.monitor.grpc_port, scenario.monitor.web_port) == (8001, 8002)
+    free = options.with_port(Scenario(), 0)
+    ports = {free.network.listen[0].rpartition(":")[2], str(free.monitor.grpc_port), str(free.monitor.web_port)}
+    assert len(ports) == 3
+    options.check_ports(free, ("router", "monitor"))
+
+
+def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        import msgspec
+
+        scenario = options.with_port(Scenario(), 0)
+        monitor = msgspec.structs.replace(scenario.monitor, web_port=port)
+        scenario = msgspec.structs.replace(scenario, monitor=monitor)
+        with pytest.raises(BusError, match=f"port {port}, which the live view needs"):
+            options.check_ports(scenario, ("router", "monitor"))
+        options.check_ports(scenario, ("router", "agent"))
+
+
+def test_two_runs_of_one_second_get_two_folders(tmp_path: Path) -> None:
+    assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000"
+    assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000-2"
+    with pytest.raises(StoreError, match=r"No such file|Permission|Read-only"):
+        options.make_run_dir(Path("/proc/nowhere"), "x")
+
+
+def test_simulate_prints_the_same_report_as_a_run(run) -> None:  # type: ignore[no-untyped-def]
+    pytest.importorskip("launch_scripts.simulation.simulate")
+    code, out, _ = run("simulate", "synthetic", "--seconds", "2", "--json")
+    assert code == 0
+    assert json.loads(out)["scenario"] == "synthetic"

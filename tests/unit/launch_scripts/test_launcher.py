@@ -1,0 +1,215 @@
+"""The launcher with processes that do nothing: starts, restarts, ordered ends, and nobody left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.processes import eventually, session_of
+
+from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm, WarmUp
+from launch_scripts.process_table import ROLES, STOP_ORDER, ProcessSpec, processes_of
+from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
+from swarm.runtime.role import RoleSetup
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forkserver() -> None:
+    warm_up = WarmUp([])
+    warm_up.begin()
+    eventually(lambda: warm_up.done(0.05), 20)
+
+
+@pytest.fixture
+def swarms() -> Iterator[list[LocalSwarm]]:
+    swarms: list[LocalSwarm] = []
+    yield swarms
+    for swarm in swarms:
+        swarm.kill()
+
+
+def swarm_of(swarms: list[LocalSwarm], folder: Path, *rows: tuple[str, str, str]) -> LocalSwarm:
+    def setup_of(spec: ProcessSpec) -> RoleSetup:
+        return RoleSetup(Scenario(), "run-1", spec.role, spec.id, time.time_ns(), 0, folder)
+
+    specs = [ProcessSpec(role, id, f"support.dummy_roles:{function}") for role, id, function in rows]
+    swarms.append(LocalSwarm(specs, setup_of, folder))
+    return swarms[-1]
+
+
+def wait_for_line(path: Path, line: str, within_s: float = 10.0) -> None:
+    eventually(lambda: path.exists() and line in path.read_text().split(), within_s, f"{line} in {path.name}")
+
+
+def endings_within(swarm: LocalSwarm, within_s: float = 10.0) -> list[Ending]:
+    found: list[Ending] = []
+    eventually(lambda: found.extend(swarm.poll()) or found, within_s, "an ending")
+    return found
+
+
+def test_the_table_has_a_process_for_each_target_and_each_25_vehicles() -> None:
+    scenario = Scenario(targets=(TargetConfig(count=3),), groups=(GroupConfig(vehicles=60),))
+    names = [spec.name for spec in processes_of(scenario)]
+    assert names == [
+        *("router-0", "keeper-0", "monitor-0", "planner-t0", "planner-t1", "planner-t2"),
+        *("targets-0", "agent-a0", "agent-a1", "agent-a2"),
+    ]
+    assert [spec.name for spec in processes_of(scenario, ("router", "agent"))][:2] == ["router-0", "agent-a0"]
+
+
+def test_targets_that_somebody_else_tracks_need_no_driver() -> None:
+    scenario = Scenario(targets=(TargetConfig(walk="external"),))
+    assert "targets-0" not in [spec.name for spec in processes_of(scenario)]
+
+
+def test_the_router_starts_first_and_ends_last() -> None:
+    assert ROLES[0] == STOP_ORDER[-1] == "router"
+    assert sorted(ROLES) == sorted(STOP_ORDER)
+
+
+def test_the_wait_before_a_restart_doubles_to_five_seconds_and_is_short_again_after_a_good_run() -> None:
+    backoff = Backoff()
+    assert [backoff.crashed(ran_s=0.0) for _ in range(7)] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
+    assert backoff.crashed(ran_s=60.0) == 0.2
+
+
+def test_processes_end_role_by_role_and_each_has_a_log(swarms: list[LocalSwarm], tmp_path: Path) -> None:
+    rows = [
+        ("router", "0", "quiet"),
+        ("keeper", "0", "quiet"),
+        ("planner", "t0", "quiet"),
+        ("agent", "a0", "quiet"),
+    ]
+    swarm = swarm_of(swarms, tmp_path, *rows)
+    swarm.start()
+    order = tmp_path / "order.txt"
+    for role, id, _ in rows:
+        wait_for_line(order, f"+{role}-{id}")
+    assert swarm.by_role()["planner"] == (1, 1)
+    assert swarm.stop(lambda: time.sleep(0.02)) == []
+    assert order.read_text().split()[4:] == ["-agent-a0", "-planner-t0", "-keeper-0", "-router-0"]
+    assert "hello from t0" in (tmp_path / "planner-t0.log").read_text()
+
+
+def test_a_process_that_crashes_is_restarted_until_it_runs(swarms: list[LocalSwarm], tmp_path: Path) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "crash_twice"))
+    swarm.start()
+    (first,) = endings_within(swarm)
+    assert first.sentence == "ZeroDivisionError: a bug of ours"
+    assert (first.refused, first.restart_in_s) == (False, 0.2)
+    (second,) = endings_within(swarm)
+    assert second.restart_in_s == 0.4
+    eventually(lambda: swarm.poll() or (tmp_path / "order.txt").exists(), 10)
+    assert swarm.restarts == 2
+    assert "ZeroDivisionError" in (tmp_path / "planner-t0.log").read_text()
+    assert swarm.stop(lambda: time.sleep(0.02)) == []
+
+
+def test_a_process_killed_from_outside_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "quiet"))
+    swarm.start()
+    wait_for_line(tmp_path / "order.txt", "+planner-t0")
+    process = swarm.running[0].process
+    assert process is not None
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    (ending,) = endings_within(swarm)
+    assert ending.sentence == "killed by SIGKILL"
+    eventually(lambda: swarm.poll() or swarm.running[0].alive, 5)
+    assert swarm.restarts == 1
+
+
+def test_a_process_that_leaves_without_being_asked_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "leave_early"))
+    swarm.start()
+    (ending,) = endings_within(swarm)
+    assert ending.restart_in_s == 0.2
+
+
+def test_an_error_of_the_users_comes_up_as_its_sentence_and_code(swarms: list[LocalSwarm], tmp_path: Path) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "refuse"))
+    swarm.start()
+    (ending,) = endings_within(swarm)
+    assert ending.sentence == "the scenario is not to my liking"
+    assert (ending.refused, ending.exit_code, ending.restart_in_s) == (True, 2, None)
+    log = (tmp_path / "planner-t0.log").read_text()
+    assert "the scenario is not to my liking" in log
+    assert "Traceback" not in log
+
+
+def test_who_does_not_end_when_asked_is_killed_and_named(
+    swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("launch_scripts.launcher.local_swarm.STOP_GRACE_S", 0.5)
+    swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
+    swarm.start()
+    wait_for_line(tmp_path / "order.txt", "+router-0")
+    time.sleep(0.3)
+    assert swarm.stop(lambda: time.sleep(0.02)) == ["agent-a0 did not end within 0.5 s and was killed"]
+
+
+def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Path) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("keeper", "0", "fail_at_the_end"))
+    swarm.start()
+    wait_for_line(tmp_path / "order.txt", "+keeper-0")
+    (failure,) = swarm.stop(lambda: time.sleep(0.02))
+    assert failure == "keeper-0 was asked to end, but RuntimeError: could not write the last page"
+
+
+_LAUNCHER = """
+import signal, sys, time
+from pathlib import Path
+from launch_scripts.launcher.local_swarm import LocalSwarm, WarmUp
+from launch_scripts.process_table import ProcessSpec
+from swarm.config.scenario import Scenario
+from swarm.runtime.role import RoleSetup
+
+asked = []
+signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
+folder = Path(sys.argv[1])
+warm_up = WarmUp([])
+warm_up.begin()
+while not warm_up.done(0.05): pass
+specs = [ProcessSpec("planner", "t0", "support.dummy_roles:quiet"), ProcessSpec("agent", "a0", sys.argv[2])]
+swarm = LocalSwarm(specs, lambda s: RoleSetup(Scenario(), "r", s.role, s.id, 1, 0, folder), folder)
+swarm.start()
+while not asked: time.sleep(0.1); swarm.poll()
+sys.exit(len(swarm.stop(lambda: time.sleep(0.02))))
+"""
+
+
+def launcher(folder: Path, agent: str) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, "-c", _LAUNCHER, str(folder), agent]
+    return subprocess.Popen(command, start_new_session=True, env=environment)
+
+
+def test_kill_9_of_the_launcher_leaves_no_process_behind(tmp_path: Path) -> None:
+    with launcher(tmp_path, "support.dummy_roles:stubborn") as process:
+        wait_for_line(tmp_path / "order.txt", "+planner-t0", within_s=20)
+        assert len(session_of(process.pid)) == 5  # launcher, tracker, forkserver, two roles
+        process.kill()
+    eventually(lambda: not session_of(process.pid), 8, "the end of all")
+
+
+def test_a_ctrl_c_that_reaches_the_whole_group_is_for_the_launcher_alone(tmp_path: Path) -> None:
+    with launcher(tmp_path, "support.dummy_roles:quiet") as process:
+        for name in ("+planner-t0", "+agent-a0"):
+            wait_for_line(tmp_path / "order.txt", name, within_s=20)
+        os.killpg(process.pid, signal.SIGINT)
+        try:
+            assert process.wait(20) == 0
+        finally:
+            process.kill()
+    order = (tmp_path / "order.txt").read_text().split()
+    assert order[2:] == ["-agent-a0", "-planner-t0"]
+    assert "KeyboardInterrupt" not in (tmp_path / "planner-t0.log").read_text()
+    eventually(lambda: not session_of(process.pid), 8, "the end of all")

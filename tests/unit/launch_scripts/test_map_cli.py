@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.map_strategies import GRID, mark_sets, set_of
+from typer.testing import CliRunner
+
+from launch_scripts.commands.map import app
+from shared_map.keeper.export import from_json, to_bands, to_json
+from shared_map.keeper.store import KeeperStore
+from swarm.errors import StoreError
+from swarm.wire.messages.marks import FOLDS, MarkSet
+from swarm.wire.statements import MarkKind
+
+PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
+SETS = [
+    set_of("a1.1", 0, 3, {5: (LETHAL, 0, 10), 6: (PACE, 2.5, 11)}),
+    set_of("a2.1", 0, 1, {6: (CLEAR, 0, 12)}),
+    set_of("a2.1", 4, 9, {}),
+]
+
+
+def stored(path: Path, sets: list[MarkSet]) -> Path:
+    with KeeperStore(path) as store:
+        store.bind("fedcba9876543210", GRID)
+        store.save(sets)
+    return path
+
+
+@given(st.lists(mark_sets(), max_size=6, unique_by=lambda each: (each.tile, each.author)))
+def test_a_map_comes_out_of_json_as_it_went_in(sets: list[MarkSet]) -> None:
+    terrain, grid, read = from_json(to_json("t", GRID, sets))
+    assert (terrain, grid) == ("t", GRID)
+
+    def bare(each: MarkSet) -> MarkSet:  # a pace means something in a PACE mark only
+        return set_of(
+            each.author,
+            each.tile,
+            each.seq // FOLDS,
+            {
+                cell: (kind, pace if kind == PACE else 0.0, stamp)
+                for cell, kind, pace, stamp in zip(
+                    np.frombuffer(each.cells, "<u2").tolist(),
+                    each.kinds,
+                    np.frombuffer(each.paces, "<f4").tolist(),
+                    np.frombuffer(each.stamps_ns, "<i8").tolist(),
+                    strict=True,
+                )
+            },
+            epoch=each.epoch,
+        )
+
+    assert read == [bare(each) for each in sorted(sets, key=lambda each: (each.tile, each.author))]
+
+
+def test_the_bands_show_the_winners() -> None:
+    pace, kind = to_bands(GRID, SETS)
+    assert kind[0, 5:8].tolist() == [LETHAL, CLEAR, 255]
+    assert np.isinf(pace[0, 5])
+    assert np.isnan(pace[0, 6])
+
+
+def test_export_import_and_inspect_on_the_command_line(tmp_path: Path) -> None:
+    store = stored(tmp_path / "map.sqlite", SETS)
+    out, again = tmp_path / "map.json", tmp_path / "again.sqlite"
+    assert CliRunner().invoke(app, ["export", str(store), str(out)]).exit_code == 0
+    assert CliRunner().invoke(app, ["import", str(out), str(again)]).exit_code == 0
+    with KeeperStore(again) as copy:
+        assert sorted(copy.load(), key=lambda each: (each.tile, each.author)) == SETS
+    found = json.loads(CliRunner().invoke(app, ["inspect", str(again), "--json"]).output)
+    assert (found["marks"], found["sets"], found["cells_with_marks"], found["cells_lethal"]) == (3, 3, 2, 1)
+    assert found["authors"]["a2.1"] == {"sets": 2, "marks": 1, "tombstones": 1}
+    assert "3 marks in 3 sets" in CliRunner().invoke(app, ["inspect", str(again)]).output
+
+
+def test_a_geotiff_says_where_and_what(tmp_path: Path) -> None:
+    import rasterio
+
+    store = stored(tmp_path / "map.sqlite", SETS)
+    out = tmp_path / "map.tif"
+    assert CliRunner().invoke(app, ["export", str(store), str(out)]).exit_code == 0
+    with rasterio.open(out) as tiff:
+        assert (tiff.height, tiff.width, tiff.transform.a) == (GRID.rows, GRID.cols, GRID.resolution_m)
+        assert np.isinf(tiff.read(1)[0, 5])
+        assert tiff.read(2)[0, 5:7].tolist() == [LETHAL, CLEAR]
+        assert tiff.tags()["terrain"] == "fedcba9876543210"
+
+
+def complaint(arguments: list[str]) -> str:
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, StoreError), result.output
+    return str(result.exception)
+
+
+def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path) -> None:
+    store = stored(tmp_path / "map.sqlite", SETS)
+    assert "there is no store" in complaint(["inspect", str(tmp_path / "none")])
+    assert "must end in .json, .tif" in complaint(["export", str(store), str(tmp_path / "map.txt")])
+    assert "cannot write" in complaint(["export", str(store), str(tmp_path / "no" / "map.json")])
+    junk = tmp_path / "junk"
+    junk.write_text("no map")
+    assert "cannot read the store" in complaint(["inspect", str(junk)])
+    assert "not an exported map: file" in complaint(["import", str(junk), str(tmp_path / "x.sqlite")])
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        ({"format": "other"}, "format is 'other'"),
+        ({"grid": {"rows": 0, "cols": 1, "resolution_m": 1}}, "grid: a grid needs"),
+        ({"sets": [{}]}, r"sets\[0\]: 'marks' is missing"),
+        ({"sets": [{"marks": [[99, 0, "lethal", None, 1]], "tile": 0}]}, "row 99, col 0 is not in 40 x 70"),
+        ({"sets": [{"marks": [[0, 40, "lethal", None, 1]], "tile": 0}]}, "outside tile 0"),
+        ({"sets": [{"marks": [[0, 0, "soft", None, 1]], "tile": 0}]}, "SOFT"),
+    ],
+)
+def test_a_garbled_export_is_refused_with_the_place(change: dict[str, object], place: str) -> None:
+    text = json.dumps({**json.loads(to_json("t", GRID, SETS)), **change})
+    with pytest.raises(StoreError, match=place):
+        from_json(text)

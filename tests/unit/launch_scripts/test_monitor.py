@@ -1,0 +1,302 @@
+"""The monitor: listens, records, serves on loopback, and is in nobody's way."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.fake_run import fake_run
+from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
+
+from launch_scripts.monitor import die_with_parent
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.sinks import Outlets, new_recording_path
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Event
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import MonitorConfig, Scenario
+from swarm.errors import BusError, StoreError
+from swarm.wire.messages.processes import Note
+from swarm.wire.messages.targets import Sighted
+from swarm.wire.messages.vehicles import Followed
+from swarm.wire.topics import FOLLOWED, NOTE, TOPICS
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return little_scenario()
+
+
+@pytest.fixture(scope="module")
+def terrain() -> Terrain:
+    return little_terrain()
+
+
+def rows_by_entity(path: Path) -> dict[str, int]:
+    """Entity -> rows logged over time, without what is static."""
+    from rerun.chunk import RrdReader
+
+    counts: dict[str, int] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a file without a footer
+        for chunk in RrdReader(str(path)).stream():
+            if not chunk.is_static:
+                counts[str(chunk.entity_path)] = counts.get(str(chunk.entity_path), 0) + chunk.num_rows
+    return counts
+
+
+def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
+    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
+    tiles = rig.service._ground.tile_rows * rig.service._ground.tile_cols
+    rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
+    rig.close()
+    rows = rows_by_entity(tmp_path / "run.rrd")
+    assert rows["/world/vehicles"] >= 12
+    assert rows["/world/targets/balls"] >= 12
+    for name in ("world/targets/poles", "world/trails/vehicles", "world/windows", "summary"):
+        assert rows[f"/{name}"] >= 3, name
+    for name in ("world/routes/t0", "world/routes/t1", "log"):
+        assert rows[f"/{name}"] >= 1, name
+    for plot in ("states", "captures_and_marks", "gap", "growth_ms", "messages"):
+        assert rows[f"/plots/{plot}"] >= 3, plot
+    textures = [rows[f"/world/ground/{tile}"] for tile in range(tiles)]
+    assert min(textures) >= 1
+    assert max(textures) >= 2, "marks change the photo"
+
+
+def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
+    seen = Sighted(
+        author="a0.1", group="all", target="t0", seq=1, stamp_ns=1, until_ns=NS_PER_S,
+        cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
+    )  # fmt: skip
+    rig.play([(NS_PER_S // 2, seen)])
+    rig.until(3 * NS_PER_S)
+    rig.close()
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 2
+
+
+def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
+    rig = Rig(scenario, terrain, tmp_path / "late.rrd")
+    rig.scheduler.run_until(20 * NS_PER_S)
+    rig.play((now_ns + 20 * NS_PER_S, told) for now_ns, told in fake_run(terrain, hidden_truth(terrain), scenario))
+    rig.close()
+    assert rows_by_entity(tmp_path / "late.rrd")["/world/vehicles"] >= 12
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_sentence(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"cannot write .*run\.rrd: No such file or directory"):
+        new_recording_path(tmp_path / "nowhere")
+
+
+def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, None)
+    rig.speaker.publish(
+        FOLLOWED,
+        Followed(vehicle="v", target="t0", start=0, directions=b"\x00", cost_s=1.0, lower_bound_s=1.0),
+        agent="a0",
+        vehicle="v",
+    )
+    rig.until(NS_PER_S)
+    assert rig.service.counters.counts["routes_unreadable"] == 1
+    rig.close()
+
+
+def test_where_to_watch_is_told_once(scenario: Scenario, terrain: Terrain) -> None:
+    rig = Rig(scenario, terrain, None, live_url="http://127.0.0.1:1/")
+    heard: list[Event] = []
+    rig.speaker.subscribe(NOTE, heard.append)
+    rig.until(3 * NS_PER_S)
+    rig.close()
+    notes = [event.message for event in heard]  # type: ignore[union-attr]
+    assert [(note.kind, note.text) for note in notes if isinstance(note, Note)] == [
+        ("live_view", "http://127.0.0.1:1/")
+    ]
+
+
+def test_a_monitor_speaks_of_nothing_but_itself(scenario: Scenario, terrain: Terrain) -> None:
+    rig = Rig(scenario, terrain, None)
+    for topic in TOPICS:
+        rig.speaker.subscribe(topic, lambda _: None)
+    rig.play(fake_run(terrain, hidden_truth(terrain), msgspec.structs.replace(scenario, seconds=2.0)))
+    rig.close()
+    assert rig.said == {"run", "stats"}
+
+
+# --- outlets: sockets and files ---------------------------------------------------------------------------------
+
+
+def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> bool:
+    deadline_s = time.monotonic() + within_s
+    while time.monotonic() < deadline_s:
+        if condition():
+            return True
+        time.sleep(0.05)
+    return condition()
+
+
+def listeners(pid: int) -> set[str]:
+    """Local addresses, in the kernel's hex, on which a process listens."""
+    inodes = set()
+    for fd in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            target = os.readlink(fd)
+        except OSError:
+            continue
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    addresses = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and fields[9] in inodes:
+                addresses.add(fields[1].rpartition(":")[0])
+    return addresses
+
+
+def stream_port(live_url: str) -> int:
+    """Of the stream that the page leads to."""
+    page = http.client.HTTPConnection("127.0.0.1", urllib.parse.urlparse(live_url).port or 0)
+    page.request("GET", "/")
+    location = page.getresponse().getheader("Location") or ""
+    page.close()
+    stream = urllib.parse.parse_qs(urllib.parse.urlparse(location).query)["url"][0]
+    return urllib.parse.urlparse(stream).port or 0
+
+
+def children(pid: int) -> list[int]:
+    return [
+        int(child)
+        for thread in Path(f"/proc/{pid}/task").iterdir()
+        for child in (thread / "children").read_text().split()
+    ]
+
+
+@pytest.mark.network
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_home(
+    terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    before = children(os.getpid())
+    outlets = Outlets("r", tmp_path / "run.rrd", LIVE, make_blueprint(Ground(terrain)))
+    assert outlets.live_url is not None
+    try:
+        with urllib.request.urlopen(outlets.live_url, timeout=30) as reply:
+            assert "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A" in reply.url, "led to the stream"
+            assert b"re_viewer.js" in reply.read()
+            policy = reply.headers["Content-Security-Policy"]
+        assert policy.endswith("connect-src 'self' http://127.0.0.1:*")
+        with urllib.request.urlopen(f"{outlets.live_url}re_viewer_bg.wasm", timeout=30) as reply:
+            assert reply.headers["Content-Type"] == "application/wasm"
+            assert reply.read(4) == b"\0asm"
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"{outlets.live_url}etc/passwd", timeout=30)
+        assert eventually(lambda: listeners(os.getpid()) == {"0100007F"})
+        assert children(os.getpid()) == before, "the viewer program is gone again"
+        assert list(home.rglob("*")) == [], "nothing is written to the home folder"
+    finally:
+        began_s = time.monotonic()
+        outlets.close()
+    assert time.monotonic() - began_s < 4
+
+
+def test_a_killed_monitor_leaves_a_readable_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    script = f"""
+import time, numpy, pathlib
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.sinks import Outlets
+from launch_scripts.monitor.scene import Ground
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.scenario import MonitorConfig
+import rerun as rr
+ground = Ground(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
+outlets = Outlets("r", pathlib.Path({str(path)!r}), MonitorConfig(live=False), make_blueprint(ground))
+for n in range(100):
+    outlets.rec.set_time("tick", sequence=n)
+    outlets.rec.log("a", rr.Scalars(n))
+outlets.rec.flush(timeout_sec=5)
+print("written", flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as monitor:
+        assert monitor.stdout is not None
+        assert monitor.stdout.readline() == "written\n"
+        monitor.send_signal(signal.SIGKILL)
+    assert rows_by_entity(path)["/a"] == 100
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot tie a child to its parent's end")
+def test_a_tied_program_ends_with_its_parent_even_if_that_is_killed() -> None:
+    parent_script = f"""
+import os, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-I", {die_with_parent.__file__!r}, str(os.getpid()), "/bin/sleep", "60"])
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+    with subprocess.Popen([sys.executable, "-c", parent_script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = Path(f"/proc/{int(parent.stdout.readline())}")
+        assert eventually(lambda: b"sleep" in (child / "cmdline").read_bytes())
+        parent.send_signal(signal.SIGKILL)
+    assert eventually(lambda: not child.exists() or "\nState:\tZ" in (child / "status").read_text())
+
+
+@pytest.mark.network
+def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("launch_scripts.monitor.sinks._PORT_PATIENCE_S", 0.2)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        config = MonitorConfig(grpc_port=0, web_port=port)
+        with pytest.raises(
+            BusError, match=rf"live view on port {port}: Address already in use; .*monitor\.web_port"
+        ):
+            Outlets("r", None, config, make_blueprint(Ground(terrain)))
+
+
+@pytest.mark.network
+def test_logging_does_not_wait_for_a_viewer_that_reads_nothing(terrain: Terrain) -> None:
+    import rerun as rr
+
+    outlets = Outlets("r", None, LIVE, make_blueprint(Ground(terrain)))
+    try:
+        assert outlets.live_url is not None
+        port = stream_port(outlets.live_url)
+        with socket.create_connection(("127.0.0.1", port)) as stalled:
+            stalled.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n")
+            worst_s = 0.0
+            for n in range(100):
+                began_s = time.perf_counter()
+                outlets.rec.set_time("tick", sequence=n)
+                outlets.rec.log("a", rr.Points3D(np.zeros((2000, 3), np.float32)))
+                worst_s = max(worst_s, time.perf_counter() - began_s)
+        assert worst_s < 2.0
+    finally:
+        outlets.close()

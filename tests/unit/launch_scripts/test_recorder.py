@@ -1,0 +1,321 @@
+"""What the recorder makes of what it heard."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.tracks import Tracks
+from swarm.clock import NS_PER_S
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+from swarm.grid import GridSpec
+from swarm.liveness import Peer
+from swarm.runtime.stats import Histogram
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
+from swarm.wire.statements import MarkKind
+
+GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
+
+
+def scenario() -> Scenario:
+    return parse_scenario(
+        'name = "test"\nseed = 7\n[[targets]]\nname = "t"\ncount = 2\n'
+        "[[groups]]\nvehicles = 4\n[vehicles]\nper_agent = 2\n"
+    )
+
+
+@pytest.fixture
+def recorder() -> Recorder:
+    return Recorder(scenario(), GRID)
+
+
+def hear(recorder: Recorder, *messages: Message, at_s: float = 0.0) -> None:
+    for message in messages:
+        recorder.heard(message, {}, int(at_s * NS_PER_S))
+
+
+def stats(
+    role: str,
+    id: str,
+    incarnation: int = 1,
+    at_s: float = 0.0,
+    counts: dict[str, int] | None = None,
+    gauges: dict[str, float] | None = None,
+    **histograms: list[float],
+) -> Stats:
+    packed = {}
+    for name, values in histograms.items():
+        histogram = Histogram()
+        for value in values:
+            histogram.add(value)
+        packed[name] = histogram.buckets
+    return Stats(
+        role=role,
+        id=id,
+        incarnation=incarnation,
+        stamp_ns=int(at_s * NS_PER_S),
+        counts=counts or {},
+        gauges=gauges or {},
+        histograms=packed,
+    )
+
+
+def fleet(
+    author: str,
+    places: dict[str, tuple[float, float]],
+    at_s: float = 0.0,
+    region: int = 0,
+    state: VehicleState = VehicleState.FOLLOWING,
+    target: str | None = "t0",
+) -> Fleet:
+    count = len(places)
+    return Fleet(
+        author=author,
+        group="all",
+        region=region,
+        seq=int(at_s * 10),
+        stamp_ns=int(at_s * NS_PER_S),
+        ids=list(places),
+        target_ids=[] if target is None else [target],
+        cells=pack_column([0] * count, "<u4"),
+        east_m=pack_column([east for east, _ in places.values()], "<f4"),
+        south_m=pack_column([south for _, south in places.values()], "<f4"),
+        heading_rad=pack_column([0.0] * count, "<f4"),
+        states=bytes([state] * count),
+        targets=bytes([NO_TARGET if target is None else 0] * count),
+    )
+
+
+def pose(target: str, east_m: float, south_m: float, seq: int, captures: int = 0) -> TargetPose:
+    return TargetPose(
+        target=target,
+        incarnation=1,
+        seq=seq,
+        stamp_ns=seq,
+        cell=0,
+        x_m=GRID.west_m + east_m,
+        y_m=GRID.north_m - south_m,
+        captures=captures,
+        jumps=captures,
+    )
+
+
+def status(target: str, gap_max: float | None, following: int = 1) -> PlannerStatus:
+    return PlannerStatus(
+        target=target,
+        incarnation=1,
+        stamp_ns=0,
+        strategy="full",
+        target_cell=0,
+        map_version=1,
+        tree_age_ms=1.0,
+        window=[0, 0, 1, 1],
+        growths=3,
+        window_growths=2,
+        growth_ms=1.5,
+        routes_served=9,
+        following=following,
+        gap_mean=gap_max,
+        gap_p95=gap_max,
+        gap_max=gap_max,
+    )
+
+
+def marks(author: str, seq: int, statements: dict[int, tuple[MarkKind, float, int]], tile: int = 0) -> MarkSet:
+    cells = sorted(statements)
+    return MarkSet(
+        author=author,
+        group="all",
+        tile=tile,
+        epoch=1,
+        seq=seq,
+        cells=pack_column(cells, "<u2"),
+        kinds=bytes(int(statements[cell][0]) for cell in cells),
+        paces=pack_column([statements[cell][1] for cell in cells], "<f4"),
+        stamps_ns=pack_column([statements[cell][2] for cell in cells], "<i8"),
+    )
+
+
+def test_what_nobody_told_of_is_null_and_not_zero(recorder: Recorder) -> None:
+    report = recorder.report()
+    for name in ("seconds", "captures", "collisions", "lethal_entries", "stranded", "lost", "marks", "startup_s"):
+        assert report[name] is None, name
+    assert report["gap"] == {"mean": None, "p95": None, "max": None}
+    assert report["growth_ms"] == {"p50": None, "p99": None}
+    assert report["vehicles"] == 4
+    assert report["targets"] == 2
+
+
+def test_counts_are_summed_over_processes_and_incarnations_but_gauges_over_the_newest(recorder: Recorder) -> None:
+    hear(
+        recorder,
+        stats("agent", "a0", 1, 1.0, {"marks": 5}, {"stranded": 2.0}),
+        stats("agent", "a0", 1, 2.0, {"marks": 7}, {"stranded": 2.0}),
+        stats("agent", "a0", 2, 3.0, {"marks": 1}, {"stranded": 0.0}),
+        stats("agent", "a1", 1, 3.0, {"marks": 10}, {"stranded": 1.0}),
+    )
+    report = recorder.report()
+    assert report["marks"] == 7 + 1 + 10
+    assert report["stranded"] == 1
+    assert report["restarts"] == 1
+    assert report["processes"] == 2
+
+
+def test_an_older_stats_message_that_comes_late_changes_nothing(recorder: Recorder) -> None:
+    hear(recorder, stats("agent", "a0", 1, 2.0, {"marks": 7}), stats("agent", "a0", 1, 1.0, {"marks": 5}))
+    assert recorder.report()["marks"] == 7
+
+
+def test_histograms_of_all_processes_are_one(recorder: Recorder) -> None:
+    hear(
+        recorder,
+        stats("planner", "t0", growth_ms=[1.0] * 98),
+        stats("planner", "t1", growth_ms=[100.0] * 2),
+    )
+    report = recorder.report()
+    assert report["growth_ms"]["p50"] == pytest.approx(1.0, rel=0.02)
+    assert report["growth_ms"]["p99"] == pytest.approx(100.0, rel=0.02)
+
+
+def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(recorder: Recorder) -> None:
+    hear(
+        recorder,
+        stats("planner", "t0", gap_excess=[0.0, 0.0, 0.0, 0.04]),
+        status("t0", 1.2),
+        status("t0", 1.05),
+    )
+    gap = recorder.report()["gap"]
+    assert gap["mean"] == pytest.approx(1.01, abs=0.001)
+    assert gap["p95"] == pytest.approx(1.04, abs=0.002)
+    assert gap["max"] == 1.2
+
+
+def test_certified_gaps_come_from_the_routes_that_vehicles_begin(recorder: Recorder) -> None:
+    for bound_s in (100.0, 80.0, 0.0):
+        hear(
+            recorder,
+            Followed(vehicle="a0-00", target="t0", start=0, directions=b"", cost_s=100.0, lower_bound_s=bound_s),
+        )
+    certified = recorder.report()["certified_gap"]
+    assert certified["mean"] == pytest.approx(1.125, abs=0.005)
+    assert certified["max"] == pytest.approx(1.25, abs=0.005)
+    assert certified["unproven"] == 1
+    assert recorder.report()["vehicles_routed"] == 1
+
+
+def test_a_vehicle_that_crosses_into_another_region_is_counted_once_where_it_is_now(recorder: Recorder) -> None:
+    hear(
+        recorder,
+        fleet("a0.1", {"a0-00": (10.0, 10.0), "a0-01": (20.0, 20.0)}, 1.0, region=0),
+        fleet("a0.1", {"a0-01": (30.0, 20.0)}, 2.0, region=1, state=VehicleState.ARRIVED),
+    )
+    vehicles = recorder.observed.vehicles()
+    assert list(vehicles) == ["a0-00", "a0-01"]
+    assert vehicles["a0-01"].east_m == 30.0
+    summary = recorder.summary(2 * NS_PER_S)
+    assert summary.states == {
+        "idle": 0, "waiting": 0, "following": 1, "arrived": 1, "stranded": 0, "lost": 0
+    }  # fmt: skip
+
+
+def test_a_capture_is_placed_where_the_target_was_before_it_jumped(recorder: Recorder) -> None:
+    hear(recorder, pose("t0", 100.0, 200.0, 1), at_s=1.0)
+    hear(recorder, pose("t0", 700.0, 50.0, 2, captures=1), at_s=3.0)
+    (capture,) = recorder.captures
+    assert (capture.time_s, capture.east_m, capture.south_m) == (2.0, 100.0, 200.0)
+
+
+def test_a_jump_begins_a_new_piece_of_a_targets_track(recorder: Recorder) -> None:
+    for n in range(4):
+        hear(recorder, pose("t0", 100.0 + n, 200.0, n, captures=int(n >= 2)), at_s=float(n))
+    lines = recorder.target_tracks.lines()
+    assert lines[("t0", 0)].tolist() == [[100.0, 200.0], [101.0, 200.0]]
+    assert lines[("t0", 1)].tolist() == [[102.0, 200.0], [103.0, 200.0]]
+
+
+def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recorder: Recorder) -> None:
+    hear(
+        recorder,
+        marks("a0.1", 1, {33: (MarkKind.LETHAL, 0.0, 10), 40: (MarkKind.LETHAL, 0.0, 10)}),
+        marks("a1.1", 1, {33: (MarkKind.PACE, 0.5, 20), 40: (MarkKind.CLEAR, 0.0, 20)}),
+    )
+    marked = recorder.marked()
+    assert marked.cells.tolist() == [1 * GRID.cols + 1]
+    assert marked.kinds.tolist() == [MarkKind.PACE]
+    assert marked.paces.tolist() == [0.5]
+    assert recorder.report()["marked_cells"] == 1
+
+
+def test_an_authors_older_set_does_not_replace_its_newer_one(recorder: Recorder) -> None:
+    hear(recorder, marks("a0.1", 2, {}), marks("a0.1", 1, {33: (MarkKind.LETHAL, 0.0, 10)}))
+    assert recorder.marked().cells.tolist() == []
+
+
+def test_the_live_table_has_a_line_per_target(recorder: Recorder) -> None:
+    recorder.alive(Peer("planner", "t0", 1), True, 0)
+    hear(
+        recorder,
+        pose("t0", 100.0, 100.0, 1),
+        fleet("a0.1", {"a0-00": (130.0, 140.0), "a0-01": (500.0, 100.0)}),
+        status("t0", 1.02),
+    )
+    first, second = recorder.summary(0).targets
+    assert (first.id, first.planner_up, first.following, first.nearest_m) == ("t0", True, 2, 50.0)
+    assert (first.growths, first.growth_ms, first.gap) == (5, 1.5, 1.02)
+    assert (second.id, second.planner_up, second.following, second.nearest_m) == ("t1", False, 0, None)
+
+
+def test_the_run_is_ready_when_all_processes_are_alive_and_a_vehicle_has_a_route(recorder: Recorder) -> None:
+    peers = [
+        ("keeper", "k0"),
+        ("targets", "d0"),
+        ("planner", "t0"),
+        ("planner", "t1"),
+        ("agent", "a0"),
+        ("agent", "a1"),
+    ]
+    for n, (role, id) in enumerate(peers):
+        assert recorder.ready_ns is None
+        recorder.alive(Peer(role, id, 1), True, n)
+    assert recorder.missing() == []
+    recorder.heard(
+        Followed(vehicle="a0-00", target="t0", start=0, directions=b"", cost_s=1.0, lower_bound_s=1.0), {}, 99
+    )
+    assert recorder.ready_ns == 99
+    recorder.alive(Peer("planner", "t1", 1), False, 100)
+    assert recorder.missing() == ["planner t1"]
+    assert recorder.ready_ns == 99
+
+
+def test_messages_per_second_are_the_difference_of_samples(recorder: Recorder) -> None:
+    for second in range(4):
+        hear(recorder, stats("agent", "a0", 1, second, {"messages_out": 50 * second}), at_s=float(second))
+    assert recorder.summary(3 * NS_PER_S).messages_per_s == 50.0
+    assert recorder.report()["messages_per_s"] == 50.0
+
+
+def test_the_report_is_json_without_nan_or_infinity(recorder: Recorder) -> None:
+    hear(recorder, status("t0", math.inf))
+    assert recorder.report()["gap"]["max"] is None
+
+
+def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
+    tracks = Tracks(interval_ns=1, limit=100)
+    for now_ns in range(1000):
+        if tracks.due(now_ns):
+            tracks.add(now_ns, [("a", 0), ("b", 0)], np.full((2, 2), now_ns, np.float32))
+    lines = tracks.lines()
+    assert 25 <= len(lines["a", 0]) <= 51
+    assert lines["a", 0][0, 0] == 0
+    assert lines["a", 0][-1, 0] > 900
+    assert (np.diff(lines["a", 0][:, 0]) > 0).all()

@@ -1,0 +1,161 @@
+"""What a run leaves behind: the numbers and the picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.image import imread
+from matplotlib.text import Text
+from numpy.typing import NDArray
+from support.fake_run import fake_run
+
+from launch_scripts.report import picture
+from launch_scripts.report.hillshade import hillshade
+from launch_scripts.report.plot_style import STYLE
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.write_report import write_report
+from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+from swarm.errors import StoreError
+from swarm.grid import GridSpec
+from swarm.liveness import Peer
+
+ASKED_FOR = (
+    *(
+        "scenario",
+        "seed",
+        "seconds",
+        "vehicles",
+        "targets",
+        "processes",
+        "restarts",
+        "captures",
+        "stranded",
+        "lost",
+    ),
+    *("reroute_requests", "marks", "routes_served", "collisions", "lethal_entries", "startup_s"),
+    *("gap", "growth_ms", "route_query_ms", "mark_to_tree_ms"),
+)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return parse_scenario(
+        'name = "little"\nseed = 3\nseconds = 12.0\n[[targets]]\nname = "t"\ncount = 2\n[[groups]]\nvehicles = 10\n'
+    )
+
+
+@pytest.fixture(scope="module")
+def ground() -> tuple[Terrain, NDArray[np.float32]]:
+    rows, cols = np.mgrid[0:48, 0:64].astype(np.float32)
+    elevation_m = 40 * np.sin(rows / 9) + 30 * np.cos(cols / 7)
+    terrain = terrain_of_pace(np.full((48, 64), 0.1, np.float32), 25.0, elevation_m.astype(np.float32))
+    truth = np.array(terrain.pace_s_per_m)
+    truth[20:26, 10:40] = np.inf
+    truth[5:12, 45:55] = 0.3
+    return terrain, truth
+
+
+@pytest.fixture(scope="module")
+def played(scenario: Scenario, ground: tuple[Terrain, NDArray[np.float32]]) -> Recorder:
+    recorder = Recorder(scenario, ground[0].grid)
+    for now_ns, told in fake_run(*ground, scenario):
+        if isinstance(told, Peer):
+            recorder.alive(told, True, now_ns)
+        else:
+            recorder.heard(told, {}, now_ns)
+    return recorder
+
+
+def test_the_report_has_every_number_that_was_asked_for(
+    played: Recorder, ground: tuple[Terrain, NDArray[np.float32]], tmp_path: Path
+) -> None:
+    returned = write_report(
+        tmp_path,
+        played,
+        ground[0],
+        truth=ground[1],
+        run_id="r1",
+        startup_s=1.5,
+        restarts=2,
+        extra={"ended_by": "time"},
+    )
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report == returned
+    assert [name for name in ASKED_FOR if report.get(name) is None] == []
+    assert report["startup_s"] == 1.5
+    assert report["restarts"] == 2
+    assert report["ended_by"] == "time"
+    assert report["captures"] == len(played.captures) > 0
+    assert report["marks"] == report["marked_cells"] > 0
+    assert report["vehicles_routed"] == 10
+    assert set(report["gap"]) == {"mean", "p95", "max"}
+    assert set(report["growth_ms"]) == {"p50", "p99"}
+    assert len(report["series"]["t_s"]) == len(report["series"]["captures"]) >= 10
+    image = imread(tmp_path / "report.png")
+    assert image.shape[:2] == (round(picture.HEIGHT_IN * picture.DPI), round(picture.WIDTH_IN * picture.DPI))
+    assert image[..., :3].std() > 0.1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "report.png"]
+
+
+def test_vehicles_are_green_targets_red_and_marks_violet_on_the_map(
+    played: Recorder, ground: tuple[Terrain, NDArray[np.float32]], tmp_path: Path
+) -> None:
+    write_report(tmp_path, played, ground[0])
+    pixels = (imread(tmp_path / "report.png")[150:1250, 50:1150, :3] * 255).round().reshape(-1, 3)
+    for name, colour in {"vehicle": "#009E73", "target": "#D1330A", "lethal mark": "#4a1486"}.items():
+        wanted = np.array([int(colour[n : n + 2], 16) for n in (1, 3, 5)])
+        near = (np.abs(pixels - wanted) < 16).all(axis=1).sum()
+        assert near > 100, f"{near} pixels in the colour of a {name}"
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (20, 200), (150, 12)])
+def test_no_label_is_cut_off_or_laid_over_another_in_the_head(
+    scenario: Scenario, shape: tuple[int, int], played: Recorder, ground: tuple[Terrain, NDArray[np.float32]]
+) -> None:
+    recorder, terrain = played, ground[0]
+    if shape != (48, 64):
+        terrain = terrain_of_pace(np.ones(shape, np.float32))
+        recorder = Recorder(scenario, terrain.grid)
+    report: dict[str, Any] = recorder.report(run_id="20261121-120000-abcd", startup_s=7.7)
+    with mpl.rc_context(STYLE):
+        figure = picture.draw(recorder, report, terrain, None)
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.draw()
+        renderer = canvas.get_renderer()
+        bounds = figure.bbox
+        for text in figure.findobj(Text):
+            if text.get_text() and text.get_visible():
+                box = text.get_window_extent(renderer)
+                assert box.x0 >= bounds.x0 - 1 and box.x1 <= bounds.x1 + 1, text.get_text()  # noqa: PT018
+                assert box.y0 >= bounds.y0 - 1 and box.y1 <= bounds.y1 + 1, text.get_text()  # noqa: PT018
+        head = [text.get_window_extent(renderer) for text in figure.texts]
+        for n, box in enumerate(head):
+            assert not any(box.overlaps(other) for other in head[:n]), figure.texts[n].get_text()
+
+
+def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(scenario: Scenario, tmp_path: Path) -> None:
+    terrain = terrain_of_pace(np.ones((1, 1), np.float32))
+    report = write_report(tmp_path, Recorder(scenario, GridSpec(1, 1, 10.0)), terrain)
+    assert report["captures"] is None
+    assert (tmp_path / "report.png").stat().st_size > 10_000
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenario, tmp_path: Path) -> None:
+    terrain = terrain_of_pace(np.ones((4, 4), np.float32))
+    with pytest.raises(StoreError, match=r"cannot write .*nowhere/report\.json: No such file"):
+        write_report(tmp_path / "nowhere", Recorder(scenario, terrain.grid), terrain)
+
+
+def test_a_slope_that_faces_the_sun_is_brighter_than_one_that_does_not() -> None:
+    across = np.arange(20, dtype=np.float32)[None, :].repeat(20, 0) * 5
+    rising_east, falling_east = hillshade(across, 10.0), hillshade(-across, 10.0)
+    assert rising_east.mean() > falling_east.mean() + 0.3
+    assert np.isfinite(hillshade(np.full((5, 5), np.nan, np.float32), 10.0)).all()

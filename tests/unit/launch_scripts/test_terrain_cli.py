@@ -1,0 +1,116 @@
+"""The commands that look at terrains, as a user runs them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from typer.testing import CliRunner
+
+from launch_scripts.commands import terrain_picture
+from launch_scripts.commands.terrain import app
+from shared_map.terrain.importers.sources import load_source
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.scenario import TerrainConfig
+from swarm.errors import SwarmError
+
+runner = CliRunner()
+
+
+def run(*words: object) -> str:
+    result = runner.invoke(app, [str(word) for word in words], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    size = ("--rows", 300, "--cols", 280, "--seed", 4, "--rivers", 0, "--roads", 0)
+    run("synth", *size, "--out", folder / "dem.tif", "--photo", folder / "photo.tif")
+    return folder
+
+
+def test_what_synth_writes_is_what_info_reads(made: Path) -> None:
+    facts = json.loads(run("info", made / "dem.tif", "--json"))
+    assert (facts["rows"], facts["cols"], facts["resolution_m"], facts["voids"]) == (300, 280, 30.0, 0)
+    assert facts["highest_m"] - facts["lowest_m"] == pytest.approx(400, abs=60)
+    assert "resolution_m" in run("info", "jacksboro")
+
+
+def test_synth_makes_the_same_again_from_a_seed(made: Path, tmp_path: Path) -> None:
+    run("synth", "--rows", 300, "--cols", 280, "--seed", 4, "--rivers", 0, "--out", tmp_path / "again.npz")
+    again = load_source(TerrainConfig(source=str(tmp_path / "again.npz")), 1)
+    first = load_source(TerrainConfig(source=str(made / "dem.tif")), 1)
+    np.testing.assert_array_equal(again.elevation_m, first.elevation_m)
+
+
+def test_cost_writes_a_geotiff_with_overviews_and_a_picture(made: Path, tmp_path: Path) -> None:
+    scenario = tmp_path / "mine.toml"
+    (tmp_path / "dem.tif").write_bytes((made / "dem.tif").read_bytes())
+    (tmp_path / "photo.tif").write_bytes((made / "photo.tif").read_bytes())
+    scenario.write_text('name = "mine"\n[terrain]\nsource = "dem.tif"\nphoto = "photo.tif"\n')
+    said = run("cost", scenario, "--out", tmp_path / "cost.tif", "--picture", tmp_path / "cost.png")
+    assert "300 x 280 cells of 30 m" in said
+    with rasterio.open(tmp_path / "cost.tif") as file:
+        pace = file.read(1)
+        assert (file.nodata, file.crs.to_epsg(), file.overviews(1)) == (-1, 32632, [2])
+    assert ((pace == -1) | (pace > 0)).all()
+    assert (tmp_path / "cost.png").stat().st_size > 50_000
+
+
+@pytest.mark.parametrize("shape", [(70, 90), (1, 1), (9, 400), (400, 9)])
+def test_a_picture_of_any_shape_with_voids_and_coarsened(
+    shape: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terrain_picture, "MOST_CELLS", 1000)
+    heights = np.random.default_rng(1).uniform(0, 50, shape).astype(np.float32)
+    pace = np.ones(shape, np.float32)
+    if heights.size > 1:
+        heights[:, 0] = np.nan
+        pace[0] = np.inf
+    terrain_picture.draw(terrain_of_pace(pace, 10.0, heights), tmp_path / "look.png", "any shape")
+    assert (tmp_path / "look.png").stat().st_size > 10_000
+
+
+def test_classify_prints_what_it_found_and_how_well(made: Path, tmp_path: Path) -> None:
+    spots = {"forest": [], "grass": []}
+    from shared_map.terrain.synthetic.landscape import landscape
+
+    _, classes = landscape(300, 280, 30.0, 400.0, 4)
+    rng = np.random.default_rng(1)
+    for name, kind in (("forest", 2), ("grass", 4)):
+        for cell in rng.choice(np.flatnonzero(classes == kind), 12, replace=False):
+            row, col = divmod(int(cell), 280)
+            spots[name].append([col * 30 + 15, row * 30 + 15])
+    labels = "".join(f'[[labels]]\nclass = "{name}"\npoints_m = {points}\n' for name, points in spots.items())
+    (tmp_path / "labels.toml").write_text(labels)
+    said = run(
+        "classify", made / "dem.tif", made / "photo.tif", "--labels", tmp_path / "labels.toml",
+        "--out", tmp_path / "classes.tif",
+    )  # fmt: skip
+    assert "forest" in said
+    assert "learnt, on polygons not seen" in said
+    with rasterio.open(tmp_path / "classes.tif") as file:
+        assert set(np.unique(file.read(1))) == {2, 4}
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("info", "nowhere.tif"), "does not exist"),
+        (("cost", "nowhere"), "no scenario 'nowhere'"),
+        (("synth", "--out", "dem.xyz", "--rows", 9, "--cols", 9), "write .tif or .tiff or .npz"),
+        (("synth", "--out", "/nowhere/dem.tif", "--rows", 9, "--cols", 9), "cannot write"),
+        (("cost", "synthetic", "--picture", "/nowhere/cost.png"), "--picture .* cannot write there, the folder"),
+        (("cost", "synthetic", "--picture", "cost.xyz"), "--picture cost.xyz: write .png"),
+        (("cost", "synthetic", "--picture", "/tmp"), "it is a folder"),
+        (("synth", "--out", "d.tif", "--photo", "photo.png", "--rows", 9, "--cols", 9), "write .tif or .tiff"),
+    ],
+)
+def test_a_mistake_is_a_sentence(words: tuple[object, ...], sentence: str) -> None:
+    with pytest.raises(SwarmError, match=sentence):
+        run(*words)

@@ -1,0 +1,226 @@
+"""Rungs, rings and their skeleton: what is grown near the target, and what far from it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from laws.test_tree_under_every_strategy import Play
+from support import slow_twins as naive
+from support.planner_strategies import RULES, Job, Marks, Move, random_pace
+
+from planner_service import target_tree as planner_strategies
+from planner_service.strategy import Auto
+from planner_service.tree import corridors as skeletons
+from planner_service.tree.corridors import Skeleton, find_skeleton
+from planner_service.tree.cost_grid import Ground
+from planner_service.tree.cost_to_go import CostToGoTree
+from planner_service.tree.windows import AHEAD, Rungs
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec, Window
+
+COARSE = ("multi_resolution", "variable_range+multi_resolution", "auto")
+
+
+def thin_walls(rng: np.random.Generator, side: int, doors: float) -> np.ndarray:
+    """Rooms of 3 x 3 cells between walls one cell thick, in which a share of cells are doors."""
+    pace = random_pace(rng, side, side, 20.0, 0.0)
+    walls = np.zeros((side, side), bool)
+    walls[3::4] = True
+    walls[:, 3::4] = True
+    pace[walls & (rng.random((side, side)) > doors)] = np.inf
+    return pace
+
+
+@pytest.fixture
+def small_rings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rings and a skeleton as they are on a large map, in the sizes of a small one."""
+    monkeypatch.setattr(skeletons, "LEAST", 3)
+    monkeypatch.setattr(skeletons, "AROUND", 2)
+    monkeypatch.setattr("planner_service.tree.cost_to_go.INNER", 6)
+    monkeypatch.setattr(planner_strategies, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
+    monkeypatch.setattr(planner_strategies, "WIDE_SHARE", 64)
+
+
+@pytest.mark.usefixtures("small_rings")
+@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("strategy", COARSE)
+def test_rings_keep_the_laws_past_thin_walls_and_marks(strategy: str, rules: dict) -> None:
+    rng = np.random.default_rng(3)
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, **rules)  # type: ignore[arg-type]
+    play = Play(thin_walls(rng, 32, 0.5), config)
+    kinds = set()
+    for step in range(36):
+        play.happen(Move(int(rng.integers(-1, 2)), int(rng.integers(-1, 2))))
+        if step % 5 == 4:
+            play.happen(Marks(step, 2))
+        if step == 2:
+            play.happen(Job("begin"))
+            play.happen(Job("end"))
+        if play.tree.ready:
+            kinds.add(play.last.kind)
+        if step % 9 == 8:
+            play.check()
+    assert "coarse" in kinds
+    play.check()
+
+
+@pytest.mark.usefixtures("small_rings")
+def test_far_from_the_target_rings_hold_where_windows_alone_drift() -> None:
+    """The target crosses the map; nothing is grown whole. Mean gap of all cells at the end."""
+    rng = np.random.default_rng(8)
+    pace = random_pace(rng, 60, 60, 30.0, 0.05)
+    pace[30] = 1.0
+    gaps = {}
+    for has_skeleton in (False, True):
+        play = Play(pace.copy(), PlannerConfig(strategy="multi_resolution", k_min=0))
+        play.target = 30 * 60 + 2
+        play.tree.update(play.pace, play.target, [], 0)
+        if has_skeleton:
+            play.happen(Job("begin"))
+            play.happen(Job("end"))
+        for _ in range(50):
+            play.happen(Move(0, 1))
+        routes = play.tree.routes(play.pace, np.arange(3600))
+        optimum = naive.cost_to_go(pace, play.target, **play.rules).reshape(-1)
+        some = np.isfinite(optimum) & (optimum > 0)
+        gaps[has_skeleton] = float((routes.cost_s[some] / optimum[some]).mean())
+    assert gaps[True] < 1.03
+    assert gaps[False] > 1.1
+
+
+def test_a_skeleton_is_where_the_traffic_is() -> None:
+    """A valley between two plains has one cheap pass: everything drives through it."""
+    pace = np.full((64, 64), 1.0, np.float32)
+    pace[:, 32] = np.inf
+    pace[20, 32] = 1.0
+    ground = Ground(GridSpec(64, 64, 1.0), PlannerConfig())
+    ground.load(pace)
+    level = find_skeleton(ground).level.reshape(66, 66)[1:-1, 1:-1]
+    assert level[20, 32] == level.max()
+    assert (level[pace == np.inf] == 0).all()
+
+
+def test_marks_let_all_cells_around_them_take_part_until_too_many_do() -> None:
+    ground = Ground(GridSpec(128, 128, 1.0), PlannerConfig())
+    pace = np.ones((128, 128), np.float32)
+    ground.load(pace)
+    skeleton = Skeleton(np.zeros(ground.size, np.uint8))
+    pace[60, 60] = np.inf
+    assert skeleton.learn(ground, ground.apply(pace, [Window(60, 60, 61, 61)]))
+    level = skeleton.level.reshape(130, 130)
+    assert (level[54:69, 54:69] == skeletons.EVERYWHERE).all()
+    assert skeleton.worn == 24 * 24
+    pace[:] = 2.0
+    assert not skeleton.learn(ground, ground.apply(pace, [Window(0, 0, 128, 128)]))
+
+
+@given(st.integers(0, 2**31), st.integers(1, 60))
+@settings(max_examples=60, deadline=None)
+def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_wide(seed: int, steps: int) -> None:
+    grid = GridSpec(256, 256, 1.0)
+    rungs = Rungs(grid, 8)
+    rng = np.random.default_rng(seed)
+    cell = grid.cell(128, 128)
+    rungs.grown(cell, 256)
+    since = {8 << rung: cell for rung in range(5)}
+    for _ in range(steps):
+        row, col = grid.row_col(cell)
+        cell = grid.cell(
+            int(np.clip(row + rng.integers(-3, 4), 0, 255)), int(np.clip(col + rng.integers(-3, 4), 0, 255))
+        )
+        half = rungs.half(cell, 128)
+        rungs.grown(cell, half)
+        for wide in since:
+            if wide <= half:
+                since[wide] = cell
+            assert AHEAD * grid.distance_cells(since[wide], cell) < wide or wide == 8
+
+
+def test_auto_grows_exactly_then_rotates_then_coarsens_and_does_not_flap() -> None:
+    auto = Auto(budget_ns=10e6)
+    stages = []
+    for full_ms in (2, 9, 11, 9, 8, 6, 11, 150, 330, 300, 250, 200, 50, 6):
+        auto.observe(full_ms * 1e6, widest=512)
+        stages.append(auto.stage)
+    assert stages == [
+        *("exact", "exact", "rotate", "rotate", "rotate", "exact", "rotate"),
+        *("rotate", "coarsen", "coarsen", "coarsen", "rotate", "rotate", "exact"),
+    ]
+
+
+@pytest.mark.parametrize("rules", RULES)
+@pytest.mark.parametrize("length_weight", [0.0, 3.0])
+def test_each_cells_length_is_that_of_its_way(rules: dict, length_weight: float) -> None:
+    rng = np.random.default_rng(4)
+    pace = random_pace(rng, 18, 23, 10.0, 0.2)
+    play = Play(pace, PlannerConfig(strategy="full", length_weight=length_weight, **rules))
+    lengths = play.tree.lengths().reshape(-1)
+    routes = play.tree.routes(pace, np.arange(pace.size))
+    for cell, route in enumerate(routes):
+        if not math.isfinite(lengths[cell]):
+            assert not route.directions
+            continue
+        diagonal = math.sqrt(2) if config_octile(rules) else 1.0
+        steps = sum(diagonal if code & 1 else 1.0 for code in route.directions)
+        assert lengths[cell] == pytest.approx(steps, rel=1e-5)
+        assert route.length_m == pytest.approx(steps, rel=1e-5)
+
+
+def config_octile(rules: dict) -> bool:
+    return bool(rules["edge"] == "octile" and rules["neighbours"] == 8)
+
+
+def test_a_dearer_length_makes_ways_shorter_and_slower() -> None:
+    pace = random_pace(np.random.default_rng(6), 30, 30, 20.0, 0.1)
+    found = {}
+    for weight in (0.0, 10.0):
+        play = Play(pace, PlannerConfig(strategy="full", length_weight=weight))
+        lengths = play.tree.lengths()
+        costs = play.tree.routes(pace, np.arange(900)).cost_s
+        found[weight] = float(lengths[np.isfinite(lengths)].sum()), float(costs[np.isfinite(costs)].sum())
+    assert found[10.0][0] < found[0.0][0]
+    assert found[10.0][1] > found[0.0][1]
+
+
+def test_what_is_asked_for_costs_what_is_driven_however_far_the_target_went() -> None:
+    """Windows raise the costs beyond them move by move; a cut route says what going on along the parents costs."""
+    pace = random_pace(np.random.default_rng(2), 80, 80, 5.0, 0.1)
+    grid = GridSpec(80, 80, 1.0)
+    ground = Ground(grid, PlannerConfig())
+    ground.load(pace)
+    tree = CostToGoTree(ground)
+    target = int(np.flatnonzero(np.isfinite(pace[40]))[20]) + 40 * 80
+    tree.grow(target)
+    for turn in range(40):
+        step = 1 if turn % 2 else -1
+        if np.isfinite(pace[40, tree.root % 80 + step]):
+            tree.move(tree.root + step, grid.around(tree.root, 8))
+    starts = np.flatnonzero((ground.weight < np.inf) & (tree.cost < np.inf))
+    before = tree.cost[starts] + tree.offset
+    driven = ground.walk(tree.parent, ground.pad(tree.root), starts, 0, ground.weight).driven
+    tree.tighten(starts)
+    after = tree.cost[starts] + tree.offset
+    assert before.max() > driven[before.argmax()] * 1.05
+    np.testing.assert_allclose(after, driven, rtol=1e-4, atol=1e-3)
+
+
+def test_on_a_large_map_a_forced_range_is_a_window_over_vehicle_and_target_until_a_worker_has_grown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(planner_strategies, "INLINE_NS", 60_000)
+    pace = random_pace(np.random.default_rng(1), 100, 100, 5.0, 0.1)
+    play = Play(pace, PlannerConfig(strategy="rotation", k_min=0))
+    for _ in range(4):
+        play.happen(Move(1, 1))
+    row, col = play.grid.row_col(play.target)
+    near = play.grid.cell(row + 9, col)
+    update = play.tree.force(pace, [near])
+    assert update.kind == "forced"
+    assert update.wants_full
+    assert update.window.contains(row + 9, col)
+    assert play.tree.force(pace, [9999]).kind == "none"
+    play.check()

@@ -1,0 +1,239 @@
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.map_strategies import MapSwarm
+
+from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, describe, pack
+from shared_map.keeper.base_map_transfer import BaseMapServer, Fetching, fetch_base_map
+from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.bus.bus import AskEnded, Bus, Event, Replied
+from swarm.config.scenario import CostConfig, GroupConfig, Scenario, TerrainConfig, ZoneConfig
+from swarm.errors import ProtocolError, TerrainError
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.topics import BASE_MAP, BASE_TILES
+
+SCENARIO = Scenario(
+    terrain=TerrainConfig(source="synthetic", rows=300, cols=520, roads=2),
+    groups=(GroupConfig(vehicles=1),),
+    cost=CostConfig(vehicle_radius_m=40.0),
+)
+"""2 x 3 regions, those in the south and east cut off; ground and prior pace differ."""
+TERRAIN = build_terrain(SCENARIO)
+EVERY = tuple(LAYERS)
+
+
+def copied(layers: tuple[str, ...] = EVERY) -> BaseMapCopy:
+    return BaseMapCopy(describe(TERRAIN, "0"), TERRAIN.digest, layers)
+
+
+def pieces(layers: tuple[str, ...] = EVERY) -> list[BaseMapTile]:
+    return [pack(TERRAIN, layer, region) for layer in layers for region in range(TERRAIN.grid.regions)]
+
+
+def same(one: Terrain, other: Terrain) -> bool:
+    arrays = ("elevation_m", "photo", "pace_s_per_m", "ground_s_per_m", "classes")
+    return (one.grid, one.digest) == (other.grid, other.digest) and all(
+        np.array_equal(getattr(one, name), getattr(other, name), equal_nan=name == "elevation_m") for name in arrays
+    )
+
+
+@given(st.permutations(pieces()), st.integers(0, 5))
+def test_a_terrain_in_pieces_in_any_order_and_twice_is_the_same_terrain(
+    parts: list[BaseMapTile], again: int
+) -> None:
+    copy = copied()
+    for tile in parts:
+        assert copy.take(tile)
+    assert not copy.take(parts[again])
+    assert copy.share == 1.0
+    assert same(copy.terrain(SCENARIO.cost), TERRAIN)
+
+
+def test_without_its_photo_the_terrain_is_as_good_to_drive_on() -> None:
+    copy = copied(NEEDED)
+    for tile in pieces(NEEDED):
+        copy.take(tile)
+    made = copy.terrain(SCENARIO.cost)
+    assert made.digest == TERRAIN.digest
+    assert not made.photo.any()
+
+
+def test_a_piece_takes_two_thirds_of_its_bytes_or_less() -> None:
+    raw = TERRAIN.grid.cells * 9
+    assert sum(len(tile.data) for tile in pieces(NEEDED)) < 0.7 * raw
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"data": b"not zlib"}, "does not unpack"),
+        ({"data": zlib.compress(b"")}, "has 0 bytes, expected 262144"),
+        ({"data": zlib.compress(bytes(1 << 28))}, "has more than 262144 bytes, expected 262144"),
+        ({"data": zlib.compress(bytes(262144))}, "is not as its digest says"),
+        ({"data": pack(TERRAIN, "ground", 0).data[:-9]}, "expected 262144"),
+        ({"region": 6}, "nobody asked for layer 'ground', region 6"),
+        ({"layer": "gold"}, "nobody asked for layer 'gold', region 0"),
+        ({"region": 1}, "expected|digest"),
+    ],
+)
+def test_a_false_piece_is_refused_in_a_sentence_and_the_true_one_still_taken(
+    change: dict[str, object], says: str
+) -> None:
+    copy = copied()
+    true = pack(TERRAIN, "ground", 0)
+    with pytest.raises(ProtocolError, match=says):
+        copy.take(msgspec.structs.replace(true, **change))
+    assert copy.take(true)
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_pass_for_a_piece(data: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        copied().take(BaseMapTile(layer="ground", region=0, data=data))
+
+
+def test_a_description_of_another_terrain_or_of_too_much_is_refused() -> None:
+    with pytest.raises(TerrainError, match=f"keeper 0 is terrain {TERRAIN.digest}, the run has fedcba"):
+        BaseMapCopy(describe(TERRAIN, "0"), "fedcba")
+    vast = msgspec.structs.replace(
+        describe(TERRAIN, "0"), rows=1 << 16, cols=1 << 16, digests=dict.fromkeys(EVERY, bytes(8 << 16))
+    )
+    with pytest.raises(TerrainError, match="65536 x 65536 cells, at most 268435456"):
+        BaseMapCopy(vast, TERRAIN.digest)
+    with pytest.raises(TerrainError, match="lacks the layer ground: it has classes"):
+        BaseMapCopy(msgspec.structs.replace(describe(TERRAIN, "0"), digests={"classes": bytes(48)}), TERRAIN.digest)
+
+
+def test_other_cost_rules_make_another_terrain_and_are_told_of() -> None:
+    copy = copied(NEEDED)
+    for tile in pieces(NEEDED):
+        copy.take(tile)
+    with pytest.raises(TerrainError, match=r"are the \[cost\] sections of the scenarios the same"):
+        copy.terrain(CostConfig(vehicle_radius_m=40.0, max_slope_deg=20.0))
+
+
+def test_where_a_mask_lies_makes_no_other_terrain(tmp_path: Path) -> None:
+    import rasterio
+
+    digests = []
+    for name in ("here", "there"):
+        mask = tmp_path / name / "mask.tif"
+        mask.parent.mkdir()
+        with rasterio.open(mask, "w", driver="GTiff", width=520, height=300, count=1, dtype="uint8") as out:
+            out.write(np.eye(300, 520, dtype=np.uint8)[None])
+        cost = CostConfig(zones=(ZoneConfig(kind="rough", mask=str(mask)),))
+        digests.append(build_terrain(msgspec.structs.replace(SCENARIO, cost=cost)).digest)
+    assert digests[0] == digests[1]
+
+
+# --- over a bus ---------------------------------------------------------------------------------------------
+
+
+class Network:
+    """A bus on which every question is answered at once by the servers, or by nobody."""
+
+    namespace = "swarm"
+
+    def __init__(self, *servers: BaseMapServer) -> None:
+        self.swarm = MapSwarm()
+        for number, server in enumerate(servers):
+            server.start(self.swarm.network.bus(f"server{number}"))
+        self.bus = self.swarm.network.bus("asker")
+        self.asked = 0
+
+    def ask(self, *arguments: object, **named: object) -> None:
+        self.asked += 1
+        self.bus.ask(*arguments, **named)  # type: ignore[arg-type]
+        self.swarm.run(5)
+
+
+def asking(network: Network) -> Bus:
+    return network  # type: ignore[return-value]
+
+
+def test_a_process_without_the_file_gets_the_terrain_of_the_run() -> None:
+    network = Network(BaseMapServer(TERRAIN, "0"))
+    told: list[tuple[str, float]] = []
+    wanted = Fetching(TERRAIN.digest, SCENARIO.cost, EVERY)
+    terrain = fetch_base_map(asking(network), wanted, "no file", lambda what, share: told.append((what, share)))
+    assert same(terrain, TERRAIN)
+    assert told[-1] == ("base map from keeper 0", 1.0)
+    assert terrain.notes[-1].startswith("fetched from keeper 0")
+
+
+def test_a_keeper_with_another_terrain_is_passed_over() -> None:
+    other = build_terrain(msgspec.structs.replace(SCENARIO, seed=9))
+    network = Network(BaseMapServer(other, "a"), BaseMapServer(TERRAIN, "b"))
+    assert same(fetch_base_map(asking(network), Fetching(TERRAIN.digest, SCENARIO.cost, EVERY), "no file"), TERRAIN)
+
+
+def test_nobody_there_is_one_sentence_within_the_deadline() -> None:
+    with pytest.raises(TerrainError) as caught:
+        fetch_base_map(
+            asking(Network()), Fetching("fed", SCENARIO.cost, within_s=0.3), "there is no file ridge.tif"
+        )
+    assert str(caught.value) == (
+        "there is no file ridge.tif, and the base map cannot be fetched: no keeper in namespace swarm answered "
+        "within 0.3 s; start one where the file is"
+    )
+
+
+class Liar(BaseMapServer):
+    """Has the true description, and some pieces of its own making beside the true ones or instead."""
+
+    def __init__(self, *, also: bool) -> None:
+        super().__init__(TERRAIN, "0")
+        self.also = also
+
+    def _piece(self, layer: str, region: int) -> BaseMapTile:
+        true = super()._piece(layer, region)
+        return true if self.also and region % 2 else BaseMapTile(layer=layer, region=region, data=b"lies")
+
+
+def test_who_lies_beside_the_keeper_only_costs_time() -> None:
+    network = Network(Liar(also=True), BaseMapServer(TERRAIN, "0"))
+    assert same(fetch_base_map(asking(network), Fetching(TERRAIN.digest, SCENARIO.cost, EVERY), "no file"), TERRAIN)
+
+
+def test_a_keeper_that_only_lies_is_given_up_in_a_sentence() -> None:
+    with pytest.raises(TerrainError, match=r"0% came, then nothing for 0.3 s; refused: .* does not unpack"):
+        fetch_base_map(
+            asking(Network(Liar(also=False))), Fetching(TERRAIN.digest, SCENARIO.cost, within_s=0.3), "no file"
+        )
+
+
+@pytest.mark.parametrize(
+    ("request_", "says"),
+    [
+        (BaseMapRequest(layers=["gold"], regions=[0]), "there is no layer 'gold'; there are ground"),
+        (BaseMapRequest(layers=["ground"], regions=[0, 6]), "a region of 6 is not in 0..5"),
+        (BaseMapRequest(layers=["ground"], regions=[0] * 65), "at most 64 pieces"),
+    ],
+)
+def test_a_keeper_refuses_what_is_no_piece_of_its_map(request_: BaseMapRequest, says: str) -> None:
+    network, events = Network(BaseMapServer(TERRAIN, "0")), list[Event]()
+    network.ask(BASE_TILES, request_, events.append, tag="t", keeper="0")
+    (ended,) = events
+    assert isinstance(ended, AskEnded)
+    assert ended.failure is not None
+    assert says in ended.failure
+
+
+def test_every_keeper_answers_for_its_terrain() -> None:
+    swarm = MapSwarm()
+    for id in ("k1", "k2"):
+        swarm.keeper(id, KeeperStore(":memory:"))
+    events: list[Event] = []
+    swarm.network.bus("asker").ask(BASE_MAP, Nothing(), events.append, tag="t")
+    swarm.run(3)
+    found = [event.message for event in events if isinstance(event, Replied)]
+    assert sorted(each.keeper for each in found if isinstance(each, BaseMap)) == ["k1", "k2"]

@@ -1,0 +1,208 @@
+"""What a photo shows: rules without labels, learning from a few, and the mistakes that must not happen."""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.draw import line
+
+from shared_map.terrain.importers.classify import by_rules, confusion, held_out, learnt, overlap
+from shared_map.terrain.importers.labels import Labels, read_labels
+from shared_map.terrain.importers.sources import Source, load_source
+from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.synthetic.landscape import landscape, paint_photo
+from shared_map.terrain.synthetic.noise import fractal
+from swarm.config.scenario import TerrainConfig
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+
+DATA = Path(__file__).parents[4] / "shared" / "data" / "dem"
+LABELS = Path(__file__).parent / "davosdorf_labels.toml"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
+
+
+@pytest.fixture(scope="module")
+def davos() -> tuple[Source, Labels]:
+    if not DATA.is_dir():
+        pytest.skip("../shared/data is absent")
+    photo = str(DATA / "davosdorf/davosdorf_color.tif")
+    source = load_source(TerrainConfig(source=str(DATA / "davosdorf/davosdorf.tif"), photo=photo), 1)
+    return source, read_labels(LABELS, source.grid)
+
+
+def test_the_lake_of_davos_is_found_without_labels(davos: tuple[Source, Labels]) -> None:
+    source, labels = davos
+    lake = labels.groups == 0
+    patches, _ = ndimage.label(source.classes == TerrainClass.WATER)
+    tarn = np.isin(patches, np.unique(patches[labels.groups == 1]))  # water too, labelled in its middle only
+    found = (patches > 0) & ~tarn
+    assert (found & lake).sum() / (found | lake).sum() >= 0.95
+
+
+def test_the_shadows_of_the_ridges_do_not_become_water(davos: tuple[Source, Labels]) -> None:
+    source, _ = davos
+    assert (source.classes[95:150, 130:330] == TerrainClass.WATER).sum() == 0
+    assert (source.classes[220:300, 0:210] == TerrainClass.WATER).sum() == 0
+
+
+def test_rules_agree_with_the_labels_of_davos(davos: tuple[Source, Labels]) -> None:
+    source, labels = davos
+    labelled = labels.classes != TerrainClass.UNKNOWN
+    table = confusion(labels.classes[labelled], source.classes[labelled])
+    assert np.trace(table) / table.sum() > 0.8
+    assert table[TerrainClass.FOREST, TerrainClass.FOREST] / table[TerrainClass.FOREST].sum() > 0.8
+
+
+def test_learning_from_labels_holds_on_polygons_it_has_not_seen(davos: tuple[Source, Labels]) -> None:
+    source, labels = davos
+    assert source.photo is not None
+    true, predicted = held_out(source.photo, source.elevation_m, 10.0, labels.classes, labels.groups)
+    table = confusion(true, predicted)
+    assert np.trace(table) / table.sum() > 0.7
+    classes = learnt(source.photo, source.elevation_m, 10.0, labels.classes)
+    assert overlap(labels.classes, np.where(labels.groups >= 0, classes, 0), TerrainClass.WATER) > 0.95
+    assert (classes[95:150, 130:330] == TerrainClass.WATER).mean() < 0.01
+
+
+@needs_data
+def test_the_lakes_of_rocky_mountain_park_are_found_on_its_own_grid() -> None:
+    source = load_source(
+        TerrainConfig(source=str(DATA / "rmnp/rmnp-dem.tif"), photo=str(DATA / "rmnp/rmnp-rgb.tif")), 1
+    )
+    water = source.classes == TerrainClass.WATER
+    assert water[178:187, 8:20].mean() > 0.9
+    assert water[150:165, 20:30].any()
+    assert water[:140].sum() <= 5
+
+
+def test_a_painted_landscape_is_recognised(tmp_path: Path) -> None:
+    elevation_m, classes = landscape(160, 200, 30.0, 500.0, seed=4)
+    elevation_m[100:130, 60:110] = elevation_m[100:130, 60:110].min()
+    classes[100:130, 60:110] = TerrainClass.WATER
+    photo = paint_photo(elevation_m, classes, 30.0, seed=4)
+    found = by_rules(photo, elevation_m, 30.0)
+    assert overlap(classes, found, TerrainClass.WATER) > 0.85
+    assert overlap(classes, found, TerrainClass.FOREST) > 0.4
+
+
+def test_a_white_cloud_and_its_shadow_on_a_slope_are_no_water() -> None:
+    row, _ = np.mgrid[:80, :80]
+    elevation_m = (row * 6.0).astype(np.float32)
+    photo = np.full((80, 80, 3), (120, 140, 80), np.uint8)
+    photo[10:30, 10:30] = 250
+    photo[40:60, 40:60] = (25, 32, 60)
+    found = by_rules(photo, elevation_m, 20.0)
+    assert not (found == TerrainClass.WATER).any()
+
+
+def shaded(photo: NDArray[np.uint8], where: NDArray[np.bool_], dark: float, tint: float) -> NDArray[np.uint8]:
+    """A cloud's shadow with soft borders: darker, and bluer by the light of the sky."""
+    depth = ndimage.gaussian_filter(where.astype(np.float32), 2)[..., None]
+    factor = 1 + (np.array([dark * (2 - tint), dark, dark * tint]) - 1) * depth
+    return np.asarray(np.clip(photo * factor, 0, 255), np.uint8)
+
+
+@pytest.mark.parametrize("dark", [0.2, 0.3, 0.45, 0.6])
+@pytest.mark.parametrize("tint", [1.0, 1.15, 1.3])
+def test_shadows_of_clouds_do_not_become_water(dark: float, tint: float) -> None:
+    elevation_m, classes = landscape(300, 400, 20.0, 300.0, seed=4)
+    photo = paint_photo(elevation_m, classes, 20.0, seed=4)
+    clouds = fractal(np.random.default_rng(7), 300, 400, 60.0)
+    shadow = clouds > np.quantile(clouds, 0.8)
+    found = by_rules(shaded(photo, shadow, dark, tint), elevation_m, 20.0)
+    assert (found == TerrainClass.WATER).sum() < 0.01 * shadow.sum()
+
+
+def test_a_shadow_over_the_shore_leaves_the_lake_and_takes_little_of_the_land(
+    davos: tuple[Source, Labels],
+) -> None:
+    source, labels = davos
+    assert source.photo is not None
+    lake = labels.groups == 0
+    shadow = np.zeros(lake.shape, np.bool_)
+    shadow[180:280, 380:480] = True  # half of the lake, and the meadow to its west
+    found = by_rules(shaded(source.photo, shadow, 0.4, 1.15), source.elevation_m, 10.0) == TerrainClass.WATER
+    assert (found & lake).sum() / lake.sum() > 0.9
+    assert (found & shadow & ~lake).sum() < 0.1 * (shadow & ~lake).sum()
+
+
+def traced_roads(shape: tuple[int, int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(cells on traced roads, windows in which every road was traced): davosdorf_roads.toml."""
+    file = tomllib.loads(Path(__file__).with_name("davosdorf_roads.toml").read_text())
+    roads, whole = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    for road in file["roads"]:
+        for (col0, row0), (col1, row1) in itertools.pairwise(road["cells"]):
+            roads[line(row0, col0, row1, col1)] = True  # type: ignore[no-untyped-call]
+    for col0, row0, col1, row1 in file["whole"]:
+        whole[row0:row1, col0:col1] = True
+    return roads, whole
+
+
+def test_most_roads_of_davos_are_found_and_little_else(davos: tuple[Source, Labels]) -> None:
+    source, labels = davos
+    roads, whole = traced_roads(source.classes.shape)
+    found = source.classes == TerrainClass.ROAD
+    to_found, to_roads = (ndimage.distance_transform_edt(~cells) for cells in (found, roads))
+    assert (to_found[roads] <= 2).mean() > 0.6
+    assert (to_roads[found & whole] <= 2).mean() > 0.9
+    for kind in (TerrainClass.WATER, TerrainClass.FOREST, TerrainClass.GRASS, TerrainClass.ROCK):
+        assert found[labels.classes == kind].mean() < 0.005
+
+
+def test_a_line_is_a_road_if_it_is_long_and_bright_on_both_sides() -> None:
+    photo = np.full((90, 120, 3), (96, 128, 70), np.uint8)
+    photo[:, :30] = (150, 150, 140)  # a field with an edge
+    photo[20, 40:110] = (170, 170, 165)
+    photo[20, 60] = photo[20, 75] = (60, 80, 50)  # trees over it
+    photo[50, 40:52] = (170, 170, 165)  # too short
+    level = np.zeros((90, 120), np.float32)
+    found = by_rules(photo, level, 10.0) == TerrainClass.ROAD
+    assert found[19:22, 42:108].any(axis=0).all()
+    assert not found[25:].any()
+    assert not (by_rules(photo, level, 90.0) == TerrainClass.ROAD).any()  # no road is that wide
+
+
+def test_bands_do_not_show(davos: tuple[Source, Labels], monkeypatch: pytest.MonkeyPatch) -> None:
+    source, _ = davos
+    assert source.photo is not None
+    monkeypatch.setattr("shared_map.terrain.row_bands.BAND_ROWS", 10_000)
+    monkeypatch.setattr("shared_map.terrain.row_bands.bands", lambda rows, band_rows=0: [(0, rows)])
+    np.testing.assert_array_equal(by_rules(source.photo, source.elevation_m, 10.0), source.classes)
+
+
+def labels_file(folder: Path, text: str) -> Labels:
+    (folder / "l.toml").write_text(text)
+    return read_labels(folder / "l.toml", GridSpec(20, 30, 10.0))
+
+
+POINT = '[[labels]]\nclass = "{}"\npoints_m = [[{}, 55]]\n'
+
+
+def test_a_labelled_point_stands_for_nine_cells(tmp_path: Path) -> None:
+    labels = labels_file(tmp_path, POINT.format("water", 55) + POINT.format("grass", 155))
+    assert (labels.classes[4:7, 4:7] == TerrainClass.WATER).all()
+    assert (labels.classes != TerrainClass.UNKNOWN).sum() == 18
+    assert labels.count == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (POINT.format("lava", 5), "Invalid enum value 'lava'"),
+        (POINT.format("water", 5), "one class"),
+        (POINT.format("water", 9999) + POINT.format("grass", 5), "label 0 .* covers no cell"),
+        ("labels = 3", "Expected `array`"),
+        ("what", "not TOML"),
+    ],
+)
+def test_bad_labels_are_refused_with_a_sentence(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(TerrainError, match=words):
+        labels_file(tmp_path, text)
+    with pytest.raises(TerrainError, match="cannot be read"):
+        read_labels(tmp_path / "nowhere.toml", GridSpec(2, 2, 1.0))

@@ -1,0 +1,134 @@
+"""Interest: within its regions a replica that holds only those equals one that holds all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.simulated_swarm import Laws, names, seeded
+
+from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.simulate import Simulation
+from shared_map.cost_map import CostMap
+from shared_map.replication.marks import region_tiles
+from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.statements import MarkKind
+from vehicle_agent.service import AgentService
+
+TERRAIN = terrain_of_pace(np.full((300, 520), 0.1, np.float32), 10.0)
+GRID = TERRAIN.grid
+REGIONS = range(GRID.regions)
+assert GRID.regions == 6
+
+regions = st.frozensets(st.sampled_from(list(REGIONS)))
+marks = st.tuples(st.integers(0, GRID.cells - 1), st.sampled_from([MarkKind.LETHAL, MarkKind.PACE, MarkKind.CLEAR]))
+steps = st.lists(st.one_of(regions, st.tuples(st.sampled_from(["a.0", "b.0", "mine"]), marks)), max_size=25)
+
+
+def sets(actions: list[PublishSet]) -> list[MarkSet]:
+    return [action.mark_set for action in actions]
+
+
+@given(steps)
+def test_within_its_regions_it_equals_one_that_holds_all(
+    happened: list[frozenset[int] | tuple[str, tuple[int, MarkKind]]],
+) -> None:
+    near_map, all_map, own_map = CostMap(TERRAIN), CostMap(TERRAIN), CostMap(TERRAIN)
+    near = MapReplica(GRID, near_map, author="mine", publish_hz=1000.0)
+    everything = MapReplica(GRID, all_map)
+    own = MapReplica(GRID, own_map)
+    writers = {name: MapReplica(GRID, author=name, publish_hz=1000.0) for name in ("a.0", "b.0")} | {"mine": near}
+    held: frozenset[int] = frozenset()
+    near.limit(held)
+    for now_ns, step in enumerate(happened):
+        if isinstance(step, frozenset):
+            near.limit(step)
+            for each in (each for tile in everything.tiles for each in everything.sets(tile)):
+                near.merge(each)  # what a query about the new regions brings, and more
+            held = step
+            continue
+        name, (cell, kind) = step
+        for each in sets(writers[name].write([cell], [kind], [0.5], 10_000_000 * (now_ns + 1))):
+            everything.merge(each)
+            if name == "mine":
+                own.merge(each)
+            else:
+                near.merge(each)
+    inside = np.zeros((GRID.rows, GRID.cols), bool)
+    for tile in [tile for region in held for tile in region_tiles(GRID, region)]:
+        window = GRID.tile_window(tile)
+        inside[window.row0 : window.row1, window.col0 : window.col1] = True
+    np.testing.assert_array_equal(near_map.pace_s_per_m[inside], all_map.pace_s_per_m[inside])
+    np.testing.assert_array_equal(near_map.pace_s_per_m[~inside], own_map.pace_s_per_m[~inside])
+    far = [tile for tile in near.tiles if not near.reading.concerns(tile)]
+    assert {each.author for tile in far for each in near.sets(tile)} <= {"mine"}
+    # Digests of all are no reason to ask for what lies elsewhere.
+    assert near.compare(everything.digest()) == []
+
+
+NEAR: Scenario = parse_scenario("""
+name = "near"
+time_scale = 40
+[terrain]
+source = "synthetic"
+rows = 280
+cols = 800
+resolution_m = 30
+relief_m = 200
+[terrain.hidden]
+rubble_fields = 12
+flooded_share = 0.02
+[cost]
+max_slope_deg = 25
+[map]
+interest = "near"
+interest_m = 1200
+[[targets]]
+count = 3
+speed_m_per_s = 3
+[[groups]]
+vehicles = 12
+[vehicles]
+per_agent = 2
+sense_range_m = 240
+capture_range_m = 60
+reassign_s = 2
+""")
+
+
+def check_interest(simulation: Simulation) -> tuple[int, int]:
+    """(sets held by agents, sets there are), after a look at each agent's regions."""
+    keeper: MapReplica = simulation.nodes["keeper-0"].service.replica  # type: ignore[union-attr]
+    held = there = 0
+    for node in simulation.nodes.values():
+        if not isinstance(node.service, AgentService):
+            continue
+        replica = node.service._replica
+        for tile in keeper.tiles:
+            there += len(keeper.sets(tile))
+            held += len(replica.sets(tile))
+            if replica.reading.concerns(tile):
+                assert [s for s in replica.sets(tile) if s.kinds] == [s for s in keeper.sets(tile) if s.kinds]
+    return held, there
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_agents_hold_what_is_near_their_vehicles_and_all_of_it(seed: int) -> None:
+    faults = random_plan(seed, names(NEAR), 20.0)
+    simulation = Simulation(seeded(seed, NEAR), faults=faults)
+    laws = Laws(simulation)
+    simulation.run_until(18)
+    for node in simulation.nodes.values():
+        if isinstance(node.service, AgentService):
+            node.service._agent.drive = lambda now_ns: None  # type: ignore[method-assign]  # nobody finds more
+    simulation.run_until(24)
+    held, there = check_interest(simulation)
+    assert 0 < held < 0.9 * there
+    assert laws.collisions == laws.lethal == []
+    simulation.finish()
+    assert simulation.report(24)["vehicles_routed"] == 12

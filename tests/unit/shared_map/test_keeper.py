@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.map_strategies import GRID, MapSwarm, set_of
+
+from shared_map.keeper.store import Keeper, KeeperStore
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.errors import StoreError
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.statements import MarkKind
+
+LETHAL = MarkKind.LETHAL
+
+
+def some_sets(count: int = 5) -> list[MarkSet]:
+    return [set_of("a", tile, 1, {tile: (LETHAL, 0, 10 + tile)}) for tile in range(count)]
+
+
+def fill(store: KeeperStore) -> None:
+    """Make the next page that the store needs one too many: a full disk."""
+    pages = store._db.execute("PRAGMA page_count").fetchone()[0]
+    store._db.execute(f"PRAGMA max_page_count = {pages}")
+
+
+def make_room(store: KeeperStore) -> None:
+    store._db.execute("PRAGMA max_page_count = 1000000")
+
+
+def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "map.sqlite"
+    with KeeperStore(path) as store:
+        store.bind("t", GRID)
+        store.save(some_sets())
+    with KeeperStore(path) as store:
+        assert (store.terrain, store.grid) == ("t", GRID)
+        assert list(store.load()) == some_sets()
+
+
+def test_an_older_set_never_replaces_a_newer_one_in_the_store() -> None:
+    store = KeeperStore(":memory:")
+    store.save([set_of("a", 0, 5, {}, epoch=2)])
+    store.save([set_of("a", 0, 9, {1: (LETHAL, 0, 1)}, epoch=1)])
+    assert list(store.load()) == [set_of("a", 0, 5, {}, epoch=2)]
+
+
+def test_the_store_of_another_terrain_is_refused(tmp_path: Path) -> None:
+    store = KeeperStore(tmp_path / "map.sqlite")
+    store.bind("0123456789abcdef", GRID)
+    store.bind("0123456789abcdef", GRID)
+    with pytest.raises(StoreError, match="holds marks on terrain 0123456789abcdef, but this run has terrain fed"):
+        store.bind("fed", GRID)
+
+
+def test_a_store_in_use_is_refused(tmp_path: Path) -> None:
+    with KeeperStore(tmp_path / "map.sqlite"), pytest.raises(StoreError, match="in use by another keeper"):
+        KeeperStore(tmp_path / "map.sqlite")
+    KeeperStore(tmp_path / "map.sqlite").close()
+
+
+def test_a_store_can_be_read_while_a_keeper_writes_it(tmp_path: Path) -> None:
+    with KeeperStore(tmp_path / "a map.sqlite") as store:
+        store.save(some_sets(2))
+        with KeeperStore(tmp_path / "a map.sqlite", read_only=True) as reader:
+            store.save(some_sets(3))
+            assert list(reader.load()) == some_sets(3)
+            with pytest.raises(StoreError, match="readonly"):
+                reader.save(some_sets())
+    with pytest.raises(StoreError, match="there is no store"):
+        KeeperStore(tmp_path / "none.sqlite", read_only=True)
+
+
+def test_a_file_that_is_no_store_is_refused_with_the_reason_and_set_aside_when_asked(tmp_path: Path) -> None:
+    path = tmp_path / "map.sqlite"
+    path.write_bytes(b"these are not the marks you are looking for" * 100)
+    with pytest.raises(StoreError, match=r"is damaged \(file is not a database\)"):
+        KeeperStore(path)
+    with KeeperStore(path, rebuild=True) as store:
+        assert list(store.load()) == []
+    assert (tmp_path / "map.sqlite.damaged-1").read_bytes().startswith(b"these are not")
+
+
+def test_a_store_with_torn_pages_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.sqlite"
+    with KeeperStore(path) as store:
+        for seq in range(40):
+            store.save([set_of(f"a{seq}.{tile}", tile, seq, {1: (LETHAL, 0, 1)}) for tile in range(20)])
+    whole = bytearray(path.read_bytes())
+    assert len(whole) > 5 * 4096
+    whole[2 * 4096 : 4 * 4096] = b"\xff" * (2 * 4096)
+    path.write_bytes(whole)
+    with pytest.raises(StoreError, match="is damaged"):
+        KeeperStore(path)
+
+
+def test_a_row_that_is_no_set_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "map.sqlite"
+    with KeeperStore(path) as store:
+        store.save(some_sets())
+    with sqlite3.connect(path) as db:
+        db.execute("UPDATE sets SET cells = x'00' WHERE tile = 3")
+    with KeeperStore(path) as store, pytest.raises(StoreError, match="damaged"):
+        list(store.load())
+
+
+def test_a_folder_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot open the store"):
+        KeeperStore(tmp_path / "file" / "map.sqlite")
+
+
+def test_only_what_is_on_the_disk_counts_as_committed() -> None:
+    keeper = Keeper()
+    first, second = set_of("a", 0, 1, {}), set_of("a", 0, 2, {})
+    keeper.accept(first)
+    waiting = keeper.waiting
+    keeper.accept(second)  # while the first is being written
+    assert keeper.committed.held() == {}
+    keeper.saved(waiting)
+    assert keeper.waiting == [second]
+    assert keeper.committed.missing({}) == []
+    assert list(keeper.committed.held()) == ["a"]
+
+
+# --- the service --------------------------------------------------------------------------------------------
+
+
+def test_an_author_learns_from_the_keepers_digest_what_is_safe() -> None:
+    swarm = MapSwarm()
+    store = KeeperStore(":memory:")
+    swarm.keeper("keeper", store)
+    author = swarm.writer("a1.1")
+    swarm.run(1.2)
+    assert author.feed.unacknowledged == 0
+    author.feed.publish(author.replica.write([5], [LETHAL], [0], swarm.now_ns))
+    assert author.feed.unacknowledged == 1
+    swarm.run(1.5)
+    assert author.feed.unacknowledged == 0
+    assert [each.author for each in store.load()] == ["a1.1"]
+
+
+def test_a_full_disk_is_told_of_and_the_keeper_goes_on_serving_and_saves_when_there_is_room() -> None:
+    swarm = MapSwarm()
+    store = KeeperStore(":memory:")
+    keeper = swarm.keeper("keeper", store)
+    author = swarm.writer("a1.1")
+    swarm.run(1.2)
+    fill(store)
+    cells = np.arange(swarm.terrain.grid.cells)
+    author.feed.publish(author.replica.write(cells, LETHAL, 0.0, swarm.now_ns))
+    swarm.run(3)
+    assert keeper.counters.counts["saves_failed"] >= 2
+    assert keeper.counters.gauges["sets_waiting"] == 6
+    assert author.feed.unacknowledged == 6
+    swarm.kill("a1.1")
+    late = swarm.listener("late")  # only the keeper is left to ask
+    swarm.run(1)
+    assert late.replica.fingerprint() == author.replica.fingerprint()
+    make_room(store)
+    swarm.run(2)
+    assert len(list(store.load())) == 6
+    assert keeper.counters.gauges["sets_waiting"] == 0
+
+
+def test_the_marks_of_the_dead_outlive_the_keeper(tmp_path: Path) -> None:
+    swarm = MapSwarm()
+    swarm.keeper("keeper", KeeperStore(tmp_path / "map.sqlite"))
+    author = swarm.writer("a1.1")
+    author.feed.publish(author.replica.write([5, 6], [LETHAL, LETHAL], [0, 0], swarm.now_ns))
+    swarm.run(1)
+    swarm.kill("a1.1")
+    swarm.kill("keeper.1")  # its file is as the last commit left it
+    copy = tmp_path / "copy.sqlite"
+    for tail in ("", "-wal"):
+        copy.with_name(copy.name + tail).write_bytes((tmp_path / f"map.sqlite{tail}").read_bytes())
+    again = swarm.keeper("keeper", KeeperStore(copy), incarnation=2)
+    assert again.replica.fingerprint() == author.replica.fingerprint()
+    late = swarm.listener("late")
+    swarm.run(1)
+    assert late.replica.fingerprint() == author.replica.fingerprint()
+
+
+def test_two_keepers_agree_though_each_missed_what_the_other_heard() -> None:
+    swarm = MapSwarm()
+    first = swarm.keeper("k1", KeeperStore(":memory:"))
+    author = swarm.writer("a1.1")
+    author.feed.publish(author.replica.write([5], [LETHAL], [0], swarm.now_ns))
+    swarm.run(1)
+    swarm.kill("a1.1")
+    second = swarm.keeper("k2", KeeperStore(":memory:"))
+    swarm.run(3)
+    assert first.replica.fingerprint() == second.replica.fingerprint() == author.replica.fingerprint()
+
+
+def test_a_keeper_refuses_the_store_of_another_terrain() -> None:
+    store = KeeperStore(":memory:")
+    store.bind("another", GRID)
+    with pytest.raises(StoreError, match="another"):
+        MapSwarm(terrain=terrain_of_pace(np.ones((9, 9), np.float32))).keeper("keeper", store)

@@ -1,0 +1,208 @@
+"""Layers against independent derivatives and against numbers that one can check by eye."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shared_map.terrain.importers.sources import load_source
+from shared_map.terrain.layers import (
+    CLASS_FACTOR,
+    TerrainClass,
+    directional_factor,
+    gradient,
+    paint_zones,
+    polygon_mask,
+    roughness_m,
+    slope_deg,
+    slope_factor,
+    terrain_pace,
+    zone_mask,
+)
+from shared_map.terrain.terrain import build_terrain
+from swarm.config.scenario import CostConfig, Scenario, TerrainConfig, ZoneConfig
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+
+DEM = Path(__file__).parents[4] / "shared" / "data" / "dem"
+MODELS = {
+    "jacksboro": "jacksboro",
+    "davosdorf": str(DEM / "davosdorf/davosdorf.tif"),
+    "bigtujunga": str(DEM / "bigtujunga/bigtujunga_512.tif"),
+    "rmnp": str(DEM / "rmnp/rmnp-dem.tif"),
+}
+RULES = ("linear", "quadratic", "tobler", "energy")
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_slope_is_scikit_images_derivative_within_1e_5(name: str) -> None:
+    from skimage.filters import sobel_h, sobel_v
+
+    if name != "jacksboro" and not DEM.is_dir():
+        pytest.skip("../shared/data is absent")
+    source = load_source(TerrainConfig(source=MODELS[name]), 1)
+    heights, step = source.elevation_m.astype(np.float64), source.grid.resolution_m
+    theirs_east, theirs_south = sobel_v(heights) / (2 * step), sobel_h(heights) / (2 * step)
+    ours_east, ours_north = gradient(source.elevation_m, step)
+    inner = (slice(1, -1), slice(1, -1))
+    np.testing.assert_allclose(ours_east[inner], theirs_east[inner], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(ours_north[inner], -theirs_south[inner], rtol=0, atol=1e-5)
+    theirs = np.arctan(np.hypot(theirs_east, theirs_south))
+    ours = np.radians(slope_deg(source.elevation_m, step).astype(np.float64))
+    np.testing.assert_allclose(ours[inner], theirs[inner], rtol=0, atol=1e-5)
+
+
+def test_a_plane_has_its_slope_everywhere_the_border_too() -> None:
+    row, col = np.mgrid[:9, :7]
+    east, north = gradient((100 + 3.0 * col - 4.0 * row).astype(np.float32), 10.0)
+    np.testing.assert_allclose(east, 0.3, atol=1e-6)
+    np.testing.assert_allclose(north, 0.4, atol=1e-6)
+
+
+def test_a_void_counts_as_level_with_its_neighbours_and_spoils_none() -> None:
+    row, _ = np.mgrid[:9, :9]
+    heights = (row * 2.0).astype(np.float32)
+    heights[4, 4] = np.nan
+    east, north = gradient(heights, 10.0)
+    known = ~np.isnan(heights)
+    assert np.isfinite(east[known]).all()
+    np.testing.assert_allclose(north[0:3], -0.2, atol=1e-6)
+
+
+def test_roughness_is_what_stands_off_the_even_slope() -> None:
+    row, col = np.mgrid[:7, :7]
+    heights = (3.0 * row + 2.0 * col).astype(np.float32)
+    np.testing.assert_allclose(roughness_m(heights, 10.0), 0, atol=1e-4)
+    heights[3, 3] += 7
+    assert roughness_m(heights, 10.0)[3, 3] == pytest.approx(7, abs=1e-4)
+    assert roughness_m(heights, 10.0)[0, 0] == pytest.approx(0, abs=1e-4)
+    pace = [
+        terrain_pace(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.uint8), CostConfig(rough_per_m=0.5), rough)
+        for rough in (None, np.full((1, 1), 4.0, np.float32))
+    ]
+    assert pace[1][0, 0] == pytest.approx(3 * pace[0][0, 0])
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_level_ground_costs_one_and_steeper_never_less(rule: str) -> None:
+    cost = CostConfig(slope_rule=rule, max_slope_deg=35)
+    grades = np.tan(np.radians(np.linspace(0, 40, 200))).astype(np.float32)
+    factor = slope_factor(grades, cost)
+    assert factor[0] == pytest.approx(1.0, abs=1e-6) or rule == "tobler"
+    assert (np.diff(factor[np.isfinite(factor)]) >= -1e-6).all()
+    steep = np.linspace(0, 40, 200) > 35.001
+    assert np.isinf(factor[steep]).all()
+    assert np.isfinite(factor[np.linspace(0, 40, 200) < 34.999]).all()
+
+
+def test_linear_and_quadratic_reach_the_steep_factor_at_the_limit() -> None:
+    limit = np.array([math.tan(math.radians(29.999))], np.float32)
+    half = np.array([math.tan(math.asin(math.sin(math.radians(30)) / 2))], np.float32)
+    for rule, middle in (("linear", 3.0), ("quadratic", 2.0)):
+        cost = CostConfig(slope_rule=rule, max_slope_deg=30, steep_factor=5)
+        assert slope_factor(limit, cost)[0] == pytest.approx(5, rel=1e-3)
+        assert slope_factor(half, cost)[0] == pytest.approx(middle, rel=1e-4)
+
+
+def test_tobler_walks_fastest_slightly_downhill() -> None:
+    cost = CostConfig(slope_rule="tobler", max_slope_deg=60)
+    rises = np.linspace(-0.5, 0.5, 1001).astype(np.float32)
+    factor = directional_factor(rises, cost)
+    assert rises[np.argmin(factor)] == pytest.approx(-0.05, abs=0.002)
+    assert directional_factor(np.zeros(1, np.float32), cost)[0] == pytest.approx(1)
+    # 6 exp(-3.5 |0.2 + 0.05|) km/h against 6 exp(-3.5 * 0.05) on the level
+    assert directional_factor(np.array([0.2], np.float32), cost)[0] == pytest.approx(math.exp(3.5 * 0.2), rel=1e-5)
+
+
+@pytest.mark.parametrize("rule", ["tobler", "energy"])
+def test_uphill_is_not_downhill(rule: str) -> None:
+    cost = CostConfig(slope_rule=rule)
+    up, down = directional_factor(np.array([0.2, -0.2], np.float32), cost)
+    assert up > down * 1.3
+    both = slope_factor(np.array([0.2], np.float32), cost)[0]
+    assert both == pytest.approx((up + down) / 2, rel=1e-6)
+
+
+@given(grade=st.floats(0, 100, width=32), factor=st.floats(0.125, 1e6, width=32), rule=st.sampled_from(RULES))
+@settings(max_examples=200, deadline=None)
+def test_costly_is_not_lethal(grade: float, factor: float, rule: str) -> None:
+    cost = CostConfig(slope_rule=rule, max_slope_deg=90, class_factor={"rock": factor})
+    pace = terrain_pace(np.array([[grade]], np.float32), np.array([[TerrainClass.ROCK]], np.uint8), cost)
+    assert np.isfinite(pace).all()
+    assert (pace > 0).all()
+
+
+def test_the_merge_rule_cell_by_cell() -> None:
+    grid = GridSpec(1, 8, 10.0)
+    kinds = ["GRASS", "FOREST", "ROAD", "WATER", "GRASS", "ROAD", "GRASS", "GRASS"]
+    classes = np.array([[TerrainClass[kind] for kind in kinds]], np.uint8)
+    grades = np.array([[0, 0, 0, 0, 2.0, 2.0, np.nan, 0]], np.float32)
+    cost = CostConfig(flat_speed_m_per_s=10, road_speed_m_per_s=20)
+    pace = terrain_pace(grades, classes, cost)
+    inf = math.inf
+    np.testing.assert_allclose(pace, [[0.1, 0.18, 0.05, inf, inf, inf, inf, 0.1]])
+
+    def zone(kind: str, col0: int, col1: int) -> ZoneConfig:
+        return ZoneConfig(kind=kind, polygon_m=((10 * col0, 0), (10 * col1, 0), (10 * col1, 10), (10 * col0, 10)))
+
+    zones = (
+        zone("forbidden", 1, 2),
+        zone("rough", 0, 2),
+        zone("preferred", 7, 8),
+        zone("road", 3, 8),
+        zone("rough", 3, 4),
+    )
+    paint_zones(pace, zones, grid, cost, void=np.isnan(grades))
+    # rough doubles; forbidden beats what is painted later; a road bridges water and cliffs, never a void
+    np.testing.assert_allclose(pace, [[0.2, inf, 0.05, 0.1, 0.05, 0.05, inf, 0.05]])
+
+
+def test_a_scenario_sets_the_factor_of_a_class() -> None:
+    classes = np.array([[TerrainClass.WATER, TerrainClass.FOREST]], np.uint8)
+    level = np.zeros((1, 2), np.float32)
+    pace = terrain_pace(level, classes, CostConfig(class_factor={"water": 4.0, "forest": "lethal"}))
+    np.testing.assert_allclose(pace, [[0.4, math.inf]])
+    ignored = terrain_pace(level, classes, CostConfig(classes=False))
+    np.testing.assert_allclose(ignored, [[0.1, 0.1]])
+    assert CLASS_FACTOR[TerrainClass.WATER] == math.inf
+
+
+def test_a_polygon_covers_the_cells_whose_middle_lies_in_it() -> None:
+    triangle = polygon_mask(((0, 0), (50, 0), (0, 50)), GridSpec(5, 5, 10.0))
+    assert triangle.tolist() == [[c + r < 4 for c in range(5)] for r in range(5)]
+    hole = polygon_mask(
+        ((0, 0), (50, 0), (50, 50), (0, 50), (0, 0), (20, 20), (20, 30), (30, 30), (30, 20), (20, 20)),
+        GridSpec(5, 5, 10.0),
+    )
+    assert hole.sum() == 24
+    assert not hole[2, 2]
+
+
+def test_a_zone_outside_the_terrain_is_refused_with_a_sentence() -> None:
+    far = ZoneConfig(kind="forbidden", name="swamp", polygon_m=((900, 900), (950, 900), (950, 950)))
+    with pytest.raises(TerrainError, match=r"'swamp' covers no cell.* 300 m x 200 m"):
+        zone_mask(far, GridSpec(20, 30, 10.0))
+    with pytest.raises(TerrainError, match="covers no cell"):
+        build_terrain(
+            Scenario(terrain=TerrainConfig(source="synthetic", rows=20, cols=30), cost=CostConfig(zones=(far,)))
+        )
+
+
+def test_a_zone_may_be_a_painted_mask(tmp_path: Path) -> None:
+    import rasterio
+
+    painted = np.zeros((20, 30), np.uint8)
+    painted[5:8, 5:8] = 255
+    with rasterio.open(tmp_path / "m.png", "w", driver="PNG", count=1, height=20, width=30, dtype="uint8") as file:
+        file.write(painted, 1)
+    zone = ZoneConfig(kind="forbidden", mask=str(tmp_path / "m.png"))
+    np.testing.assert_array_equal(zone_mask(zone, GridSpec(20, 30, 10.0)), painted > 0)
+    with pytest.raises(TerrainError, match="20 x 30 pixels, the terrain 10 x 10"):
+        zone_mask(zone, GridSpec(10, 10, 10.0))
+    with pytest.raises(TerrainError, match="does not exist"):
+        zone_mask(ZoneConfig(kind="road", mask="nowhere.png"), GridSpec(10, 10, 10.0))

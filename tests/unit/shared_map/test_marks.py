@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.map_strategies import GRID, mark_sets, naive_winners, set_of
+
+from shared_map.replication.marks import (
+    NO_STATEMENT,
+    HybridClock,
+    changes,
+    difference,
+    fault,
+    grid_cells,
+    region_tiles,
+    resolve,
+    supersedes,
+    tile_cells,
+)
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.statements import STAMP_LIMIT_NS, MarkKind
+
+PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
+
+
+def test_the_set_with_the_higher_epoch_and_then_seq_stays() -> None:
+    old = set_of("a", 0, 9, {}, epoch=1)
+    assert supersedes(set_of("a", 0, 0, {}, epoch=2), old)
+    assert supersedes(set_of("a", 0, 10, {}, epoch=1), old)
+    assert not supersedes(set_of("a", 0, 8, {}, epoch=1), old)
+    assert not supersedes(old, old)
+
+
+def test_of_two_statements_about_a_cell_the_newer_wins_and_on_a_tie_the_larger_author() -> None:
+    a = set_of("a", 0, 0, {5: (LETHAL, 0, 10), 6: (LETHAL, 0, 10)})
+    b = set_of("b", 0, 0, {5: (PACE, 2.0, 9), 6: (PACE, 2.0, 10)})
+    won = resolve([a, b])
+    assert won.kinds[5] == LETHAL
+    assert (won.kinds[6], won.paces[6]) == (PACE, 2.0)
+    assert won.kinds[7] == CLEAR
+    assert won.stamps_ns[7] == NO_STATEMENT
+
+
+@given(st.lists(mark_sets(), max_size=12))
+def test_resolving_agrees_with_the_two_rules_taken_one_statement_at_a_time(sets: list[MarkSet]) -> None:
+    newest: dict[tuple[int, str], MarkSet] = {}
+    for each in sets:
+        held = newest.get((each.tile, each.author))
+        if held is None or supersedes(each, held):
+            newest[each.tile, each.author] = each
+    for tile in range(GRID.tiles):
+        won = resolve(newest[at] for at in sorted(newest) if at[0] == tile)
+        said = np.flatnonzero(won.stamps_ns != NO_STATEMENT)
+        found = {(tile, int(c)): (int(won.kinds[c]), float(won.paces[c])) for c in said}
+        assert found == {at: what for at, what in naive_winners(sets).items() if at[0] == tile}
+
+
+@given(st.integers(0, GRID.cells - 1))
+def test_a_cell_is_found_again_from_its_tile(cell: int) -> None:
+    tiles, inner = tile_cells(GRID, np.array([cell]))
+    assert tiles.tolist() == [GRID.tile_of(cell)]
+    assert grid_cells(GRID, int(tiles[0]), inner).tolist() == [cell]
+
+
+def test_every_tile_is_in_exactly_one_region() -> None:
+    found = [tile for region in range(GRID.regions) for tile in region_tiles(GRID, region)]
+    assert sorted(found) == list(range(GRID.tiles))
+    assert all(GRID.region_of_tile(t) == r for r in range(GRID.regions) for t in region_tiles(GRID, r))
+
+
+@pytest.mark.parametrize(
+    ("mark_set", "reason"),
+    [
+        (set_of("a", 6, 0, {}), "tile 6 is not in 0..5"),
+        (set_of("a", 2, 0, {6: (LETHAL, 0, 1)}), "a cell of tile 2 lies outside the grid"),
+        (set_of("a", 3, 0, {8 * 32: (LETHAL, 0, 1)}), "a cell of tile 3 lies outside the grid"),
+    ],
+)
+def test_a_set_that_is_no_part_of_the_grid_is_told_apart_by_its_values_alone(
+    mark_set: MarkSet, reason: str
+) -> None:
+    assert (fault(mark_set, GRID) or "").startswith(reason)
+
+
+def test_whoever_knows_a_statement_from_the_future_can_overrule_it_at_once() -> None:
+    clock = HybridClock()
+    assert clock.stamps_ns(100, np.array([NO_STATEMENT, 50, 5_000])).tolist() == [100, 100, 5_001]
+    assert clock.stamps_ns(90, np.array([NO_STATEMENT])).tolist() == [100]  # never backwards
+    assert clock.stamps_ns(101, np.array([NO_STATEMENT])).tolist() == [101]  # not dragged along
+
+
+def test_a_stamp_beyond_time_is_no_mark() -> None:
+    with pytest.raises(ValueError, match="below 2"):
+        set_of("a", 0, 0, {0: (LETHAL, 0, STAMP_LIMIT_NS)})
+
+
+@given(mark_sets(), st.none() | mark_sets(), st.lists(mark_sets(), max_size=3))
+def test_the_difference_that_a_set_makes_is_that_between_before_and_after(
+    new: MarkSet, old: MarkSet | None, more: list[MarkSet]
+) -> None:
+    """Whether few or many say something, and by the short way as by the long."""
+    others = sorted({each.author: each for each in more if each.author != new.author}.values(), key=_author)
+    before = resolve(sorted([*others] + ([] if old is None else [_by(new.author, old)]), key=_author))
+    after = resolve(sorted([*others, new], key=_author))
+    changed = difference(None if old is None else _by(new.author, old), new, others)
+    assert changed.cells.tolist() == changes(before, after).cells.tolist()
+    assert changed.kinds.tolist() == after.kinds[changed.cells].tolist()
+    assert changed.paces.tolist() == after.paces[changed.cells].tolist()
+    assert changed.stamps_ns.tolist() == after.stamps_ns[changed.cells].tolist()
+
+
+def _author(of: MarkSet) -> str:
+    return of.author
+
+
+def _by(author: str, of: MarkSet) -> MarkSet:
+    return msgspec.structs.replace(of, author=author)

@@ -1,0 +1,232 @@
+"""Plain formats: what is right is read, what is wrong is said with its line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared_map.terrain.importers.plain_files import read_pgm
+from shared_map.terrain.importers.sources import Source, load_source
+from shared_map.terrain.terrain import build_terrain
+from swarm.config.scenario import CostConfig, Scenario, TerrainConfig
+from swarm.errors import TerrainError
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
+ASC = "ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\nNODATA_value -9999\n1 2 3\n4 -9999 6\n"
+MAP = "type octile\nheight 3\nwidth 4\nmap\n..@T\nGS.W\nO...\n"
+YAML = "image: m.pgm  # the picture\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\nnegate: 0\n"
+YAML += "occupied_thresh: 0.65\nfree_thresh: 0.25\n"
+
+
+def load(path: Path, text: str | bytes | None = None, **settings: object) -> Source:
+    if text is not None:
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return load_source(TerrainConfig(source=str(path), **settings), seed=1)
+
+
+def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
+    source = load(tmp_path / "a.asc", ASC)
+    np.testing.assert_array_equal(source.elevation_m, np.array([[1, 2, 3], [4, np.nan, 6]], np.float32))
+    assert (source.grid.resolution_m, source.grid.west_m, source.grid.north_m) == (50, 1000, 2100)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (ASC.replace("ncols 3", "ncols 2.5"), "its header says ncols 2.5; expected a whole number"),
+        (ASC.replace("ncols 3", "ncols nan"), "its header says ncols nan; expected a finite number"),
+        (ASC.replace("cellsize 50", "cellsize inf"), "its header says cellsize inf; expected a finite number"),
+        (ASC.replace("1 2 3", "1 2"), r"ragged: line 7 has 2 heights, its header says 3"),
+        (ASC.replace("4 -9999 6\n", ""), "has 1 rows of heights; its header says 2"),
+        (ASC.replace("4 -9999 6", "4 x 6"), "line 8"),
+        (ASC.replace("ncols 3\n", ""), "lacks ncols"),
+        (ASC.replace("cellsize 50", "cellsize 0"), "must be positive"),
+        (ASC.replace("ncols 3", "ncols 300000").replace("nrows 2", "nrows 300000"), "300000 x 300000"),
+        (ASC.replace("ncols 3", "ncols three"), "line 1: 'three' is no number"),
+        (
+            ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47"),
+            "looks like degrees",
+        ),
+        (b"\xff\xfe\x00", "no text"),
+        ("", "no ESRI ASCII grid"),
+    ],
+)
+def test_a_bad_ascii_grid_is_refused_with_a_sentence(tmp_path: Path, text: str | bytes, words: str) -> None:
+    with pytest.raises(TerrainError, match=words):
+        load(tmp_path / "a.asc", text)
+
+
+def test_an_ascii_grid_in_degrees_is_put_on_metres_when_told(tmp_path: Path) -> None:
+    text = ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47")
+    source = load(tmp_path / "a.asc", text.replace("-9999 6", "5 6"), crs="EPSG:4326")
+    assert 80 < source.grid.resolution_m < 100
+
+
+def test_arrays_come_from_npz_with_resolution_and_photo(tmp_path: Path) -> None:
+    heights = np.arange(20.0).reshape(4, 5)
+    photo = np.full((4, 5, 3), 90, np.uint8)
+    np.savez(tmp_path / "a.npz", elevation=heights, resolution_m=30.0, photo=photo)
+    source = load(tmp_path / "a.npz")
+    np.testing.assert_array_equal(source.elevation_m, heights)
+    assert source.grid.resolution_m == 30
+    assert source.photo is not None
+    assert load(tmp_path / "a.npz", resolution_m=60.0).elevation_m.shape == (2, 2)
+
+
+def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    for arrays, words in (
+        ({"height": np.ones((3, 3))}, r"no two-dimensional `elevation`.*height \(3, 3\)"),
+        ({"elevation": np.ones(3)}, "no two-dimensional"),
+        ({"elevation": np.ones((3, 3))}, "does not say how large a cell is; set terrain.resolution_m"),
+        ({"elevation": np.ones((3, 3)), "resolution_m": -1.0}, "must be positive"),
+        ({"elevation": np.array([["a", "b"]])}, "of numbers"),
+    ):
+        np.savez(path, **arrays)
+        with pytest.raises(TerrainError, match=words):
+            load(path)
+    np.savez(path, elevation=np.random.default_rng(1).normal(size=(50, 50)), resolution_m=1.0)
+    with pytest.raises(TerrainError, match=r"truncated or no \.npz"):
+        load(path, path.read_bytes()[:9000])
+    with pytest.raises(TerrainError, match=r"truncated or no \.npz"):
+        load(path, b"PK nonsense")
+
+
+def test_an_hgt_is_known_by_its_length(tmp_path: Path) -> None:
+    heights = np.full((1201, 1201), 700, ">i2")
+    heights[0, 0] = -32768
+    source = load(tmp_path / "N46E009.hgt", heights.tobytes())
+    assert 70 < source.grid.resolution_m < 93
+    assert np.nanmedian(source.elevation_m) == 700
+    with pytest.raises(TerrainError, match=r"truncated or no \.hgt: it has 1000 bytes"):
+        load(tmp_path / "N46E010.hgt", b"\0" * 1000)
+
+
+def test_a_png_needs_a_scale(tmp_path: Path) -> None:
+    import rasterio
+
+    grey = (np.arange(48).reshape(6, 8) * 100).astype(np.uint16)
+    with rasterio.open(tmp_path / "a.png", "w", driver="PNG", count=1, height=6, width=8, dtype="uint16") as file:
+        file.write(grey, 1)
+    with pytest.raises(TerrainError, match=r"set terrain\.resolution_m .* terrain\.height_scale"):
+        load(tmp_path / "a.png")
+    source = load(tmp_path / "a.png", resolution_m=5.0, height_scale=0.1)
+    np.testing.assert_allclose(source.elevation_m, grey * 0.1, rtol=1e-6)
+
+
+# --- maps without heights -----------------------------------------------------------------------------------
+
+
+def test_a_movingai_map_is_open_or_lethal_cell_by_cell(tmp_path: Path) -> None:
+    (tmp_path / "a.map").write_text(MAP)
+    scenario = Scenario(
+        terrain=TerrainConfig(source=str(tmp_path / "a.map")), cost=CostConfig(flat_speed_m_per_s=4.0)
+    )
+    terrain = build_terrain(scenario)
+    lethal = np.array([[0, 0, 1, 1], [0, 0, 0, 1], [1, 0, 0, 0]], bool)
+    np.testing.assert_array_equal(np.isinf(terrain.pace_s_per_m), lethal)
+    assert (terrain.pace_s_per_m[~lethal] == 0.25).all()
+    assert terrain.grid.resolution_m == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (MAP.replace("GS.W", "GS."), "line 6: 3 cells; its header says 4"),
+        (MAP.replace("O...\n", ""), "2 rows; its header says 3"),
+        (MAP.replace("O...", "O.x."), "line 7, column 3: 'x' is no ground"),
+        (MAP.replace("height 3", "height many"), "no MovingAI map"),
+        (MAP.replace("height 3", "height 99999999").replace("width 4", "width 9999"), "header says 99999999"),
+        ("hello", "no MovingAI map"),
+    ],
+)
+def test_a_bad_map_is_refused_with_a_sentence(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(TerrainError, match=words):
+        load(tmp_path / "a.map", text)
+
+
+def ros(
+    folder: Path, yaml: str = YAML, image: bytes = b"P5\n# made by hand\n3 2\n255\n\xfe\x00\xcd\xfe\xfe\x00"
+) -> Source:
+    (folder / "m.pgm").write_bytes(image)
+    return load(folder / "m.yaml", yaml)
+
+
+def test_a_ros_map_keeps_row_0_on_top_and_unknown_is_lethal(tmp_path: Path) -> None:
+    source = ros(tmp_path)
+    np.testing.assert_array_equal(source.factor, np.array([[1, np.inf, 1], [1, 1, np.inf]], np.float32))
+    assert (source.grid.resolution_m, source.grid.west_m, source.grid.north_m) == (0.05, -1.0, -1.9)
+    unknown = ros(tmp_path, YAML.replace("0.25", "0.1"))
+    assert np.isinf(unknown.factor[0, 2])
+    (tmp_path / "m.yaml").write_text(YAML.replace("0.25", "0.1"))
+    assert load(tmp_path / "m.yaml", nodata="fill").factor[0, 2] == 1
+
+
+def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
+    scaled = ros(tmp_path, YAML + "mode: scale\n", b"P2 3 1 # wide\n100\n100 55 20\n").factor
+    assert scaled[0, 0] == 1
+    assert 1 < scaled[0, 1] < 10
+    assert np.isinf(scaled[0, 2])
+    raw = ros(tmp_path, YAML + "mode: raw\n", b"P5 3 1 255\n\x00\x64\xff").factor
+    np.testing.assert_array_equal(raw, np.array([[1, np.inf, np.inf]], np.float32))
+    turned = ros(tmp_path, YAML.replace("negate: 0", "negate: 1"), b"P5 2 1 255\n\x00\xff").factor
+    np.testing.assert_array_equal(turned, np.array([[1, np.inf]], np.float32))
+    wide = ros(tmp_path, YAML, b"P5 2 1 65535\n\xff\xff\x00\x00").factor
+    np.testing.assert_array_equal(wide, np.array([[1, np.inf]], np.float32))
+
+
+@pytest.mark.parametrize(
+    ("yaml", "image", "words"),
+    [
+        (YAML, b"P6 1 1 255\n\0\0\0", "no PGM: it begins with b'P6'"),
+        (YAML, b"P5 100 100 255\n\0\0", "truncated: 2 pixels; its header says 100 x 100"),
+        (YAML, b"P5 99999 99999 255\n\0", "header says 99999 x 99999"),
+        (YAML, b"P5 a b 255\n\0", "width, height and brightest"),
+        (YAML, b"P2 2 1 255\n1 x\n", "no PGM"),
+        (YAML, b"P5 2 1 0\n\0\0", "brightest value is 0"),
+        (YAML.replace("resolution: 0.05\n", ""), b"P5 1 1 255\n\0", "resolution is missing"),
+        (YAML.replace("0.05", "wide"), b"P5 1 1 255\n\0", "wide"),
+        (YAML.replace("0.0]", "0.7]"), b"P5 1 1 255\n\0", "turned by 0.7 rad"),
+        (YAML + "mode: fancy\n", b"P5 1 1 255\n\0", "mode is 'fancy'"),
+        (YAML + "what is this\n", b"P5 1 1 255\n\0", "line 7"),
+        (YAML.replace("0.25", "0.9"), b"P5 1 1 255\n\0", "free <= occupied"),
+    ],
+)
+def test_a_bad_ros_map_is_refused_with_a_sentence(tmp_path: Path, yaml: str, image: bytes, words: str) -> None:
+    with pytest.raises(TerrainError, match=words):
+        ros(tmp_path, yaml, image)
+
+
+def test_a_missing_image_is_said(tmp_path: Path) -> None:
+    with pytest.raises(TerrainError, match=r"m.yaml names the image m.pgm, but there is no file"):
+        load(tmp_path / "m.yaml", YAML)
+
+
+def test_resampling_a_map_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "m.pgm").write_bytes(b"P5 2 1 255\n\xff\xff")
+    with pytest.raises(TerrainError, match="cannot be resampled without closing gaps"):
+        load(tmp_path / "m.yaml", YAML, resolution_m=0.2)
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["depot", "tb3_sandbox"])
+def test_real_ros_maps_have_free_and_lethal_ground(name: str) -> None:
+    source = load(DATA / "ros_maps" / f"{name}.yaml")
+    pixels, _ = read_pgm(DATA / "ros_maps" / f"{name}.pgm")
+    assert source.factor is not None
+    assert source.factor.shape == pixels.shape
+    assert (source.factor == 1).sum() == (pixels > 255 * 0.75).sum() or name != "depot"
+    assert np.isinf(source.factor).any()
+
+
+@needs_data
+@pytest.mark.parametrize(
+    "name", ["cities/Berlin_0_512", "mazes/maze512-32-0", "random/random512-10-0", "rooms/16room_000"]
+)
+def test_real_grid_maps_are_512_squared(name: str) -> None:
+    source = load(DATA / "movingai" / f"{name}.map")
+    assert source.elevation_m.shape == (512, 512)
+    assert 0.3 < np.isfinite(source.factor).mean() < 1

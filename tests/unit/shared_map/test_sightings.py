@@ -1,0 +1,131 @@
+"""Target-sighted marks: told by who has a target in sight; the newest wins, they end by themselves."""
+
+from __future__ import annotations
+
+import msgspec
+from hypothesis import given
+from hypothesis import strategies as st
+from support.simulated_swarm import SMALL, Laws
+
+from launch_scripts.simulation.simulate import Simulation
+from shared_map.keeper.store import KeeperStore
+from shared_map.replication.filter import Reading
+from shared_map.sightings import Sightings, pose_of
+from swarm.bus.bus import Heard
+from swarm.grid import GridSpec
+from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.topics import POSE, SIGHTED
+from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.sensing.target_detector import Lookout
+
+GRID = GridSpec(40, 40, 10.0, west_m=1000.0, north_m=5000.0)
+
+
+def sighted(
+    stamp_ns: int, *, target: str = "t", author: str = "red.a0.1", seq: int = 0, cell: int = 7, until_ns: int = 1000
+) -> Sighted:
+    group = author.partition(".")[0]
+    return Sighted(
+        author=author, group=group, target=target, seq=seq, stamp_ns=stamp_ns, until_ns=until_ns, cell=cell,
+        x_m=0.0, y_m=0.0, uncertainty_m=5.0,
+    )  # fmt: skip
+
+
+some = st.builds(
+    sighted,
+    st.integers(0, 5),
+    target=st.sampled_from(["t", "u"]),
+    author=st.sampled_from(["red.a0.1", "blue.a1.1"]),
+    seq=st.integers(0, 2),
+    until_ns=st.integers(0, 9),
+)
+
+
+@given(st.lists(some, max_size=12), st.randoms(use_true_random=False))
+def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighted], chance: object) -> None:
+    # An author says one thing under one number.
+    told = list({(each.target, each.author, each.stamp_ns, each.seq): each for each in told}.values())
+    again = [*told, *told]
+    chance.shuffle(again)  # type: ignore[attr-defined]
+    one, other = Sightings(Reading(GRID)), Sightings(Reading(GRID))
+    for each in told:
+        one.hear(each)
+    for each in again:
+        other.hear(each)
+    assert one.best(4) == other.best(4)
+    for target, best in one.best(4).items():
+        assert best.until_ns > 4
+        assert best.target == target
+
+
+def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
+    seen = Sightings(Reading(GRID))
+    seen.hear(sighted(5, author="red.a0.1", cell=1, until_ns=10))
+    seen.hear(sighted(4, author="blue.a1.1", cell=2, until_ns=20))
+    assert seen.best(9)["t"].cell == 1
+    assert seen.best(10)["t"].cell == 2
+    assert seen.best(20) == {}
+
+
+def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
+    seen = Sightings(Reading(GRID, frozenset({"red"})))
+    assert not seen.hear(sighted(5, author="blue.a1.1"))
+    assert seen.hear(sighted(4, author="red.a0.1"))
+    assert pose_of(seen.best(9)["t"]).seq == 4
+
+
+def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
+    lookout = Lookout(GRID, "red.a0.1", "red", range_m=100.0, lasts_s=2.0)
+    x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
+    lookout.truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m))
+    far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
+    assert lookout.look([far], 0) == []
+    (told,) = lookout.look([far, near], 0)
+    assert (told.cell, told.until_ns, told.uncertainty_m) == (410, 2_000_000_000, 5.0 + 0.02 * 50.0)
+    assert lookout.look([near], 400_000_000) == []  # not so often
+    assert len(lookout.look([near], 500_000_000)) == 1
+
+
+def test_the_store_keeps_where_each_target_was_seen_last() -> None:
+    with KeeperStore(":memory:") as store:
+        store.save_sightings([sighted(5, cell=1), sighted(5, target="u")])
+        store.save_sightings([sighted(4, cell=2)])
+        assert [(each.target, each.cell) for each in store.sightings()] == [("t", 1), ("u", 7)]
+
+
+UNTRACKED = msgspec.structs.replace(
+    SMALL,
+    targets=(msgspec.structs.replace(SMALL.targets[0], name="lost", count=2, tracker="sighted"),),
+    vehicles=msgspec.structs.replace(SMALL.vehicles, sense_range_m=400.0),
+)
+
+
+def test_targets_that_nobody_tracks_are_chased_by_what_vehicles_see() -> None:
+    simulation = Simulation(msgspec.structs.replace(UNTRACKED, seed=3))
+    laws = Laws(simulation)
+    heard: list[Heard] = []
+    ear = simulation.network.bus("ear")
+    ear.subscribe(POSE, heard.append)  # type: ignore[arg-type]
+    seen: list[Heard] = []
+    ear.subscribe(SIGHTED, seen.append)  # type: ignore[arg-type]
+    simulation.run_until(20)
+    simulation.finish()
+    report = simulation.report(20)
+    assert heard == []
+    assert len(seen) > 20
+    assert report["captures"] > 0
+    assert laws.collisions == laws.lethal == []
+    store = simulation.nodes["keeper-0"].store
+    assert store is not None
+    assert {each.target for each in store.sightings()} <= {"lost0", "lost1"} != set()
+
+
+def test_a_sighting_that_ended_on_its_way_tells_nobody_anything() -> None:
+    blind = msgspec.structs.replace(UNTRACKED.vehicles, sense_range_m=0.1)
+    simulation = Simulation(msgspec.structs.replace(UNTRACKED, vehicles=blind))
+    simulation.run_until(1)
+    stranger = simulation.network.bus("stranger")
+    late = sighted(0, target="lost0", author="all.a9.1", until_ns=1)
+    stranger.publish(SIGHTED, late, target="lost0", author="all.a9.1")
+    simulation.run_until(2)
+    assert simulation.report(2)["payloads_dropped"] == 0

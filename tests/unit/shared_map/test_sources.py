@@ -1,0 +1,350 @@
+"""Every kind of file is read onto one metric grid; what is wrong with a file is said in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import Affine, from_origin
+
+from shared_map.terrain.importers.sources import Source, load_source, metres_per_degree
+from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.terrain import build_terrain
+from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.errors import TerrainError
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
+UTM = from_origin(500_000, 5_200_000, 20, 20)
+
+
+def heights(rows: int = 40, cols: int = 50) -> np.ndarray:
+    row, col = np.mgrid[:rows, :cols]
+    return (500 + 3.0 * row + 2.0 * col + 10 * np.sin(row / 5.0) * np.cos(col / 7.0)).astype(np.float32)
+
+
+def write(path: Path, bands: np.ndarray, transform: Affine = UTM, crs: Any = "EPSG:32632", **profile: Any) -> Path:
+    bands = bands if bands.ndim == 3 else bands[None]
+    scales = profile.pop("scales", None)
+    offsets = profile.pop("offsets", None)
+    size = {"count": bands.shape[0], "height": bands.shape[1], "width": bands.shape[2], "dtype": bands.dtype}
+    with rasterio.open(path, "w", driver="GTiff", crs=crs, transform=transform, **size, **profile) as file:
+        file.write(bands)
+        if scales:
+            file.scales, file.offsets = scales, offsets
+    return path
+
+
+def load(source: Path | str, **settings: Any) -> Source:
+    return load_source(TerrainConfig(source=str(source), **settings), seed=1)
+
+
+def said(source: Source, words: str) -> bool:
+    return any(words in note for note in source.notes)
+
+
+# --- GeoTIFF ------------------------------------------------------------------------------------------------
+
+
+def test_a_metric_geotiff_is_taken_as_it_is(tmp_path: Path) -> None:
+    source = load(write(tmp_path / "a.tif", heights()))
+    np.testing.assert_array_equal(source.elevation_m, heights())
+    assert (source.grid.rows, source.grid.cols, source.grid.resolution_m) == (40, 50, 20)
+    assert (source.grid.west_m, source.grid.north_m, source.grid.crs) == (500_000, 5_200_000, "EPSG:32632")
+
+
+def test_degrees_are_put_on_square_metres(tmp_path: Path) -> None:
+    row, _ = np.mgrid[:60, :80]
+    plane = (1000 + row * 5.0).astype(np.float32)
+    source = load(write(tmp_path / "a.tif", plane, from_origin(9.5, 46.9, 0.001, 0.001), "EPSG:4326"))
+    per_lat, per_lon = metres_per_degree(46.87)
+    assert source.grid.resolution_m == pytest.approx(0.001 * np.sqrt(per_lat * per_lon), rel=2e-3)
+    assert source.grid.rows * source.grid.resolution_m == pytest.approx(0.06 * per_lat, rel=0.02)
+    assert source.grid.cols * source.grid.resolution_m == pytest.approx(0.08 * per_lon, rel=0.02)
+    assert not np.isnan(source.elevation_m).any()
+    per_cell = np.diff(source.elevation_m[5:-5, 10])
+    np.testing.assert_allclose(per_cell, 5.0 * source.grid.resolution_m / (0.001 * per_lat), rtol=5e-3)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:2263"])
+def test_systems_whose_unit_is_no_true_metre_are_reprojected(tmp_path: Path, crs: str) -> None:
+    where = (
+        from_origin(980_000, 200_000, 100, 100)
+        if crs == "EPSG:2263"
+        else from_origin(1_000_000, 5_900_000, 100, 100)
+    )
+    source = load(write(tmp_path / "a.tif", heights(), where, crs))
+    true_m = 30.48 if crs == "EPSG:2263" else 100 * np.cos(np.radians(46.7))
+    assert source.grid.resolution_m == pytest.approx(true_m, rel=0.01)
+
+
+def test_a_rotated_file_is_turned_north_up_and_says_so(tmp_path: Path) -> None:
+    turned = Affine(20 * np.cos(0.5), 20 * np.sin(0.5), UTM.c, 20 * np.sin(0.5), -20 * np.cos(0.5), UTM.f)
+    source = load(write(tmp_path / "a.tif", heights(), turned))
+    assert said(source, "rotated")
+    assert said(source, "voids")
+    known = source.elevation_m[~np.isnan(source.elevation_m)]
+    assert 0.5 < known.size / source.elevation_m.size < 0.95
+    assert heights().min() - 1 <= known.min()
+    assert known.max() <= heights().max() + 1
+
+
+def test_a_coarser_resolution_averages(tmp_path: Path) -> None:
+    source = load(write(tmp_path / "a.tif", heights()), resolution_m=40.0)
+    assert (source.grid.rows, source.grid.cols) == (20, 25)
+    np.testing.assert_allclose(source.elevation_m, heights().reshape(20, 2, 25, 2).mean(axis=(1, 3)), atol=0.01)
+
+
+def test_scale_and_offset_are_applied_and_said(tmp_path: Path) -> None:
+    raw = np.round(heights() * 10).astype(np.int16) - 3000
+    source = load(write(tmp_path / "a.tif", raw, scales=(0.1,), offsets=(300.0,)))
+    np.testing.assert_allclose(source.elevation_m, heights(), atol=0.06)
+    assert said(source, "scale 0.1 and offset 300")
+
+
+def test_heights_below_the_sea_are_heights(tmp_path: Path) -> None:
+    source = load(write(tmp_path / "a.tif", heights() - 900))
+    assert source.elevation_m.min() < -300
+    assert not np.isnan(source.elevation_m).any()
+
+
+@pytest.mark.parametrize("dtype", ["float32", "int16"])
+def test_voids_nan_and_infinite_cells_are_voids_counted_and_said(tmp_path: Path, dtype: str) -> None:
+    values = heights().astype(dtype)
+    values[5:10, 5:10] = -9999
+    if dtype == "float32":
+        values[20, 20], values[20, 22], values[20, 24] = np.nan, np.inf, -3.4e38
+    source = load(write(tmp_path / "a.tif", values, nodata=-9999))
+    count = 28 if dtype == "float32" else 25
+    assert np.isnan(source.elevation_m).sum() == count
+    assert said(source, f"{count} voids")
+    terrain = build_terrain(Scenario(terrain=TerrainConfig(source=str(tmp_path / "a.tif"))))
+    assert (np.isinf(terrain.pace_s_per_m) == np.isnan(source.elevation_m)).all()
+
+
+def test_voids_are_filled_on_request(tmp_path: Path) -> None:
+    values = heights()
+    values[5:10, 5:10] = -9999
+    source = load(write(tmp_path / "a.tif", values, nodata=-9999), nodata="fill")
+    assert said(source, "filled")
+    np.testing.assert_allclose(source.elevation_m, heights(), atol=6.0)
+
+
+def test_54_percent_voids_are_lethal_with_a_hint(tmp_path: Path) -> None:
+    values = heights(50, 50)
+    values[:27] = -9999
+    path = write(tmp_path / "a.tif", values, nodata=-9999)
+    assert said(load(path), "54.0% of the cells) are lethal; crop the file, or set terrain.nodata = 'fill'")
+    assert not np.isnan(load(path, nodata="fill").elevation_m).any()
+
+
+def test_a_photo_on_another_grid_is_brought_onto_the_elevations(tmp_path: Path) -> None:
+    photo = np.zeros((3, 100, 100), np.uint8)
+    photo[1] = 120
+    photo[:, :, 50:] = [[[200]], [[60]], [[40]]]
+    write(tmp_path / "dem.tif", heights(), UTM)
+    west = UTM.c + 20 * 25 - 10 * 50
+    write(tmp_path / "photo.tif", photo, from_origin(west, UTM.f, 10, 10))
+    source = load(tmp_path / "dem.tif", photo=str(tmp_path / "photo.tif"))
+    assert source.photo is not None
+    assert source.photo.shape == (40, 50, 3)
+    assert (source.photo[:, :24] == (0, 120, 0)).all()
+    assert (source.photo[:, 26:] == (200, 60, 40)).all()
+
+
+def test_a_photo_of_another_projection_and_depth_with_alpha(tmp_path: Path) -> None:
+    write(tmp_path / "dem.tif", heights(), UTM)
+    bounds = rasterio.warp.transform_bounds("EPSG:32632", "EPSG:4326", 500_000, 5_199_200, 501_000, 5_200_000)
+    where = rasterio.transform.from_bounds(*bounds, 120, 100)
+    photo = np.random.default_rng(1).integers(200, 4000, (4, 100, 120)).astype(np.uint16)
+    photo[3] = 65535
+    photo[3, :, :60] = 0
+    write(tmp_path / "photo.tif", photo, where, "EPSG:4326", photometric="rgb", alpha="yes")
+    source = load(tmp_path / "dem.tif", photo=str(tmp_path / "photo.tif"))
+    assert source.seen is not None
+    assert not source.seen[:, :23].any()
+    assert source.seen[2:-2, 27:-1].all()
+    assert (source.classes[~source.seen] == TerrainClass.UNKNOWN).all()
+    assert said(source, "stretched")
+
+
+# --- bad rasters --------------------------------------------------------------------------------------------
+
+
+def no_crs(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights(), crs=None)}
+
+
+def without_metres(folder: Path) -> dict[str, Any]:
+    local = 'LOCAL_CS["mine",UNIT["metre",1]]'
+    return {"source": write(folder / "a.tif", heights(), crs=local)}
+
+
+def photo_elsewhere(folder: Path) -> dict[str, Any]:
+    photo = write(folder / "p.tif", np.zeros((3, 9, 9), np.uint8), from_origin(600_000, 5_200_000, 10, 10))
+    return {"source": write(folder / "a.tif", heights()), "photo": str(photo)}
+
+
+def photo_without_place(folder: Path) -> dict[str, Any]:
+    photo = write(folder / "p.tif", np.zeros((3, 9, 9), np.uint8), Affine.identity(), None)
+    return {"source": write(folder / "a.tif", heights()), "photo": str(photo)}
+
+
+def a_photo_as_terrain(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", np.zeros((3, 40, 50), np.uint8))}
+
+
+def truncated(folder: Path) -> dict[str, Any]:
+    path = write(folder / "a.tif", heights(400, 400))
+    path.write_bytes(path.read_bytes()[:200_000])
+    return {"source": path}
+
+
+def truncated_compressed(folder: Path) -> dict[str, Any]:
+    noise = np.random.default_rng(1).normal(size=(400, 400)).astype(np.float32)
+    path = write(folder / "a.tif", noise, compress="deflate", tiled=True, blockxsize=128, blockysize=128)
+    path.write_bytes(path.read_bytes()[:200_000])
+    return {"source": path}
+
+
+def promise_of_20_gb(folder: Path) -> dict[str, Any]:
+    path = folder / "a.tif"
+    size = {"count": 1, "height": 100_000, "width": 100_000, "dtype": "int16"}
+    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32632", transform=UTM, SPARSE_OK=True, **size):
+        pass
+    return {"source": path}
+
+
+def promise_in_16384(folder: Path) -> dict[str, Any]:
+    path = write(folder / "a.tif", heights(64, 64))
+    data = bytearray(path.read_bytes())
+    for old in (64,):  # ImageWidth and ImageLength become 12800: 160 M cells in a file of 16 kB
+        for tag in (256, 257):
+            at = data.find(np.array([tag, 3], "<u2").tobytes() + np.array([1], "<u4").tobytes())
+            assert int(data[at + 8]) == old
+            data[at + 8 : at + 10] = np.array([12800], "<u2").tobytes()
+    path.write_bytes(bytes(data))
+    return {"source": path}
+
+
+def all_voids(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", np.full((9, 9), np.nan, np.float32))}
+
+
+def no_raster(folder: Path) -> dict[str, Any]:
+    (folder / "a.tif").write_text("this is a letter, not a map")
+    return {"source": folder / "a.tif"}
+
+
+def missing(folder: Path) -> dict[str, Any]:
+    return {"source": folder / "nowhere.tif"}
+
+
+def a_folder(folder: Path) -> dict[str, Any]:
+    return {"source": folder}
+
+
+def strange_ending(folder: Path) -> dict[str, Any]:
+    (folder / "a.xyz").write_text("1 2 3")
+    return {"source": folder / "a.xyz"}
+
+
+def wrong_crs(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights(), crs=None), "crs": "EPSG:banana"}
+
+
+def coarser_than_all(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights()), "resolution_m": 5000.0}
+
+
+def labels_without_photo(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights()), "labels": "labels.toml"}
+
+
+def the_whole_world(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights(), from_origin(-180, 90, 7.2, 4.5), "EPSG:4326")}
+
+
+def beyond_the_pole(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights(), from_origin(9, 91, 0.1, 0.1), "EPSG:4326")}
+
+
+def complex_heights(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights().astype(np.complex64))}
+
+
+def around_the_pole(folder: Path) -> dict[str, Any]:
+    return {"source": write(folder / "a.tif", heights(), from_origin(10, 90, 0.001, 0.001), "EPSG:4326")}
+
+
+def photo_of_nothing(folder: Path) -> dict[str, Any]:
+    black = np.zeros((3, 40, 50), np.uint8)
+    return {"source": write(folder / "a.tif", heights()), "photo": write(folder / "p.tif", black, nodata=0)}
+
+
+def photo_of_nan(folder: Path) -> dict[str, Any]:
+    nothing = np.full((3, 40, 50), np.nan, np.float32)
+    return {"source": write(folder / "a.tif", heights()), "photo": write(folder / "p.tif", nothing)}
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (around_the_pole, "around latitude 89.98, where degrees of longitude have no width; reproject it"),
+        (photo_of_nothing, "p.tif shows nothing of the terrain"),
+        (photo_of_nan, "p.tif shows nothing of the terrain"),
+        (the_whole_world, "no flat grid is true over more than 12; crop it"),
+        (beyond_the_pole, "to 91; its georeference is damaged"),
+        (complex_heights, "holds complex64 values"),
+        (no_crs, r"does not say in which coordinate system.*set terrain\.crs"),
+        (without_metres, r"without metres or degrees.*set terrain\.crs"),
+        (photo_elsewhere, "photo .*p.tif does not overlap the terrain: it covers x 600000"),
+        (photo_without_place, "georeference both, or make them the same size"),
+        (a_photo_as_terrain, r"3 bands: a photo\? Name it in terrain\.photo"),
+        (truncated, "truncated: its header promises 400 x 400 cells, 0.6 MB, and it has 0.2 MB"),
+        (truncated_compressed, "truncated or no raster"),
+        (promise_of_20_gb, "promises 100000 x 100000 cells, 20000.0 MB"),
+        (promise_in_16384, "truncated"),
+        (all_voids, "no heights at all"),
+        (no_raster, "no raster"),
+        (missing, "nowhere.tif does not exist"),
+        (a_folder, "is a folder"),
+        (strange_ending, ".xyz is unknown; give .tif"),
+        (wrong_crs, "'EPSG:banana' is no coordinate system"),
+        (coarser_than_all, "no cell of 5000 m fits"),
+        (labels_without_photo, "needs a photo"),
+    ],
+)
+def test_a_bad_raster_is_refused_with_a_sentence(
+    tmp_path: Path, make: Callable[[Path], dict[str, Any]], words: str
+) -> None:
+    with pytest.raises(TerrainError, match=words) as caught:
+        load(**make(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+# --- real data ----------------------------------------------------------------------------------------------
+
+
+@needs_data
+def test_real_pairs_come_onto_one_grid() -> None:
+    davos = load(DATA / "dem/davosdorf/davosdorf.tif", photo=str(DATA / "dem/davosdorf/davosdorf_color.tif"))
+    assert (davos.grid.rows, davos.grid.cols, davos.grid.resolution_m) == (495, 559, 10)
+    assert davos.photo is not None
+    rmnp = load(DATA / "dem/rmnp/rmnp-dem.tif", photo=str(DATA / "dem/rmnp/rmnp-rgb.tif"))
+    assert 230 < rmnp.grid.resolution_m < 238
+    assert rmnp.photo is not None
+    assert rmnp.photo.shape == (rmnp.grid.rows, rmnp.grid.cols, 3)
+    assert not np.isnan(rmnp.elevation_m).any()
+    tujunga = load(DATA / "dem/bigtujunga/bigtujunga_512.tif")
+    assert tujunga.elevation_m.shape == (512, 512)
+
+
+@needs_data
+def test_jacksboro_from_its_file_is_jacksboro() -> None:
+    file = load(DATA / "dem/jacksboro/jacksboro_fault_dem.npz", resolution_m=75.0)
+    np.testing.assert_array_equal(file.elevation_m, load("jacksboro").elevation_m)

@@ -1,0 +1,308 @@
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.map_strategies import Composite, FeedService, LossyLinks, MapSwarm, set_of
+
+from shared_map.keeper.service import KeeperService
+from shared_map.keeper.store import KeeperStore
+from shared_map.replication.mark_sets import packed
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.sync import MapFeed
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import Asked, Heard
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.clock import MonotonicClock
+from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process
+from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import Counters
+from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarksRequest
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import DIGEST, MARKS, NOTE
+
+LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
+
+
+def write(service: FeedService, swarm: MapSwarm, cells: list[int], kind: MarkKind = LETHAL) -> None:
+    service.feed.publish(service.replica.write(cells, kind, 0.0, swarm.now_ns))
+
+
+def all_equal(services: Sequence[FeedService | KeeperService]) -> bool:
+    return len({service.replica.fingerprint() for service in services}) == 1
+
+
+def test_a_mark_reaches_every_replica_at_once() -> None:
+    swarm = MapSwarm()
+    author, listener = swarm.writer("a1.1"), swarm.listener("p")
+    write(author, swarm, [5])
+    swarm.run(0.01)
+    assert listener.replica.winners(0).kinds.tolist() == [LETHAL]
+
+
+def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -> None:
+    swarm = MapSwarm()
+    swarm.keeper("keeper", KeeperStore(":memory:"))
+    dead, alive = swarm.writer("a1.1"), swarm.writer("a2.1")
+    write(dead, swarm, [5, 900])
+    write(alive, swarm, [6])
+    swarm.run(1)
+    swarm.kill("a1.1")
+    late = swarm.listener("late")
+    swarm.run(0.05)
+    assert late.feed.joined
+    assert all_equal([late, dead, alive])
+    assert late.replica.take_newest_stamp_ns() is None  # old news say nothing about latency
+
+
+def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> None:
+    links = LossyLinks(1)
+    swarm = MapSwarm(links)
+    author, listener = swarm.writer("a1.1"), swarm.listener("p")
+    write(author, swarm, [5])
+    swarm.run(0.5)
+    links.dropped = 1.0
+    known = listener.replica.counts["sets_repeated"]
+    write(author, swarm, [40])  # another tile
+    swarm.run(0.2)
+    links.dropped = 0.0
+    assert not all_equal([author, listener])
+    swarm.run(1.5)
+    assert all_equal([author, listener])
+    assert listener.replica.counts["sets_repeated"] == known
+
+
+def test_when_a_partition_heals_all_replicas_are_equal_within_two_seconds() -> None:
+    links = LossyLinks(2)
+    swarm = MapSwarm(links)
+    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
+    near, far, listener = swarm.writer("a1.1"), swarm.writer("a2.1"), swarm.listener("p")
+    swarm.run(1)
+    links.far_side = {"a2.1", "p"}
+    for n in range(20):
+        write(near, swarm, [n])
+        write(far, swarm, [n + 10], CLEAR if n % 2 else LETHAL)
+        swarm.run(0.3)
+    assert not all_equal([near, far])
+    links.far_side = set()
+    swarm.run(2)
+    assert all_equal([near, far, listener])
+    assert keeper.replica.fingerprint() == near.replica.fingerprint()
+
+
+def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it() -> None:
+    links = LossyLinks(3)
+    swarm = MapSwarm(links)
+    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
+    author, listener = swarm.writer("a1.1"), swarm.listener("p")
+    swarm.run(1)
+    links.far_side = {"keeper.1"}
+    write(author, swarm, [5])
+    swarm.run(0.2)
+    swarm.kill("a1.1")
+    links.far_side = set()
+    swarm.run(6)
+    assert keeper.replica.fingerprint() == listener.replica.fingerprint() == author.replica.fingerprint()
+
+
+def test_nobody_speaks_under_anothers_key() -> None:
+    swarm = MapSwarm()
+    listener = swarm.listener("p")
+    liar = swarm.network.bus("liar")
+    liar.publish(MARKS, set_of("a1.1", 0, 1, {5: (LETHAL, 0, 1)}), region=0, tile=0, author="liar")
+    liar.publish(MARKS, set_of("liar", 1, 1, {5: (LETHAL, 0, 1)}), region=0, tile=0, author="liar")
+    swarm.run(0.1)
+    assert listener.replica.tiles == []
+    assert listener.replica.counts["sets_refused"] == 2
+
+
+def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
+    swarm = MapSwarm()
+    liar = swarm.network.bus("liar")
+    [lies] = packed([set_of("a1.1", tile, 9, {5: (LETHAL, 0, 1)}) for tile in range(3)])
+    [truth] = packed([set_of("liar", 1, 1, {6: (LETHAL, 0, 1)})])
+
+    def answer(event: object) -> None:
+        assert isinstance(event, Asked)
+        event.answer(lies, region="-", tile="-", author="liar")
+        event.answer(truth, region="-", tile="-", author="liar")
+        event.end()
+
+    liar.serve(MARKS, answer, author="liar")
+    late = swarm.listener("late")
+    swarm.run(0.1)
+    assert [(each.author, each.tile) for each in late.replica.answer(MarksRequest())] == [("liar", 1)]
+    assert late.replica.counts["sets_refused"] == 1
+
+
+def test_digests_without_end_are_held_within_bounds() -> None:
+    swarm = MapSwarm()
+    listener = swarm.listener("p")
+    hostile = swarm.network.bus("hostile")
+    rows = np.array([(tile, 1, 1) for tile in range(6)], DIGEST_ROW).tobytes()
+    for n in range(6000):
+        digest = Digest(author=f"x{n}", role="agent", held={f"x{n}": rows})
+        hostile.publish(DIGEST, digest, author=f"x{n}")
+    swarm.run(0.01)
+    assert len(listener.feed._claims) <= 4096
+    assert listener.feed._claim_bytes == sum(claim.size for claim in listener.feed._claims.values())
+    swarm.run(10)
+    assert listener.feed._claim_bytes == 0
+
+
+def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
+    swarm = MapSwarm()
+    keeper_says = swarm.network.bus("k")
+    listener = swarm.listener("p")
+    kept = {seq: np.array([(3, 1, seq)], DIGEST_ROW).tobytes() for seq in (1, 2, 3)}
+    for seq in (2, 1):
+        digest = Digest(author="k.1", role="keeper", held={"a1.1": kept[seq]}, seq=seq)
+        keeper_says.publish(DIGEST, digest, author="k.1")
+        swarm.run(0.01)
+    [claim] = listener.feed._claims.values()
+    assert claim.digest.held == listener.feed._kept == {"a1.1": kept[2]}
+    uncounted = Digest(author="k.1", role="keeper", held={"a1.1": kept[3]})
+    keeper_says.publish(DIGEST, uncounted, author="k.1")
+    swarm.run(0.01)
+    assert listener.feed._kept == {"a1.1": kept[3]}
+
+
+def test_events_of_others_are_left_to_others() -> None:
+    swarm = MapSwarm()
+    listener = swarm.listener("p")
+    note = set_of("a", 0, 1, {})
+    assert not listener.feed.handle(Heard(NOTE, {}, note), 0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    writes=st.lists(
+        st.tuples(st.integers(0, 2), st.integers(0, 2799), st.sampled_from([LETHAL, CLEAR]), st.floats(0, 0.5)),
+        min_size=1,
+        max_size=25,
+    ),
+)
+def test_with_30_percent_dropped_10_percent_doubled_and_500_ms_jitter_replicas_agree_after_quiet(
+    seed: int, writes: list[tuple[int, int, MarkKind, float]]
+) -> None:
+    swarm = MapSwarm(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
+    store = KeeperStore(":memory:")
+    keeper = swarm.keeper("keeper", store)
+    authors = [swarm.writer(f"a{n}.1") for n in range(3)]
+    listener = swarm.listener("p")
+    for author, cell, kind, pause_s in writes:
+        write(authors[author], swarm, [cell], kind)
+        swarm.run(pause_s)
+    waited_s = 0.0
+    everybody: list[FeedService | KeeperService] = [*authors, listener, keeper]
+    while not all_equal(everybody) and waited_s < 30:
+        swarm.run(0.5)
+        waited_s += 0.5
+    assert all_equal(everybody)
+    swarm.run(0.2)
+    sinks = [service.replica._cost_map for service in [*authors, listener]]
+    assert all(isinstance(sink, Composite) and sink.same(sinks[0]) for sink in sinks)  # type: ignore[arg-type]
+    assert len(list(store.load())) == sum(len(keeper.replica.sets(t)) for t in keeper.replica.tiles)
+
+
+# --- on real zenoh ------------------------------------------------------------------------------------------
+
+
+class Ticking(FeedService):
+    """A feed as a whole service, so that a real `Process` can run it."""
+
+    def __init__(self, feed: MapFeed) -> None:
+        super().__init__(feed)
+        self.counters = Counters()
+
+    def stop(self, now_ns: int) -> None:
+        pass
+
+
+class Running:
+    """Services on threads, each with its own zenoh session; closed in reverse order."""
+
+    def __init__(self, network: NetworkConfig) -> None:
+        self.network = network
+        self.terrain = terrain_of_pace(np.ones((64, 64), np.float32))
+        self.scenario = Scenario(network=network)
+        self._undo: list[Callable[[], None]] = []
+
+    def feed(self, author: str | None) -> Ticking:
+        bus, inbox = open_bus(self.network), Inbox()
+        replica = MapReplica(self.terrain.grid, Composite(self.terrain.grid), author=author)
+        service = Ticking(MapFeed(replica, bus, inbox.post, MapConfig(), "agent"))
+        self._run(service, bus, inbox)
+        return service
+
+    def keeper(self, store: KeeperStore) -> KeeperService:
+        bus, inbox = open_bus(self.network), Inbox()
+        setup = RoleSetup(self.scenario, "run", "keeper", "keeper", time.time_ns(), 0)
+        service = KeeperService(setup, self.terrain, bus, inbox.post, store)
+        self._run(service, bus, inbox)
+        return service
+
+    def _run(self, service: Ticking | KeeperService, bus: ZenohBus, inbox: Inbox) -> None:
+        process = Process(service, inbox, MonotonicClock(), 10.0)
+        thread = threading.Thread(target=process.run)
+        thread.start()
+
+        def undo() -> None:
+            process.stop()
+            thread.join(5)
+            bus.close()
+
+        self._undo.append(undo)
+
+    def stop_last(self) -> None:
+        self._undo.pop()()
+
+    def close(self) -> None:
+        while self._undo:
+            self.stop_last()
+
+
+@pytest.fixture
+def running() -> Iterator[Running]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
+    with open_bus(network, mode="router"):
+        swarm = Running(network)
+        try:
+            yield swarm
+        finally:
+            swarm.close()
+
+
+def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> None:
+    deadline = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < deadline, "not in time"
+        time.sleep(0.02)
+
+
+@pytest.mark.network
+def test_on_real_zenoh_marks_are_heard_kept_and_handed_to_who_comes_late(running: Running) -> None:
+    store = KeeperStore(":memory:")
+    running.keeper(store)
+    listener = running.feed(None)
+    author = running.feed("a1.1")
+    author.feed.publish(author.replica.write([5, 3000], LETHAL, 0.0, time.time_ns()))
+    eventually(lambda: listener.replica.fingerprint() == author.replica.fingerprint())
+    eventually(lambda: author.feed.unacknowledged == 0)
+    running.stop_last()  # the author ends; the keeper answers for it
+    late = running.feed(None)
+    eventually(lambda: late.replica.fingerprint() == author.replica.fingerprint(), within_s=2)
+    assert late.feed.joined
+    assert len(list(store.load())) == 2

@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.terrain import (
+    build_terrain,
+    build_truth,
+    load_prepared,
+    load_prepared_truth,
+    load_terrain,
+    load_truth,
+    prepare,
+    save_prepared,
+    scenario_key,
+    terrain_of_pace,
+)
+from swarm.config.load import load_scenario
+from swarm.config.scenario import CostConfig, Scenario, TerrainConfig, ZoneConfig
+from swarm.errors import TerrainError
+from swarm.runtime.role import RoleSetup
+
+SCENARIOS = Path(__file__).parents[3] / "launch_scripts" / "scenarios"
+SMALL = Scenario(seed=2, terrain=TerrainConfig(source="synthetic", rows=48, cols=64, relief_m=150))
+
+
+def with_cost(**changes: object) -> Scenario:
+    return msgspec.structs.replace(SMALL, cost=CostConfig(**changes))
+
+
+def test_jacksboro_is_mountains_with_roads_lakes_and_cliffs_on_square_metres() -> None:
+    scenario = load_scenario(SCENARIOS / "jacksboro.toml")
+    terrain = build_terrain(scenario)
+    assert (terrain.grid.rows, terrain.grid.cols, terrain.grid.resolution_m) == (424, 400, 75.0)
+    assert terrain.elevation_m.dtype == np.float32
+    assert 236 <= terrain.elevation_m.min() < 260
+    assert 1040 < terrain.elevation_m.max() <= 1076
+    passable = np.isfinite(terrain.pace_s_per_m)
+    assert 0.01 < 1 - passable.mean() < 0.10
+    labels, _ = ndimage.label(passable)
+    assert np.bincount(labels.ravel())[1:].max() > 0.99 * passable.sum()
+    assert (terrain.pace_s_per_m[terrain.classes == TerrainClass.ROAD] == np.float32(1 / 20)).all()
+    assert (terrain.classes == TerrainClass.WATER).sum() > 300
+    assert terrain.photo.shape == (424, 400, 3)
+    truth = build_truth(scenario, terrain)
+    assert (np.isinf(truth) & passable).sum() > 500
+    assert ((truth > terrain.pace_s_per_m) & np.isfinite(truth)).sum() > 500
+
+
+def test_the_same_scenario_gives_the_same_digest_and_another_rule_another() -> None:
+    digest = build_terrain(SMALL).digest
+    assert len(digest) == 16
+    assert build_terrain(SMALL).digest == digest
+    assert build_terrain(with_cost(steep_factor=7.0)).digest != digest
+    assert build_terrain(msgspec.structs.replace(SMALL, seed=3)).digest != digest
+
+
+def test_a_prepared_terrain_is_the_same_and_loads_in_a_blink(tmp_path: Path) -> None:
+    scenario = with_cost(vehicle_radius_m=40.0)
+    terrain, truth = prepare(tmp_path / "run", scenario)
+    started = time.perf_counter()
+    again = load_prepared(tmp_path / "run", scenario_key(scenario))
+    assert time.perf_counter() - started < 0.05
+    assert again is not None
+    assert (again.grid, again.digest, again.notes) == (terrain.grid, terrain.digest, terrain.notes)
+    for name in ("elevation_m", "photo", "pace_s_per_m", "ground_s_per_m", "classes"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(terrain, name))
+    np.testing.assert_array_equal(load_prepared_truth(tmp_path / "run"), truth)
+    assert again.vehicle_radius_m == 40.0
+    assert (terrain.ground_s_per_m != terrain.pace_s_per_m).any()
+
+
+def test_a_prepared_terrain_of_another_scenario_is_not_taken(tmp_path: Path) -> None:
+    prepare(tmp_path, SMALL)
+    other = msgspec.structs.replace(SMALL, seed=9)
+    setup = RoleSetup(other, "r", "agent", "a0", 1, 1, tmp_path)
+    assert load_prepared(tmp_path, scenario_key(other)) is None
+    terrain = load_terrain(setup)
+    assert terrain.digest == build_terrain(other).digest
+    assert load_truth(setup, terrain).shape == (48, 64)
+    assert load_prepared(tmp_path / "nowhere") is None
+
+
+@pytest.mark.parametrize("damage", ["terrain.json", "pace.npy", "elevation.npy"])
+def test_a_damaged_prepared_terrain_is_refused_with_a_sentence(tmp_path: Path, damage: str) -> None:
+    prepare(tmp_path, SMALL)
+    path = tmp_path / damage
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(TerrainError, match="delete"):
+        load_prepared(tmp_path)
+
+
+def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    terrain = terrain_of_pace(np.ones((4, 4), np.float32))
+    with pytest.raises(TerrainError, match="cannot write"):
+        save_prepared(tmp_path / "file" / "run", terrain, terrain.pace_s_per_m)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"max_slope_deg": 0.001}, "max_slope_deg"),
+        ({"vehicle_radius_m": 1e4, "max_slope_deg": 5.0}, "vehicle_radius_m"),
+        (
+            {"zones": (ZoneConfig(kind="forbidden", polygon_m=((-1, -1), (1e5, -1), (1e5, 1e5), (-1, 1e5))),)},
+            "zones",
+        ),
+    ],
+)
+def test_a_terrain_on_which_all_is_lethal_is_refused_and_says_why(changes: dict[str, object], why: str) -> None:
+    with pytest.raises(TerrainError, match=rf"every cell .* lethal.*{why}"):
+        build_terrain(with_cost(**changes))
+
+
+def test_agents_that_load_a_prepared_terrain_import_nothing_slow(tmp_path: Path) -> None:
+    prepare(tmp_path, SMALL)
+    slow = ("numba", "rasterio", "skimage", "sklearn", "matplotlib", "scipy")
+    code = (
+        "import sys; from pathlib import Path; from shared_map.terrain.terrain import load_prepared;"
+        "import shared_map.cost_map;"
+        f"assert load_prepared(Path({str(tmp_path)!r}));"
+        f"found = [m for m in {slow!r} if m in sys.modules]; assert not found, found"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[3], timeout=60)
+
+
+@pytest.mark.parametrize("size", [(120, 150), (700, 640)])
+def test_rivers_cross_a_synthetic_terrain_and_can_be_forded(size: tuple[int, int]) -> None:
+    rows, cols = size
+    source = TerrainConfig(source="synthetic", rows=rows, cols=cols, rivers=2, roads=3)
+    terrain = build_terrain(Scenario(seed=6, terrain=source, cost=CostConfig(max_slope_deg=60)))
+    water = terrain.classes == TerrainClass.WATER
+    assert rows / 2 < water.sum() < 6 * (rows + cols)
+    assert water.any(axis=1).mean() > 0.75
+    labels, _ = ndimage.label(np.isfinite(terrain.pace_s_per_m))
+    assert np.bincount(labels.ravel())[1:].max() > 0.97 * np.isfinite(terrain.pace_s_per_m).sum()
+    assert terrain.elevation_m[water].mean() < terrain.elevation_m.mean()
+
+
+def test_a_small_synthetic_terrain_is_built_too() -> None:
+    for rows, cols in ((1, 1), (2, 3), (9, 9)):
+        source = TerrainConfig(source="synthetic", rows=rows, cols=cols, relief_m=1.0)
+        assert build_terrain(Scenario(terrain=source)).grid.cells == rows * cols
+
+
+def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
+    import re
+
+    import rasterio
+    from rasterio.transform import from_origin
+
+    text = (Path(__file__).parents[3] / "docs" / "terrain.md").read_text()
+    block = re.search(r"(?:^ {7}.*\n)+", text, re.MULTILINE)
+    assert block is not None
+    (tmp_path / "mine.toml").write_text(textwrap.dedent(block[0]))
+    base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(5e5, 5e6, 20, 20)}
+    with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
+        file.write(np.random.default_rng(1).uniform(0, 2, (60, 70)).astype(np.float32), 1)
+    with rasterio.open(tmp_path / "photo.tif", "w", height=60, width=70, count=3, dtype="uint8", **base) as file:
+        file.write(np.full((3, 60, 70), 120, np.uint8))
+    roads = np.zeros((60, 70), np.uint8)
+    roads[30] = 1
+    with rasterio.open(
+        tmp_path / "roads.png", "w", driver="PNG", height=60, width=70, count=1, dtype="uint8"
+    ) as file:
+        file.write(roads, 1)
+    terrain = build_terrain(load_scenario(tmp_path / "mine.toml"))
+    assert (terrain.pace_s_per_m[30, 45:] == np.float32(0.05)).all()
+    assert np.isinf(terrain.pace_s_per_m[20, 40])

@@ -1,0 +1,142 @@
+"""Processes of different runs or terrains refuse each other with a sentence."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from support.memory_world import MemoryWorld
+
+from swarm.bus.bus import Event, Heard, LinkChanged
+from swarm.errors import RunMismatchError
+from swarm.liveness import Peer
+from swarm.runtime.membership import Member, check_same_run
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.topics import NOTE, STATS
+
+INFO = RunInfo(
+    run_id="r1", role="planner", id="t0", incarnation=7, scenario="demo", terrain="aaaa", rows=4, cols=5,
+    resolution_m=90.0, started_ns=0,
+)  # fmt: skip
+
+
+class Node:
+    """A process that is nothing but a member."""
+
+    def __init__(self, world: MemoryWorld, **changes: object) -> None:
+        self.info = msgspec.structs.replace(INFO, **changes)
+        self.bus = world.bus(self.info.id)
+        self.member = Member(self.info, self.bus, self.post)
+        self.rest: list[Event] = []
+        self.failure: RunMismatchError | None = None
+
+    def post(self, event: Event) -> None:
+        try:
+            if not self.member.handle(event):
+                self.rest.append(event)
+        except RunMismatchError as error:
+            self.failure = error
+
+
+def test_members_of_one_run_get_along():
+    world = MemoryWorld()
+    nodes = [Node(world, id=id) for id in ("t0", "t1", "t2")]
+    for node in nodes:
+        node.member.join()
+        world.settle()
+    assert [node.failure for node in nodes] == [None] * 3
+    assert [node.rest for node in nodes] == [[]] * 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"run_id": "r2", "scenario": "other"},
+            "planner t1 belongs to run r2, but planner t0 in the same namespace belongs to run r1 (scenario ",
+        ),
+        (
+            {"terrain": "bbbb", "rows": 8},
+            "planner t1 has terrain bbbb (8 x 5), but planner t0 has aaaa (4 x 5): terrain files or ",
+        ),
+    ],
+)
+def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(changes, words):
+    world = MemoryWorld()
+    first, stranger = Node(world), Node(world, id="t1", **changes)
+    first.member.join()
+    world.settle()
+    stranger.member.join()
+    world.settle()
+    assert str(stranger.failure).startswith(words)
+    assert stranger.failure.exit_code == 5
+    assert first.failure is None
+
+
+def test_of_two_that_start_at_once_at_least_one_notices():
+    world = MemoryWorld()
+    one, other = Node(world), Node(world, id="t1", run_id="r2")
+    one.member.join()
+    other.member.join()
+    world.settle()
+    assert one.failure or other.failure
+
+
+def test_who_meets_only_after_a_cut_heals_is_checked_then():
+    world = MemoryWorld()
+    one, other = Node(world), Node(world, id="t1", run_id="r2")
+    world.cut(other.bus)
+    one.member.join()
+    other.member.join()
+    world.settle()
+    assert one.failure is None
+    assert other.failure is None
+    world.heal(other.bus)
+    world.settle()
+    assert other.failure is not None
+    assert LinkChanged(True) in other.rest
+
+
+def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_to_be_up():
+    world = MemoryWorld()
+    node = Node(world)
+    node.member.join()
+    world.settle()
+    asked = node.bus.counts["messages_out"]
+    world.bus("r").declare_alive(Peer("router", "0", 1))
+    world.settle()
+    assert node.rest == [LinkChanged(up=True, beyond=True)]
+    assert node.bus.counts["messages_out"] == asked + 2  # one question to all, and our own answer
+
+
+def test_counters_are_told_once_a_second_and_at_the_end():
+    world, heard = MemoryWorld(), []
+    node = Node(world)
+    world.bus("watcher").subscribe(STATS, heard.append)
+    node.member.join()
+    node.member.counters.count("marks", 3)
+    node.member.counters.observe("tick_ms", 2.0)
+    for _ in range(25):
+        node.member.tick(world.scheduler.clock.now_ns())
+        world.run_ms(100)
+    node.member.publish_stats(world.scheduler.clock.now_ns())
+    world.settle()
+    assert len(heard) == 4
+    last = heard[-1].message
+    assert (last.role, last.id, last.incarnation) == ("planner", "t0", 7)
+    assert last.counts["marks"] == 3
+    assert last.counts["messages_out"] >= 3
+    assert sum(last.histograms["tick_ms"].values()) == 1
+
+
+def test_a_note_reaches_whoever_watches():
+    world, heard = MemoryWorld(), []
+    node = Node(world)
+    world.bus("watcher").subscribe(NOTE, heard.append)
+    node.member.note(5, "closure", "road closed", cell=9)
+    world.settle()
+    assert [type(event) for event in heard] == [Heard]
+    assert (heard[0].message.text, heard[0].message.cell) == ("road closed", 9)
+
+
+def test_the_same_run_from_anywhere_is_the_same_run():
+    check_same_run(INFO, msgspec.structs.replace(INFO, role="agent", id="a0", incarnation=9, started_ns=5))

@@ -1,0 +1,158 @@
+"""The simulated network does what every bus does, and what a link model says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+from support.bus_behaviour import *  # noqa: F403
+from support.bus_behaviour import Box, answering, asked, note, pose, run_info
+from support.memory_world import MemoryWorld
+
+from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
+from swarm.bus.memory_bus import PerfectLinks
+from swarm.bus.scheduler import InlineWorker, Scheduler
+from swarm.clock import ManualClock
+from swarm.liveness import Peer
+from swarm.wire.messages.base import Nothing, schema_of
+from swarm.wire.topics import NOTE, POSE, RUN
+
+
+@pytest.fixture
+def world() -> MemoryWorld:
+    return MemoryWorld()
+
+
+class Links(PerfectLinks):
+    """Says what it is told to."""
+
+    def __init__(self, *delays_ms: float) -> None:
+        self.delays = [int(delay * 1e6) for delay in delays_ms]
+
+    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
+        return self.delays
+
+
+def test_a_lost_message_does_not_arrive_and_a_repeated_one_arrives_twice():
+    for delays, times in (((), 0), ((1,), 1), ((1, 3), 2)):
+        world, box = MemoryWorld(Links(*delays)), Box()
+        a, b = world.bus("a"), world.bus("b")
+        b.subscribe(POSE, box)
+        a.publish(POSE, pose(), target="t0")
+        world.settle()
+        assert len(box) == times
+
+
+def test_messages_overtake_each_other_where_the_link_says_so():
+    world, box = MemoryWorld(), Box()
+    a, b = world.bus("a"), world.bus("b")
+    b.subscribe(POSE, box)
+    for seq, delay in ((1, 9), (2, 3), (3, 6)):
+        world.network.links = Links(delay)
+        a.publish(POSE, pose(seq=seq), target="t0")
+    world.settle()
+    assert [event.message.seq for event in box] == [2, 3, 1]
+
+
+def test_a_repeated_query_is_answered_twice_and_ends_once():
+    world = MemoryWorld(Links(1, 3))
+    a, b = world.bus("a"), world.bus("b")
+    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    box = asked(world, a, RUN, Nothing())
+    world.settle()
+    assert len(box.of(AskEnded)) == 1
+    assert len(box.of(Replied)) == box[-1].replies >= 1
+
+
+def test_a_lost_query_times_out():
+    world = MemoryWorld(Links())
+    a, b = world.bus("a"), world.bus("b")
+    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    assert asked(world, a, RUN, Nothing(), timeout_s=0.5) == [AskEnded("q", RUN, 0, "timeout")]
+    assert world.scheduler.clock.now_ns() == pytest.approx(1_500_000_000, rel=1e-3)
+
+
+def test_replies_keep_their_order_though_the_link_does_not():
+    world, kept = MemoryWorld(), Box()
+    a, b, box = world.bus("a"), world.bus("b"), Box()
+    b.serve(RUN, kept, role="agent", id="b")
+    a.ask(RUN, Nothing(), box, tag="q")
+    world.settle()
+    world.network.links = Links(9)
+    kept[0].answer(run_info("b"))
+    world.network.links = Links(1)
+    kept[0].end()
+    world.settle()
+    assert [type(event) for event in box] == [Replied, AskEnded]
+
+
+def test_those_who_hear_a_message_share_it():
+    world = MemoryWorld()
+    a, boxes = world.bus("a"), [Box() for _ in range(3)]
+    for n, box in enumerate(boxes):
+        world.bus(f"b{n}").subscribe(NOTE, box)
+    a.publish(NOTE, note("x"), role="agent", id="a0")
+    world.settle()
+    assert boxes[0][0] is boxes[1][0] is boxes[2][0]
+
+
+def test_a_closed_node_gets_nothing_that_was_under_way():
+    world, box = MemoryWorld(), Box()
+    a, b = world.bus("a"), world.bus("b")
+    b.subscribe(POSE, box)
+    b.watch_alive(box)
+    a.declare_alive(Peer("agent", "a", 1))
+    a.publish(POSE, pose(), target="t0")
+    b.close()
+    world.settle()
+    assert box == []
+    assert world.deliveries == []
+
+
+def test_a_node_that_dies_while_cut_off_stays_gone():
+    world, box = MemoryWorld(), Box()
+    a, b = world.bus("a"), world.bus("b")
+    b.watch_alive(box)
+    a.declare_alive(Peer("agent", "a", 1))
+    world.settle()
+    world.cut(a)
+    a.close()
+    world.settle()
+    world.heal(a)
+    world.settle()
+    assert box[1:] == [Disappeared(Peer("agent", "a", 1))]
+
+
+def test_every_delivery_is_traced():
+    world = MemoryWorld()
+    a, b = world.bus("a"), world.bus("b")
+    b.subscribe(POSE, Box())
+    a.publish(POSE, pose(), target="t0")
+    world.settle()
+    ((now_ns, source, destination, what, payload),) = world.deliveries
+    assert (now_ns, source, destination, what) == (1_000_200_000, "a", "b", "pose")
+    assert schema_of("pose").encode() in payload
+
+
+def test_what_is_due_first_happens_first_and_of_two_the_one_scheduled_first():
+    scheduler, seen = Scheduler(ManualClock()), []
+    for name, when_ns in (("late", 9), ("one", 5), ("two", 5), ("past", -3)):
+        scheduler.at(when_ns, lambda name=name: seen.append((name, scheduler.clock.now_ns())))
+    assert scheduler.run_until(7) == 3
+    assert seen == [("past", 0), ("one", 5), ("two", 5)]
+    assert scheduler.clock.now_ns() == 7
+    assert scheduler.run_until(20) == 1
+
+
+def test_work_is_done_after_the_time_that_it_is_taken_to_cost():
+    scheduler, box = Scheduler(ManualClock()), Box()
+    worker = InlineWorker(scheduler)
+    worker.submit("grow", lambda: 42, box, model_ns=5_000_000)
+    scheduler.run_until(4_999_999)
+    assert box == []
+    scheduler.run_until(5_000_000)
+    assert [(event.tag, event.result, event.took_ns) for event in box.of(WorkDone)] == [("grow", 42, 5_000_000)]
+    worker.submit("grow", lambda: 43, box)
+    worker.close()
+    scheduler.run_until(9_000_000)
+    assert len(box) == 1

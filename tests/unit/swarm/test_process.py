@@ -1,0 +1,287 @@
+"""The loop: late ticks are dropped, the inbox keeps the newest, a failed worker ends the process."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from swarm.bus.bus import Event, Heard, HeardMany, LinkChanged, WorkDone
+from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process, ThreadWorker
+from swarm.runtime.stats import Counters
+from swarm.wire.messages.processes import Note
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.topics import NOTE, POSE
+
+
+def pose(target: str, seq: int) -> Heard:
+    message = TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
+    return Heard(POSE, {"target": target}, message)
+
+
+def note(text: str) -> Heard:
+    return Heard(NOTE, {"role": "agent", "id": "a0"}, Note(role="agent", id="a0", stamp_ns=1, kind="k", text=text))
+
+
+def drain(inbox: Inbox) -> list[Event]:
+    taken = []
+    while (event := inbox.take(0)) is not None:
+        taken.append(event)
+    return taken
+
+
+class Recording:
+    """A service that writes down what happens to it; `on_tick` may do more."""
+
+    def __init__(self, on_tick=lambda ticks: None, on_event=lambda event: None) -> None:
+        self.counters = Counters()
+        self.log: list[object] = []
+        self.ticks: list[int] = []
+        self._on_tick = on_tick
+        self._on_event = on_event
+
+    def start(self, now_ns: int) -> None:
+        self.log.append("start")
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        self.log.append(event)
+        self._on_event(event)
+
+    def tick(self, now_ns: int) -> None:
+        self.ticks.append(now_ns)
+        self._on_tick(self.ticks)
+
+    def stop(self, now_ns: int) -> None:
+        self.log.append("stop")
+
+
+def test_of_samples_that_say_everything_only_the_newest_per_key_is_kept_in_the_oldest_place():
+    inbox = Inbox()
+    for event in (pose("t0", 1), note("x"), pose("t1", 1), pose("t0", 2), note("y"), pose("t0", 3)):
+        inbox.post(event)
+    assert len(inbox) == 4
+    assert inbox.superseded == 2
+    assert drain(inbox) == [pose("t0", 3), note("x"), pose("t1", 1), note("y")]
+    inbox.post(pose("t0", 4))
+    assert drain(inbox) == [pose("t0", 4)]
+
+
+def test_every_other_event_is_kept_in_order():
+    inbox = Inbox()
+    events = [note(str(n)) for n in range(100)] + [LinkChanged(True), LinkChanged(False)]
+    for event in events:
+        inbox.post(event)
+    assert drain(inbox) == events
+    assert inbox.take(0) is None
+
+
+def test_many_threads_may_post():
+    inbox = Inbox()
+
+    def post(name: str) -> None:
+        for n in range(500):
+            inbox.post(note(f"{name}{n}"))
+            inbox.post(pose(name, n))
+
+    threads = [threading.Thread(target=post, args=(name,)) for name in "abcd"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    taken = drain(inbox)
+    for name in "abcd":
+        texts = [e.message.text for e in taken if e.topic is NOTE and e.message.text.startswith(name)]
+        assert texts == [f"{name}{n}" for n in range(500)]
+        assert [e.message.seq for e in taken if e.fields.get("target") == name] == [499]
+
+
+def batch(n: int) -> HeardMany:
+    return HeardMany(NOTE, [(f"note/agent/a{n}", note(str(n)).message)])
+
+
+def test_who_brings_batches_waits_until_the_owner_has_kept_up():
+    inbox = Inbox()
+    brought: list[int] = []
+
+    def bring() -> None:
+        for n in range(10):
+            inbox.post(batch(n))
+            brought.append(n)
+
+    bringer = threading.Thread(target=bring)
+    bringer.start()
+    taken = []
+    while len(taken) < 10:
+        event = inbox.take(1.0)
+        assert isinstance(event, HeardMany)
+        taken.append(event)
+        assert len(brought) <= len(taken) + 3
+    bringer.join(1.0)
+    assert taken == [batch(n) for n in range(10)]
+
+
+def test_nobody_waits_for_an_owner_that_has_ended():
+    inbox = Inbox()
+    bringer = threading.Thread(target=lambda: [inbox.post(batch(n)) for n in range(5)])
+    bringer.start()
+    bringer.join(0.1)
+    assert bringer.is_alive()
+    inbox.close()
+    bringer.join(1.0)
+    assert not bringer.is_alive()
+
+
+def test_a_take_waits_for_a_post_and_no_longer():
+    inbox = Inbox()
+    threading.Timer(0.05, inbox.post, [note("x")]).start()
+    began_s = time.monotonic()
+    assert inbox.take(5.0) == note("x")
+    assert time.monotonic() - began_s < 2.0
+
+
+def test_what_a_worker_fails_with_is_raised_where_the_state_is_owned():
+    inbox = Inbox()
+    inbox.post(note("x"))
+    inbox.fail(RuntimeError("boom"))
+    assert inbox.take(0) == note("x")
+    with pytest.raises(RuntimeError, match="boom"):
+        inbox.take(0)
+
+
+def test_late_ticks_are_taken_once_and_the_missed_ones_counted():
+    clock, inbox = ManualClock(), Inbox()
+
+    def on_tick(ticks: list[int]) -> None:
+        if len(ticks) == 4:
+            process.stop()
+        clock.advance_to(clock.now_ns() + (350_000_000 if len(ticks) == 2 else 100_000_000))
+
+    service = Recording(on_tick)
+    process = Process(service, inbox, clock, tick_hz=10)
+    process.run()
+    assert [tick // 10**6 for tick in service.ticks] == [0, 100, 450, 550]
+    assert service.counters.counts == {"ticks_dropped": 2}
+    assert service.log == ["start", "stop"]
+
+
+def test_events_are_handled_between_ticks_and_ticks_come_though_the_inbox_is_full():
+    clock, inbox = ManualClock(), Inbox()
+    for n in range(50):
+        inbox.post(note(str(n)))
+
+    def on_event(event: Event) -> None:
+        clock.advance_to(clock.now_ns() + 10_000_000)
+        if event == note("49"):
+            process.stop()
+
+    service = Recording(on_event=on_event)
+    process = Process(service, inbox, clock, tick_hz=10)
+    process.run()
+    assert [tick // 10**6 for tick in service.ticks] == [0, 100, 200, 300, 400]
+    assert len(service.log) == 52
+
+
+def test_a_service_that_raises_is_stopped_and_the_error_goes_on():
+    def on_tick(ticks: list[int]) -> None:
+        raise ValueError("bug")
+
+    service = Recording(on_tick)
+    with pytest.raises(ValueError, match="bug"):
+        Process(service, Inbox(), ManualClock(), tick_hz=10).run()
+    assert service.log == ["start", "stop"]
+
+
+def test_a_process_ticks_at_its_rate_and_stops_from_another_thread():
+    service = Recording()
+    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50)
+    threading.Timer(0.5, process.stop).start()
+    process.run()
+    assert 15 <= len(service.ticks) <= 27
+    assert service.log[-1] == "stop"
+
+
+def test_a_worker_gives_its_result_back_as_an_event():
+    inbox, clock = Inbox(), MonotonicClock()
+    worker = ThreadWorker("w", inbox, clock)
+    worker.submit("grow", lambda: 42, inbox.post)
+    done = inbox.take(5.0)
+    assert isinstance(done, WorkDone)
+    assert (done.tag, done.result) == ("grow", 42)
+    assert 0 <= done.took_ns < NS_PER_S
+    worker.submit("fail", lambda: 1 // 0, inbox.post)
+    with pytest.raises(ZeroDivisionError):
+        inbox.take(5.0)
+    worker.close()
+
+
+def test_the_clock_never_runs_backwards():
+    clock = ManualClock(5)
+    clock.advance_to(7)
+    with pytest.raises(ValueError, match="backwards"):
+        clock.advance_to(6)
+    real = MonotonicClock()
+    assert abs(real.now_ns() - time.time_ns()) < NS_PER_S
+    times = [real.now_ns() for _ in range(1000)]
+    assert times == sorted(times)
+
+
+IDLE = """
+import sys, threading
+from swarm.bus.bus import *
+from swarm.clock import MonotonicClock
+from swarm.runtime.process import Inbox, Process, end_with
+from swarm.runtime.stats import Counters
+
+class Idle:
+    counters = Counters()
+    def start(self, now_ns): print("up", flush=True)
+    def handle(self, event, now_ns): pass
+    def tick(self, now_ns): pass
+    def stop(self, now_ns):
+        if sys.argv[1] == "hang": threading.Event().wait()
+        print("stopped", flush=True)
+
+process = Process(Idle(), Inbox(), MonotonicClock(), tick_hz=0.001)
+process.stop_on_signals()
+if sys.argv[1] != "signal":
+    end_with(sys.stdin.read, process.stop, grace_s=0.5)
+process.run()
+"""
+
+
+def idle(how: str) -> subprocess.Popen[bytes]:
+    process = subprocess.Popen([sys.executable, "-c", IDLE, how], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"up\n"
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_loop_in_good_order(number):
+    process = idle("signal")
+    for _ in range(50):  # impatient, until it is gone
+        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
+        time.sleep(0.002)
+    out, _ = process.communicate(timeout=20)
+    assert out == b"stopped\n"
+    assert process.returncode == 0
+
+
+def test_a_process_ends_with_its_parent():
+    process = idle("parent")
+    out, _ = process.communicate(timeout=20)
+    assert out == b"stopped\n"
+    assert process.returncode == 0
+
+
+def test_a_process_that_hangs_at_its_end_is_ended():
+    process = idle("hang")
+    process.communicate(timeout=20)
+    assert process.returncode == 1

@@ -1,0 +1,118 @@
+"""Routes by the thousand: as arrays, as columns on the wire, and one by one."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.wire_strategies import routes
+
+from planner_service.kernels import route_walk
+from swarm.errors import ProtocolError
+from swarm.wire import routes as named
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.planning import RouteReply
+from swarm.wire.routes import (
+    OK,
+    STATUSES,
+    UNREACHABLE,
+    Route,
+    RouteBatch,
+    RouteStatus,
+    pack_directions,
+    unpack_directions,
+)
+
+
+def reply_of(batch: RouteBatch) -> RouteReply:
+    return RouteReply(
+        target="t",
+        incarnation=1,
+        target_cell=0,
+        map_version=0,
+        tree_age_ms=0.0,
+        rows=9,
+        cols=9,
+        routes=batch.columns(),
+    )
+
+
+@given(st.lists(routes, max_size=6))
+def test_routes_come_off_the_wire_as_they_were(some: list[Route]) -> None:
+    batch = RouteBatch.of(some)
+    assert list(batch) == some
+    reply = decode(encode(reply_of(batch)), RouteReply)
+    assert len(reply.routes) == len(some)
+    assert list(reply.routes) == some
+    assert [reply.routes[i - 1] for i in range(len(some))] == [some[i - 1] for i in range(len(some))]
+    np.testing.assert_array_equal(batch.gaps, [route.gap for route in some if route.status is RouteStatus.OK])
+
+
+@given(st.binary(max_size=100))
+def test_eight_directions_take_three_bytes(raw: bytes) -> None:
+    codes = np.frombuffer(raw, np.uint8) & 7
+    packed = pack_directions(codes)
+    assert len(packed) == 3 * math.ceil(len(codes) / 8)
+    np.testing.assert_array_equal(unpack_directions(packed, len(codes)), codes)
+
+
+def test_the_first_direction_is_in_the_lowest_bits() -> None:
+    assert pack_directions(np.array([1, 2, 3], np.uint8)) == bytes([1 | 2 << 3 | (3 << 6) % 256, 3 >> 2, 0])
+
+
+def test_a_thousand_routes_take_few_bytes() -> None:
+    codes = np.arange(300, dtype=np.uint8) % 8
+    some = RouteBatch.of([Route(status=RouteStatus.OK, start=7, directions=codes.tobytes())] * 1000)
+    assert len(encode(reply_of(some))) < 1000 * (300 * 3 / 8 + 50)
+
+
+def test_no_route_is_a_status_and_costs_nothing_finite() -> None:
+    batch = RouteBatch.none(np.array([3, 4]), UNREACHABLE)
+    assert list(batch) == [Route(status=RouteStatus.UNREACHABLE, start=cell) for cell in (3, 4)]
+    assert batch.gaps.size == 0
+    with pytest.raises(IndexError):
+        batch[2]
+
+
+def test_the_gap_of_a_batch_is_infinite_where_nothing_is_proven() -> None:
+    some = [
+        Route(status=RouteStatus.OK, start=0, cost_s=3.0, lower_bound_s=bound) for bound in (2.0, 3.0, 4.0, 0.0)
+    ]
+    assert RouteBatch.of(some).gaps.tolist() == [1.5, 1.0, 1.0, math.inf]
+
+
+def test_kernels_and_columns_number_statuses_alike() -> None:
+    for name in ("OK", "UNREACHABLE", "OUTSIDE", "LETHAL_START"):
+        assert getattr(route_walk, name) == getattr(named, name)
+        assert STATUSES[getattr(route_walk, name)].name == name
+
+
+COLUMNS = RouteBatch.of([Route(status=RouteStatus.OK, start=5, directions=b"\x01\x02")]).columns()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"statuses": bytes([5])}, "status 5 is not in 0..4"),
+        ({"statuses": bytes([0, 0])}, "starts has 8 bytes, expected 2 values of 8"),
+        ({"starts": np.array([1 << 40]).tobytes()}, "start 1099511627776 is no cell"),
+        ({"steps": b"\x02\x00"}, "steps has 2 bytes, expected 1 values of 4"),
+        ({"steps": b"\xff\xff\xff\xff"}, "directions of 4294967295 steps has 3 bytes"),
+        ({"directions": b""}, "directions of 2 steps has 0 bytes, expected 1 values of 3"),
+        ({"cost_s": np.array([np.nan]).tobytes()}, "cost_s has a value that is not a number"),
+        ({"remaining_s": b""}, "remaining_s has 0 bytes"),
+    ],
+)
+def test_columns_that_do_not_fit_each_other_are_refused_in_words(change: dict, complaint: str) -> None:
+    reply = msgspec.to_builtins(reply_of(RouteBatch.of([])), builtin_types=(bytes,))
+    reply["routes"] = msgspec.to_builtins(COLUMNS, builtin_types=(bytes,)) | change
+    with pytest.raises(ProtocolError, match=complaint):
+        decode(msgspec.msgpack.encode(reply), RouteReply)
+
+
+def test_ok_is_the_first_status() -> None:
+    assert (OK, STATUSES[OK]) == (0, RouteStatus.OK)

@@ -1,0 +1,100 @@
+"""Key expressions: what is put together comes apart again, and only that."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm.wire.topics import CLAIMS, FLEET, MARKS, POSE, TOPICS
+
+chunks = st.text("abzAZ09_.-", min_size=1, max_size=12)
+topics = st.sampled_from(TOPICS)
+
+
+@given(st.data(), topics, chunks)
+def test_a_key_parses_back_to_its_fields(data, topic, namespace):
+    fields = {name: data.draw(chunks) for name in topic.fields}
+    key = topic.keyed(namespace, **fields)
+    assert topic.parse(namespace, key) == fields
+    assert topic.expression(namespace, **fields) == key
+
+
+@given(st.data(), topics)
+def test_fields_not_given_are_wildcards(data, topic):
+    given_fields = data.draw(st.sets(st.sampled_from(topic.fields)))
+    fields = {name: data.draw(chunks) for name in topic.fields if name in given_fields}
+    expression = topic.expression("swarm", **fields)
+    assert topic.parse("swarm", expression) == {name: fields.get(name, "*") for name in topic.fields}
+    assert expression.count("*") == len(topic.fields) - len(fields)
+
+
+def test_no_key_belongs_to_two_topics():
+    for one, other in itertools.permutations(TOPICS, 2):
+        key = one.keyed("swarm", **dict.fromkeys(one.fields, "x"))
+        assert other.parse("swarm", key) is None, (one.name, other.name)
+
+
+def test_names_are_unique_and_every_topic_is_published_or_served():
+    assert len({topic.name for topic in TOPICS}) == len({topic.key for topic in TOPICS}) == len(TOPICS)
+    assert all(topic.published or topic.request for topic in TOPICS)
+
+
+@pytest.mark.parametrize("wrong", ["", "a/b", "a*", "$*", "**", "a b", "a?b", "a#", "\n"])
+def test_what_is_not_one_chunk_is_refused(wrong):
+    with pytest.raises(ValueError, match="part of a key"):
+        POSE.keyed("swarm", target=wrong)
+    with pytest.raises(ValueError, match="part of a key"):
+        POSE.expression("swarm", target=wrong)
+
+
+def test_the_key_of_one_value_needs_every_field_and_no_other():
+    with pytest.raises(TypeError, match="needs the field author"):
+        FLEET.keyed("swarm", region=3)
+    with pytest.raises(TypeError, match="needs the field target"):
+        POSE.keyed("swarm", target="*")
+    with pytest.raises(TypeError, match="has no field targte; it has target"):
+        POSE.expression("swarm", targte="t0")
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "swarm",
+        "swarm/",
+        "other/claims/a0",
+        "swarm/claims/a0/x",
+        "swarm/claims/",
+        "swarmclaims/a0",
+        "swarm/marks/1/2",
+    ],
+)
+def test_a_key_of_something_else_has_no_fields(key):
+    assert CLAIMS.parse("swarm", key) is None
+    assert MARKS.parse("swarm", key) is None
+
+
+def test_no_thread_meets_a_message_type_that_msgspec_has_not_finished_describing() -> None:
+    # The first conversion to a struct type is not thread-safe in msgspec: another thread that meets the unfinished
+    # description crashes the process. So each type is converted to once, on import.
+    program = """
+import msgspec, msgspec._utils as utils
+from swarm import topics
+
+def describe(*_):
+    raise SystemExit("described a struct after the import")
+
+utils._eval_type = describe
+for topic in topics.TOPICS:
+    for kind in (topic.message, topic.request):
+        if kind is not None:
+            try:
+                msgspec.convert({}, kind)
+            except msgspec.ValidationError:
+                pass
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

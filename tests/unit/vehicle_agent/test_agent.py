@@ -1,0 +1,248 @@
+"""The agent's decisions without any bus: whom it asks, which target it takes, where it starts."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario, plan_agents
+from swarm.grid import GridSpec
+from swarm.wire.fields import column
+from swarm.wire.messages.planning import RouteReply
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Claims, VehicleState
+from swarm.wire.routes import RouteBatch
+from vehicle_agent.agent import Agent, AskCosts, AskRoutes, LocalMap
+from vehicle_agent.assignment import UNSETTLED, Choice, choose
+from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.fleet import FleetReport
+from vehicle_agent.placement import nearest_free, spawn_cells
+from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.traffic.resumption import Resumption
+
+GRID = GridSpec(12, 12, 10.0)
+LEVEL = np.full((12, 12), 0.1, np.float32)
+TEXT = """
+seed = 5
+[[targets]]
+name = "t"
+count = 2
+[[groups]]
+vehicles = 4
+cells = [[5, 5], [5, 7]]
+[vehicles]
+per_agent = 2
+"""
+S = 1_000_000_000
+
+
+def agent_of(scenario: Scenario, index: int = 0) -> Agent:
+    spawns = spawn_cells(scenario, GRID, LEVEL, LEVEL)
+    ground = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
+    return Agent(plan_agents(scenario)[index], scenario, ground, TruthSensor(GRID, LEVEL, 20.0), spawns, 1)
+
+
+@pytest.fixture
+def agent() -> Agent:
+    agent = agent_of(parse_scenario(TEXT))
+    agent.placed_by(Resumption("a0"))
+    agent.set_planners({"t0": 1, "t1": 1}, 0)
+    return agent
+
+
+def pose(target: str, row: int, col: int, seq: int = 1, jumps: int = 0) -> TargetPose:
+    cell = GRID.cell(row, col)
+    x_m, y_m = GRID.centre_m(cell)
+    return TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m, jumps=jumps)
+
+
+def answer_costs(agent: Agent, asked: AskCosts, now_ns: int, **costs_s: list[float]) -> None:
+    for target, values in costs_s.items():
+        agent.costs_given(asked.request, target, np.array(values, np.float32))
+    agent.costs_ended(asked.request, now_ns)
+
+
+def test_at_the_start_all_planners_are_asked_once_for_all_vehicles(agent: Agent) -> None:
+    assert agent.decide(0) == [AskCosts(1, ("a0-00", "a0-01"), (GRID.cell(5, 5), GRID.cell(5, 7)))]
+    assert agent.decide(S // 10) == []
+
+
+def test_one_request_per_target_and_tick_for_all_who_need_a_route(agent: Agent) -> None:
+    (asked,) = agent.decide(0)
+    assert isinstance(asked, AskCosts)
+    answer_costs(agent, asked, 0, t0=[5.0, 6.0], t1=[9.0, 9.0])
+    (routes,) = agent.decide(S // 10)
+    cells = (GRID.cell(5, 5), GRID.cell(5, 7))
+    assert routes == AskRoutes(2, "t0", ("a0-00", "a0-01"), cells, force=False, reroutes=0)
+
+
+def test_nobody_answering_is_asked_again_soon(agent: Agent) -> None:
+    (asked,) = agent.decide(0)
+    assert isinstance(asked, AskCosts)
+    agent.costs_ended(asked.request, S)
+    assert agent.decide(S + S // 10) == []
+    assert len(agent.decide(2 * S)) == 1
+
+
+def test_a_reply_too_short_for_its_request_makes_the_rest_ask_again(agent: Agent) -> None:
+    (asked,) = agent.decide(0)
+    assert isinstance(asked, AskCosts)
+    answer_costs(agent, asked, 0, t0=[5.0, 6.0])
+    (routes,) = agent.decide(S // 10)
+    assert isinstance(routes, AskRoutes)
+    empty = RouteReply(
+        target="t0",
+        incarnation=1,
+        target_cell=3,
+        map_version=0,
+        tree_age_ms=0.0,
+        rows=12,
+        cols=12,
+        routes=RouteBatch.of([]).columns(),
+    )
+    assert agent.routes_given(routes.request, empty, S // 5) == []
+    assert len(agent.decide(S)) == 1
+
+
+def test_costs_of_the_wrong_length_or_request_are_nobodys(agent: Agent) -> None:
+    (asked,) = agent.decide(0)
+    assert isinstance(asked, AskCosts)
+    agent.costs_given(asked.request, "t0", np.array([1.0], np.float32))
+    agent.costs_given(asked.request + 7, "t0", np.array([1.0, 1.0], np.float32))
+    agent.costs_ended(asked.request, 0)
+    assert {vehicle.target for vehicle in agent.vehicles.values()} == {None}
+
+
+def test_an_old_pose_does_not_undo_a_newer_one(agent: Agent) -> None:
+    (asked,) = agent.decide(0)
+    assert isinstance(asked, AskCosts)
+    answer_costs(agent, asked, 0, t0=[5.0, 6.0])
+    agent.hear_pose(pose("t0", 5, 5, seq=2), 0)
+    agent.hear_pose(pose("t0", 11, 11, seq=1), 0)
+    agent.decide(S)
+    assert agent.vehicles["a0-00"].state is VehicleState.ARRIVED
+
+
+def test_a_target_outside_the_terrain_is_not_believed(agent: Agent) -> None:
+    outside = TargetPose(target="t0", incarnation=1, seq=9, stamp_ns=0, cell=144, x_m=0.0, y_m=0.0)
+    agent.hear_pose(outside, 0)
+    agent.decide(0)
+
+
+def test_vehicles_go_on_where_they_last_stood_and_not_where_somebody_else_is() -> None:
+    scenario = parse_scenario(TEXT)
+    agent = agent_of(scenario)
+    known = Resumption("a0")
+    last = Claims(
+        agent="a0",
+        incarnation=0,
+        seq=9,
+        clock=3,
+        holds={"a0-00": [17, 18], "a0-01": [40]},
+        wants=[],
+        seen={},
+    )
+    other = Claims(agent="a1", incarnation=1, seq=4, clock=8, holds={"a1-00": [40]}, wants=[], seen={})
+    for claims in (last, other):
+        known.answered(claims)
+    agent.placed_by(known)
+    assert {id: vehicle.cell for id, vehicle in agent.vehicles.items()} == {"a0-00": 17}
+    # The other one asks for a free cell nearby, and stands there once it is granted.
+    agent.rights.set_alive({})
+    agent.decide(0)
+    agent.rights.speak()
+    agent.rights.grant()
+    agent.decide(S)
+    assert GRID.distance_cells(agent.vehicles["a0-01"].cell, 40) == 1
+
+
+# --- assignment ---------------------------------------------------------------------------------------------
+
+ALIVE = {"t0": 1, "t1": 1, "t2": 1}
+TARGETS = ["t0", "t1", "t2"]
+
+
+def test_the_cheapest_of_the_allowed_targets_is_chosen() -> None:
+    costs = {"t0": 9.0, "t1": 5.0, "t2": 1.0}
+    assert choose(costs, ["t0", "t1"], ALIVE, None, 0.15, True) == Choice("t1")
+
+
+@pytest.mark.parametrize(("other_s", "chosen"), [(8.6, "t0"), (8.4, "t1")])
+def test_another_target_must_be_worth_the_change(other_s: float, chosen: str) -> None:
+    assert choose({"t0": 10.0, "t1": other_s}, TARGETS, {"t0": 1}, "t0", 0.15, True) == Choice(chosen)
+
+
+def test_a_target_that_cannot_be_reached_any_more_is_left_for_any_other() -> None:
+    assert choose({"t0": math.inf, "t1": 1e6}, TARGETS, ALIVE, "t0", 0.15, True) == Choice("t1")
+
+
+def test_a_silent_planner_keeps_its_vehicles_until_they_give_it_up() -> None:
+    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", 0.15, True) == Choice("t0")
+    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", 0.15, False) == Choice("t1")
+
+
+def test_no_way_is_certain_only_when_all_live_planners_have_said_so() -> None:
+    walled_in = {"t0": math.inf, "t1": math.inf}
+    assert choose(walled_in, TARGETS, ALIVE, None, 0.15, True) == UNSETTLED
+    assert choose(walled_in, TARGETS, {"t0": 1, "t1": 1}, None, 0.15, True) == Choice(None)
+    assert choose({}, TARGETS, {}, None, 0.15, True) == UNSETTLED
+
+
+# --- where they start ---------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 1000), st.sampled_from(["spread", "cluster"]), st.integers(0, 25))
+def test_all_vehicles_start_on_different_passable_cells_of_one_part(seed: int, start: str, walls: int) -> None:
+    chance = random.Random(seed)
+    prior = LEVEL.copy()
+    prior.reshape(-1)[chance.sample(range(144), walls)] = np.inf
+    text = f'seed = {seed}\n[[groups]]\nvehicles = 30\nstart = "{start}"\n[vehicles]\nper_agent = 7\n'
+    spawns = spawn_cells(parse_scenario(text), GRID, prior, prior)
+    cells = [cell for vehicles in spawns.values() for cell in vehicles.values()]
+    assert len(set(cells)) == 30
+    assert np.isfinite(prior.reshape(-1)[cells]).all()
+    assert [len(vehicles) for vehicles in spawns.values()] == [7, 7, 7, 7, 2]
+
+
+def test_nobody_starts_on_an_island_or_on_what_is_lethal_in_truth() -> None:
+    prior, truth = LEVEL.copy(), LEVEL.copy()
+    prior[:, 3] = np.inf  # three columns of 36 cells are cut off
+    truth[:, 8] = np.inf
+    text = "[[groups]]\nvehicles = 40\n"
+    spawns = spawn_cells(parse_scenario(text), GRID, prior, truth)
+    columns = {cell % 12 for vehicles in spawns.values() for cell in vehicles.values()}
+    assert columns <= {4, 5, 6, 7}
+
+
+def test_explicit_places_come_first_and_are_left_free_by_all_others() -> None:
+    scenario = parse_scenario(TEXT)
+    spawns = spawn_cells(scenario, GRID, LEVEL, LEVEL)
+    assert spawns["a0"] == {"a0-00": GRID.cell(5, 5), "a0-01": GRID.cell(5, 7)}
+    assert not set(spawns["a1"].values()) & set(spawns["a0"].values())
+
+
+def test_the_nearest_free_cell_is_searched_ring_by_ring() -> None:
+    assert nearest_free(GRID, 0, {2, 30}.__contains__) == 2
+    assert nearest_free(GRID, 0, lambda cell: False) is None
+
+
+# --- what is told of them -----------------------------------------------------------------------------------
+
+
+def test_a_region_that_the_vehicles_have_left_is_told_so_once() -> None:
+    grid = GridSpec(300, 300, 1.0)
+    report = FleetReport(grid, "a0.1", "all")
+    near, far = Vehicle("u", grid, grid.cell(0, 0)), Vehicle("v", grid, grid.cell(0, 299))
+    told = dict(report.reports([near, far], S))
+    assert [told[0].ids, told[1].ids] == [["u"], ["v"]]
+    assert column(told[1].east_m, "<f4").tolist() == [299.5]
+    told = dict(report.reports([near], 2 * S))
+    assert [told[0].ids, told[1].ids] == [["u"], []]
+    assert told[0].seq == told[1].seq == 2
+    assert list(dict(report.reports([near], 3 * S))) == [0]

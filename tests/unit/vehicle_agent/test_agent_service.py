@@ -1,0 +1,454 @@
+"""Agents end to end on a simulated network: they follow, find out, mark, make way, and come back from the dead."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+from support.agent_world import AgentWorld, pace_of
+
+from swarm.errors import ConfigError
+from swarm.wire.messages.vehicles import VehicleState
+from vehicle_agent.placement import spawn_cells
+
+SCENARIO = """
+name = "test"
+seed = 3
+[[targets]]
+name = "t"
+walk = "still"
+[[groups]]
+vehicles = {vehicles}
+cells = {cells}
+[vehicles]
+per_agent = {per_agent}
+sense_range_m = 30.0
+capture_range_m = {capture}
+"""
+
+
+def scenario(
+    vehicles: int, cells: list[tuple[int, int]] | None = None, per_agent: int = 2, capture: float = 10.0
+) -> str:
+    given = [list(cell) for cell in cells or []]
+    return SCENARIO.format(vehicles=vehicles, cells=given, per_agent=per_agent, capture=capture)
+
+
+OPEN = ["." * 20] * 20
+
+
+def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() -> None:
+    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN))
+    world.put_target("t", 10, 12)
+    world.start_all()
+    took_s = world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
+    # 9 cells of 10 m at 0.1 s/m to come within 10 m of the target, and at most a second to get going.
+    assert 8.5 <= took_s <= 10.5
+    assert world.where() == {"a0-00": (10, 11)}
+    world.assert_lawful()
+
+
+def test_four_agents_share_the_ground_without_meeting() -> None:
+    world = AgentWorld(scenario(8, capture=15.0), pace_of(OPEN))
+    world.put_target("t", 10, 10)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    world.assert_lawful()
+
+
+class Lossy:
+    """Loses, repeats, delays and so reorders; seeded."""
+
+    def __init__(self, seed: int, loss: float = 0.1) -> None:
+        self._chance = random.Random(seed)
+        self._loss = loss
+
+    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> list[int]:
+        copies = 1 + (self._chance.random() < 0.1)
+        return [
+            int(self._chance.uniform(0.2, 150.0) * 1e6)
+            for _ in range(copies)
+            if self._chance.random() >= self._loss
+        ]
+
+    def connected(self, source: str, destination: str, now_ns: int) -> bool:
+        return True
+
+
+# --- driving ------------------------------------------------------------------------------------------------
+
+
+def test_a_vehicle_that_finds_the_road_closed_marks_it_and_takes_another() -> None:
+    prior = [
+        "###############",
+        "#.............#",
+        "#.###########.#",
+        "#.............#",
+        "###############",
+    ]
+    truth = list(prior)
+    truth[1] = "#......#......#"
+    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(prior), pace_of(truth))
+    world.put_target("t", 1, 13)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    world.assert_lawful()
+    assert world.count("marks") == 1
+    assert world.count("reroute_requests") >= 1
+    assert not np.isfinite(world.planners["t"].pace[1, 7])
+
+
+def test_marks_of_one_agent_spare_another_the_detour() -> None:
+    prior = [
+        "###################",
+        "#.................#",
+        "#.####.##########.#",
+        "#.####.##########.#",
+        "#.................#",
+        "###################",
+    ]
+    truth = list(prior)
+    truth[1] = "#............#....#"
+    world = AgentWorld(scenario(2, [(1, 10), (1, 2)], per_agent=1), pace_of(prior), pace_of(truth))
+    world.put_target("t", 1, 17)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=90)
+    world.assert_lawful()
+    # The second turned off at the branch: it never came within its sensor's three cells of the closure.
+    assert [service.counters.counts["marks"] for service in world.agents.values()] == [1, 0]
+
+
+def test_slow_ground_is_marked_and_driven_at_its_own_pace() -> None:
+    prior = ["." * 14]
+    truth = [".....~~~~....."]
+    world = AgentWorld(scenario(1, [(0, 0)]), pace_of(prior), pace_of(truth))
+    world.put_target("t", 0, 13)
+    world.start_all()
+    took_s = world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    # 12 cells, four of them at three times the pace.
+    assert 19.4 <= took_s <= 22.0
+    assert world.count("marks") == 4
+
+
+def test_a_vehicle_goes_on_when_its_target_jumps() -> None:
+    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN))
+    world.put_target("t", 10, 8)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
+    world.put_target("t", 2, 17, jumped=True)
+    world.run_s(1.0)
+    assert world.all_in(VehicleState.FOLLOWING)
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
+    row, col = world.where()["a0-00"]
+    assert abs(row - 2) + abs(col - 17) == 1
+
+
+def test_routes_given_in_parts_are_driven_without_a_stop() -> None:
+    text = scenario(1, [(10, 0)]) + "route_cells = 12\n"
+    world = AgentWorld(text, pace_of(["." * 60] * 20))
+    world.put_target("t", 10, 50)
+    world.start_all()
+    took_s = world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=80)
+    assert took_s <= 51.0
+    assert world.count("reroute_requests") == 0
+
+
+def test_nothing_is_ever_forced_until_a_route_has_run_out() -> None:
+    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN))
+    world.put_target("t", 10, 12)
+    world.start_all()
+    world.run_s(3.0)
+    planner = world.planners["t"]
+    assert [request.force for request in planner.requests] == [False]
+    assert planner.requests[0].vehicles == ["a0-00"]
+    # The target walks away and nobody pushes a newer route: the old one runs out.
+    world.put_target("t", 2, 2)
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    assert any(request.force for request in planner.requests)
+    assert world.count("reroute_requests") >= 1
+
+
+# --- which target -------------------------------------------------------------------------------------------
+
+TWO_TARGETS = scenario(1, [(10, 10)]).replace('name = "t"\n', 'name = "t"\ncount = 2\n')
+
+
+def test_each_vehicle_goes_for_the_cheapest_target_and_changes_only_for_a_better_one() -> None:
+    world = AgentWorld(TWO_TARGETS, pace_of(["." * 40] * 20))
+    world.put_target("t0", 10, 25)
+    world.put_target("t1", 10, 0)
+    world.start_all()
+    world.run_s(1.0)
+    vehicle = world.agents["a0"].agent.vehicles["a0-00"]
+    assert vehicle.target == "t1"
+    world.put_target("t0", 10, 17)
+    world.put_target("t1", 19, 4)
+    world.run_s(6.0)
+    assert vehicle.target == "t1"
+    world.put_target("t0", *world.where()["a0-00"])
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
+    assert vehicle.target == "t0"
+
+
+def test_a_walled_in_vehicle_is_stranded_until_the_wall_is_known_to_be_open() -> None:
+    prior = ["." * 12] * 3 + ["#" * 12] + ["." * 12] * 4
+    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(prior))
+    world.put_target("t", 6, 6)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.STRANDED), within_s=5)
+    world.run_s(0.2)
+    assert world.agents["a0"].counters.gauges["stranded"] == 1.0
+    world.put_target("t", 1, 8)
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
+
+
+# --- planners come and go -----------------------------------------------------------------------------------
+
+
+def test_a_vehicle_whose_planner_is_gone_keeps_its_route_and_says_so() -> None:
+    world = AgentWorld(scenario(1, [(10, 1)]), pace_of(OPEN))
+    world.put_target("t", 10, 15)
+    world.start_all()
+    world.run_s(3.0)
+    world.stop_planner("t")
+    world.run_s(0.5)
+    assert world.all_in(VehicleState.LOST)
+    before = world.where()["a0-00"][1]
+    world.run_s(3.0)
+    assert world.all_in(VehicleState.LOST)
+    assert world.where()["a0-00"][1] - before == 3
+    world.start_planner("t", incarnation=2)
+    world.run_s(1.0)
+    assert world.all_in(VehicleState.FOLLOWING)
+    assert world.planners["t"].requests[0].vehicles == ["a0-00"]
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
+
+
+def test_a_planner_that_does_not_answer_is_asked_again_and_again_but_not_in_a_frenzy() -> None:
+    world = AgentWorld(scenario(1, [(10, 1)]), pace_of(OPEN))
+    world.put_target("t", 10, 5)
+    world.start_all()
+    world.planners["t"].mute = True
+    world.run_s(5.0)
+    assert world.all_in(VehicleState.IDLE)
+    world.planners["t"].mute = False
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=10)
+
+
+# --- making way ---------------------------------------------------------------------------------------------
+
+TWO_WAYS = """
+seed = {seed}
+[[targets]]
+name = "west"
+walk = "still"
+[[targets]]
+name = "east"
+walk = "still"
+[[groups]]
+name = "eastbound"
+vehicles = {count}
+cells = {west_cells}
+targets = ["east"]
+[[groups]]
+name = "westbound"
+vehicles = {count}
+cells = {east_cells}
+targets = ["west"]
+[vehicles]
+per_agent = {per_agent}
+sense_range_m = 30.0
+capture_range_m = {capture}
+"""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_corridor_with_one_passing_place_lets_two_pass_each_other(seed: int) -> None:
+    corridor = ["#" * 21, "#" + "." * 19 + "#", "#" * 10 + "." + "#" * 10, "#" * 21]
+    text = TWO_WAYS.format(seed=seed, count=1, west_cells=[[1, 2]], east_cells=[[1, 16]], per_agent=1, capture=10.0)
+    world = AgentWorld(text, pace_of(corridor))
+    world.put_target("west", 1, 1)
+    world.put_target("east", 1, 19)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=120)
+    world.assert_lawful()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_columns_pass_each_other_through_a_gap(seed: int) -> None:
+    field = ["." * 9 + ("..." if row == 4 else "###") + "." * 9 for row in range(9)]
+    west = [[row, col] for col in (1, 3) for row in (2, 4, 6)]
+    east = [[row, 20 - col] for row, col in west]
+    text = TWO_WAYS.format(seed=seed, count=6, west_cells=west, east_cells=east, per_agent=3, capture=25.0)
+    world = AgentWorld(text, pace_of(field))
+    world.put_target("west", 4, 2)
+    world.put_target("east", 4, 18)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=300)
+    world.assert_lawful()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_crowd_fits_around_its_target(seed: int) -> None:
+    # 21 cells lie within 25 m of the target: room for all 16, if those in front move up.
+    text = scenario(16, per_agent=4, capture=25.0).replace("seed = 3", f"seed = {seed}")
+    world = AgentWorld(text, pace_of(OPEN))
+    world.put_target("t", 10, 10)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=120)
+    world.assert_lawful()
+
+
+def test_whoever_has_arrived_in_a_corridor_moves_up_for_those_behind() -> None:
+    corridor = ["#" * 16, "#" + "." * 14 + "#", "#" * 16]
+    text = scenario(3, [(1, 5), (1, 3), (1, 1)], per_agent=1, capture=30.0)
+    world = AgentWorld(text, pace_of(corridor))
+    world.put_target("t", 1, 12)
+    world.start_all()
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    world.assert_lawful()
+
+
+def maze(seed: int, size: int = 14) -> list[str]:
+    """Ways one cell wide around pillars, with some of them walled up."""
+    chance = random.Random(seed)
+    return [
+        "".join(
+            "#" if (row % 2 and col % 2) or ((row % 2 or col % 2) and chance.random() < 0.25) else "."
+            for col in range(size)
+        )
+        for row in range(size)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
+    chance = random.Random(seed)
+    text = scenario(24, per_agent=6, capture=15.0).replace('name = "t"\n', 'name = "t"\ncount = 3\n')
+    world = AgentWorld(text, pace_of(maze(seed)), links=Lossy(seed, loss=0.05))
+    homes = sorted(cell for spawns in spawn_cells_of(world).values() for cell in spawns.values())
+    places = [world.terrain.grid.row_col(cell) for cell in homes]
+    for target in world.scenario.target_ids:
+        world.put_target(target, *chance.choice(places))
+    world.start_all()
+    stands_since: dict[str, tuple[tuple[int, int], int]] = {}
+    longest_s = captures = 0
+    for second in range(100):
+        world.run_s(1.0)
+        for target in world.scenario.target_ids:
+            if any(v.target == target and v.in_reach for v in world.vehicles()):
+                captures += 1
+                world.put_target(target, *chance.choice(places), jumped=True)
+        for id, place in world.where().items():
+            if id not in stands_since or stands_since[id][0] != place:
+                stands_since[id] = (place, second)
+            longest_s = max(longest_s, second - stands_since[id][1])
+    assert captures > 30
+    assert longest_s < 50
+    world.assert_lawful()
+
+
+def spawn_cells_of(world: AgentWorld) -> dict[str, dict[str, int]]:
+    return spawn_cells(world.scenario, world.terrain.grid, world.terrain.pace_s_per_m, world.truth)
+
+
+# --- crashes and bad links ----------------------------------------------------------------------------------
+
+
+def test_a_restarted_agent_goes_on_where_its_vehicles_last_stood() -> None:
+    world = AgentWorld(scenario(4), pace_of(OPEN))
+    world.put_target("t", 10, 10)
+    world.start_all()
+    world.run_s(4.0)
+    before = world.where()
+    world.crash_agent("a1")
+    world.run_s(1.5)
+    world.start_agent("a1")
+    world.until(lambda: len(world.agents["a1"].agent.vehicles) == 2, within_s=0.6)
+    after = world.where()
+    for id in ("a1-00", "a1-01"):
+        assert max(abs(a - b) for a, b in zip(after[id], before[id], strict=True)) <= 1
+    world.until(lambda: len(world.states()) == 4 and VehicleState.IDLE not in world.states().values(), within_s=3)
+    world.assert_lawful()
+
+
+def test_the_first_to_start_does_not_wait_for_anybody() -> None:
+    world = AgentWorld(scenario(4), pace_of(OPEN))
+    world.put_target("t", 10, 10)
+    world.start_planner("t")
+    world.start_agent("a0")
+    assert world.until(lambda: len(world.agents["a0"].agent.vehicles) == 2, within_s=1) <= 0.5
+    # a1 never starts: its places stay free.
+    world.run_s(20)
+    world.assert_lawful()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_crashes_and_bad_links_bring_no_two_vehicles_together(seed: int) -> None:
+    chance = random.Random(seed)
+    text = scenario(12, per_agent=3, capture=15.0).replace("seed = 3", f"seed = {seed}")
+    world = AgentWorld(text, pace_of(["." * 12] * 12), links=Lossy(seed))
+    world.put_target("t", 6, 6)
+    world.start_all()
+    moved = 0
+    for round in range(12):
+        world.put_target("t", chance.randrange(12), chance.randrange(12), jumped=True)
+        before = world.where()
+        world.run_s(3.0)
+        after = world.where()
+        moved += sum(after[id] != place for id, place in before.items() if id in after)
+        if round % 3 == 1:
+            dead = chance.choice(["a1", "a2", "a3"])
+            world.crash_agent(dead)
+            world.run_s(chance.uniform(0.0, 2.0))
+            world.start_agent(dead)
+    world.run_s(5.0)
+    assert len(world.states()) == 12
+    assert moved > 20
+    world.assert_lawful()
+
+
+def test_an_agent_that_is_cut_off_stays_on_the_cells_that_it_holds() -> None:
+    world = AgentWorld(scenario(2, [(10, 2), (0, 0)], per_agent=1), pace_of(OPEN))
+    world.put_target("t", 10, 18)
+    world.start_all()
+    world.run_s(4.0)
+    world.network.link_changed("agent-a0", False)
+    world.run_s(1.0)
+    column = world.where()["a0-00"][1]
+    world.run_s(10.0)
+    assert world.where()["a0-00"][1] - column <= 3
+    world.network.link_changed("agent-a0", True)
+    world.until(lambda: world.states()["a0-00"] is VehicleState.ARRIVED, within_s=30)
+    world.assert_lawful()
+
+
+# --- where they start ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cell", "words"),
+    [
+        ((30, 2), r"groups: all: cell \[30, 2\] is outside the terrain of 20 x 20 cells"),
+        ((3, 3), r"groups: all: cell \[3, 3\] is lethal; choose a passable cell"),
+    ],
+)
+def test_an_impossible_place_is_refused_in_a_sentence(cell: tuple[int, int], words: str) -> None:
+    pace = pace_of(OPEN)
+    pace[3, 3] = np.inf
+    world = AgentWorld(scenario(1, [cell]), pace)
+    with pytest.raises(ConfigError, match=words):
+        world.start_agent("a0")
+
+
+def test_more_vehicles_than_cells_are_refused() -> None:
+    world = AgentWorld(scenario(10), pace_of(["..."] * 3))
+    with pytest.raises(ConfigError, match="10 vehicles, but only 9 connected passable cells"):
+        world.start_agent("a0")
+
+
+def test_an_agent_that_the_scenario_does_not_have_is_refused() -> None:
+    world = AgentWorld(scenario(2), pace_of(OPEN))
+    with pytest.raises(ConfigError, match="has no agent a7"):
+        world.start_agent("a7")

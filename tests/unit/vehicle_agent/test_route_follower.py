@@ -1,0 +1,145 @@
+"""Routes on their way to be driven, and the point that drives them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm.grid import GridSpec, walk
+from vehicle_agent.driving.motion import Motion
+from vehicle_agent.driving.route_follower import Follower, route_cells
+from vehicle_agent.fleet import directions_of
+
+GRID = GridSpec(10, 10, 10.0)
+
+
+def following(*cells: int, here: int | None = None) -> Follower:
+    route = Follower()
+    assert route.begin(cells, cells[0] if here is None else here)
+    return route
+
+
+def test_a_route_is_joined_where_the_vehicle_stands_on_it() -> None:
+    route = following(11, 12, 13, 14, here=13)
+    assert route.ahead() == [14]
+    assert route.left == 1
+
+
+def test_a_route_that_does_not_pass_here_changes_nothing() -> None:
+    route = following(11, 12, 13)
+    assert not route.begin([44, 45], 11)
+    assert route.ahead() == [12, 13]
+
+
+def test_cells_are_passed_one_by_one_and_others_are_ignored() -> None:
+    route = following(11, 12, 13, 14)
+    route.moved(13)
+    assert route.ahead(2) == [12, 13]
+    route.moved(12)
+    assert route.ahead(2) == [13, 14]
+
+
+def test_a_route_ends_before_the_first_closed_cell_ahead() -> None:
+    route = following(11, 12, 13, 14, here=12)
+    assert not route.cut({11}.__contains__)
+    assert route.cut({14}.__contains__)
+    assert route.ahead() == [13]
+
+
+def test_a_detour_rejoins_the_route_where_it_ends() -> None:
+    route = following(11, 12, 13, 14, 15)
+    assert route.splice([22, 23, 14])
+    assert route.ahead() == [22, 23, 14, 15]
+    assert not route.splice([77])
+    assert route.ahead() == [22, 23, 14, 15]
+
+
+def test_a_dropped_route_has_nothing_ahead() -> None:
+    route = following(11, 12)
+    route.drop()
+    assert route.ahead() == []
+    assert route.left == 0
+
+
+@given(st.integers(0, 99), st.binary(max_size=12))
+def test_directions_from_the_network_become_cells_or_nothing(start: int, codes: bytes) -> None:
+    cells = route_cells(GRID, start, codes)
+    try:
+        expected = tuple(walk(GRID, start, codes))
+    except ValueError:
+        assert cells is None
+    else:
+        assert cells == expected
+        assert directions_of(expected, GRID.cols) == codes
+
+
+def test_a_start_outside_the_grid_is_no_route() -> None:
+    assert route_cells(GRID, 100, b"") is None
+    assert route_cells(GRID, -1, b"") is None
+
+
+# --- motion -------------------------------------------------------------------------------------------------
+
+
+def test_a_vehicle_occupies_the_cell_that_its_point_is_in() -> None:
+    motion = Motion(GRID, 11)
+    motion.set_out(12)
+    assert motion.advance(0.4, 0.1) == 0.0
+    assert (motion.cell, motion.entering, motion.place_m()) == (11, 12, (19.0, 15.0))
+    # One second a cell: the border after half of it, and there it stops to look around.
+    assert motion.advance(0.6, 0.1) == pytest.approx(0.5)
+    assert (motion.cell, motion.entering, motion.at_rest) == (12, None, False)
+    assert motion.advance(0.7, 0.1) == pytest.approx(0.2)
+    assert motion.at_rest
+    assert motion.place_m() == (25.0, 15.0)
+
+
+def test_a_diagonal_step_is_longer_and_heads_south_east() -> None:
+    motion = Motion(GRID, 11)
+    motion.set_out(22)
+    left_s = motion.advance(motion.advance(2.0, 0.1), 0.1)
+    assert left_s == pytest.approx(2.0 - math.sqrt(2.0))
+    assert motion.heading_rad == pytest.approx(0.75 * math.pi)
+
+
+def test_a_vehicle_turns_back_as_long_as_it_has_not_left_its_cell() -> None:
+    motion = Motion(GRID, 11)
+    motion.set_out(12)
+    motion.advance(0.3, 0.1)
+    motion.turn_back()
+    assert (motion.cell, motion.entering) == (11, None)
+    assert motion.advance(0.5, 0.1) == pytest.approx(0.2)
+    assert motion.at_rest
+    assert motion.cell == 11
+
+
+def test_a_vehicle_that_has_left_its_cell_does_not_turn_back() -> None:
+    motion = Motion(GRID, 11)
+    motion.set_out(12)
+    motion.advance(0.5, 0.1)
+    motion.turn_back()
+    assert motion.cell == motion.head == 12
+
+
+def test_nobody_sets_out_for_a_cell_that_is_no_neighbour() -> None:
+    with pytest.raises(ValueError, match="no step"):
+        Motion(GRID, 19).set_out(20)
+
+
+@given(st.lists(st.floats(0.01, 0.7), min_size=30, max_size=30))
+def test_time_is_neither_lost_nor_won_by_cutting_it_up(slices: list[float]) -> None:
+    motion = Motion(GRID, 0)
+    spent_s, target = 0.0, 1
+    for seconds in slices:
+        left_s = seconds
+        while left_s > 0.0 and target < 10:
+            if motion.at_rest:
+                motion.set_out(target)
+            left_s = motion.advance(left_s, 0.1)
+            target += motion.at_rest
+        spent_s += seconds - left_s
+    east_m, _ = motion.place_m()
+    assert east_m == pytest.approx(5.0 + 10.0 * spent_s, abs=1e-3)

@@ -1,0 +1,85 @@
+"""What is seen, and which marks follow from it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from swarm.grid import GridSpec
+from swarm.wire.statements import MarkKind
+from vehicle_agent.sensing.sensor import Sight, TruthSensor, compare
+
+GRID = GridSpec(9, 9, 10.0)
+CENTRE = 40
+LEVEL = np.full((9, 9), 0.1, np.float32)
+
+
+def changed(cells: dict[int, float]) -> NDArray[np.float32]:
+    pace = LEVEL.copy()
+    for cell, value in cells.items():
+        pace.reshape(-1)[cell] = value
+    return pace
+
+
+def test_all_cells_within_the_radius_are_seen_and_no_others() -> None:
+    seen = TruthSensor(GRID, LEVEL, 20.0).look([CENTRE]).cells
+    assert len(seen) == len(set(seen.tolist())) == 13
+    assert {CENTRE + 2, CENTRE - 18, CENTRE + 10} <= set(seen.tolist())
+    assert CENTRE + 11 not in seen
+
+
+def test_the_eight_neighbours_are_seen_however_short_the_sight() -> None:
+    assert len(TruthSensor(GRID, LEVEL, 1.0).look([CENTRE]).cells) == 9
+
+
+def test_nothing_outside_the_grid_is_seen() -> None:
+    assert sorted(TruthSensor(GRID, LEVEL, 10.0).look([8]).cells.tolist()) == [7, 8, 16, 17]
+
+
+def test_what_agrees_with_the_map_is_not_marked() -> None:
+    sight = TruthSensor(GRID, changed({CENTRE: 0.1004}), 20.0).look([CENTRE])
+    assert len(compare(sight, LEVEL, LEVEL)) == 0
+
+
+def test_lethal_slow_and_cleared_cells_are_marked_as_such() -> None:
+    truth = changed({41: math.inf, 42: 0.3})
+    ground = changed({31: math.inf, 39: 0.5})
+    findings = compare(TruthSensor(GRID, truth, 20.0).look([CENTRE]), ground, LEVEL)
+    assert findings.cells.tolist() == [31, 39, 41, 42]
+    assert findings.kinds.tolist() == [MarkKind.CLEAR, MarkKind.CLEAR, MarkKind.LETHAL, MarkKind.PACE]
+    assert findings.paces[3] == np.float32(0.3)
+
+
+def test_a_cell_that_two_vehicles_see_is_marked_once() -> None:
+    truth = changed({41: math.inf})
+    findings = compare(TruthSensor(GRID, truth, 20.0).look([40, 42]), LEVEL, LEVEL)
+    assert findings.cells.tolist() == [41]
+
+
+def test_the_sensor_sees_what_the_ground_is_now() -> None:
+    truth = LEVEL.copy()
+    sensor = TruthSensor(GRID, truth, 10.0)
+    truth.reshape(-1)[41] = np.inf
+    assert np.isinf(sensor.look([CENTRE]).paces).sum() == 1
+
+
+paces = st.sampled_from([0.1, 0.2, math.inf])
+
+
+@given(*(st.lists(paces, min_size=81, max_size=81) for _ in range(3)))
+def test_after_the_marks_are_applied_nothing_differs_any_more(
+    true: list[float], mapped: list[float], prior: list[float]
+) -> None:
+    truth, ground, before = (np.array(values, np.float32).reshape(9, 9) for values in (true, mapped, prior))
+    sight = Sight(np.arange(81), truth.reshape(-1))
+    findings = compare(sight, ground, before)
+    flat = ground.reshape(-1)
+    for cell, kind, pace in zip(findings.cells, findings.kinds, findings.paces, strict=True):
+        known = {MarkKind.LETHAL: math.inf, MarkKind.PACE: pace, MarkKind.CLEAR: before.reshape(-1)[cell]}
+        flat[cell] = known[MarkKind(int(kind))]
+    assert (flat == truth.reshape(-1)).all()
+    assert len(compare(sight, ground, before)) == 0

@@ -1,0 +1,1 @@
+"""What vehicles see: the ground around them and targets."""

@@ -1,0 +1,67 @@
+"""Which targets an agent's vehicles see, and what they tell of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.wire.messages.targets import Sighted, TargetPose
+from vehicle_agent.driving.vehicle import Vehicle
+
+_TELL_NS = NS_PER_S // 2
+"""A target that stays in sight is told of so often."""
+_RANGE_SHARE = 0.02
+"""The simulated sensor is off by this share of the distance, besides half a cell."""
+
+
+class Lookout:
+    """The simulated sensor for targets: it knows where they truly are, and tells only of those within its range."""
+
+    def __init__(self, grid: GridSpec, author: str, group: str, range_m: float, lasts_s: float) -> None:
+        self._grid = grid
+        self._author = author
+        self._group = group
+        self._range_m = range_m
+        self._lasts_ns = int(lasts_s * NS_PER_S)
+        self._true: dict[str, TargetPose] = {}
+        self._told_ns: dict[str, int] = {}
+        self._seq = 0
+
+    def truth(self, pose: TargetPose) -> None:
+        """Where a target is: the ground that the sensor looks at."""
+        known = self._true.get(pose.target)
+        if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):
+            self._true[pose.target] = pose
+
+    def look(self, vehicles: Iterable[Vehicle], now_ns: int) -> list[Sighted]:
+        """What there is to tell of targets in sight, each by the vehicle that is nearest."""
+        due = [id for id in self._true if now_ns - self._told_ns.get(id, -_TELL_NS) >= _TELL_NS]
+        if not due:
+            return []
+        places = [vehicle.motion.place_m() for vehicle in vehicles]
+        seen = []
+        for id in due:
+            pose = self._true[id]
+            east_m, south_m = pose.x_m - self._grid.west_m, self._grid.north_m - pose.y_m
+            distance_m = min((math.hypot(e - east_m, s - south_m) for e, s in places), default=math.inf)
+            if distance_m <= self._range_m:
+                self._told_ns[id] = now_ns
+                seen.append(self._sighted(pose, distance_m, now_ns))
+        return seen
+
+    def _sighted(self, pose: TargetPose, distance_m: float, now_ns: int) -> Sighted:
+        self._seq += 1
+        return Sighted(
+            author=self._author,
+            group=self._group,
+            target=pose.target,
+            seq=self._seq,
+            stamp_ns=now_ns,
+            until_ns=now_ns + self._lasts_ns,
+            cell=pose.cell,
+            x_m=pose.x_m,
+            y_m=pose.y_m,
+            uncertainty_m=0.5 * self._grid.resolution_m + _RANGE_SHARE * distance_m,
+        )

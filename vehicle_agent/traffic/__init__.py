@@ -1,0 +1,1 @@
+"""Right of way between vehicles of all agents: reservations, territory, deadlocks, resumption."""
