@@ -1,4 +1,4 @@
-"""How far from optimal routes are: the books of one planner. Pure.
+"""How far from optimal routes are: statistics of one planner. Pure.
 
 certified_gap_excess  proven, of every route served: its cost over its lower bound, less 1
 gap_excess            measured at full growths: driven cost over optimum of what the tree offered each follower
@@ -30,7 +30,7 @@ _MOST = 64
 Gaps = NDArray[np.float64]
 
 
-class GapBooks:
+class GapStatistics:
     """What was measured of one planner's routes. `last` is mean, p95 and highest of the last full growth."""
 
     def __init__(
@@ -46,7 +46,7 @@ class GapBooks:
         self._due_ns = 0
 
     def certify(self, routes: RouteBatch) -> float:
-        """Book the proven gaps of served routes; returns the widest."""
+        """Note the proven gaps of served routes. Returns the widest, at least 1."""
         gaps = routes.gaps
         self._counters.observe_all("certified_gap", gaps)
         self._counters.observe_all("certified_gap_excess", gaps - 1.0)
@@ -65,7 +65,7 @@ class GapBooks:
         self._due_ns = now_ns + _EVERY_NS
         some = _some(followers)
         cells = [follower.cell for follower in some]
-        routes = tree.routes(pace, cells, 0)
+        routes = tree.routes(cells, 0)
         driven = routes.cost_s + self._length_weight * routes.length_m
         self._offered(_ratios(driven, tree.cost_to_go_at(cells)))
         self._held(tree, some, pace)

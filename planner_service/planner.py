@@ -1,29 +1,16 @@
-"""The planner of one target: when to grow, what to answer, whom to tell. Events in, actions out."""
+"""The planner of one target: when to grow, what to answer, whom to push newer routes to. Pure."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-from planner_service.events import (
-    Action,
-    AnswerCosts,
-    AnswerRoutes,
-    CostsAsked,
-    Event,
-    FleetHeard,
-    GrowTree,
-    PoseHeard,
-    Push,
-    Refuse,
-    RoutesAsked,
-    Tell,
-    TreeGrown,
-)
 from planner_service.followers import Follower, Followers
-from planner_service.gaps import GapBooks
-from planner_service.target_tree import MODEL_NS_PER_CELL, GrownTree, TargetTree, Update
+from planner_service.full_growth import GrownTree
+from planner_service.gaps import GapStatistics
+from planner_service.target_tree import MODEL_NS_PER_CELL, TargetTree, Update
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
@@ -39,6 +26,7 @@ from swarm.wire.messages.planning import (
     RouteRequest,
 )
 from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
@@ -52,12 +40,30 @@ _MEDIAN_OF = 5
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
 
 
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A request that is not answered, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GrowTree:
+    """Run `job` on a worker and bring what it returns to `Planner.adopt`."""
+
+    job: Callable[[], GrownTree]
+
+
+Action = GrowTree | PushedRoute | PlannerStatus
+"""What a planner wants done: a growth run, a message published."""
+
+
 class Planner:
     """Keeps the tree of one target, and answers from it.
 
     Poses and map changes are taken in once per tick, however many there were; at most one full growth is under
-    way, and what changes meanwhile is made up for when it is adopted. Answers never wait for a growth: before the
-    first they are NO_TARGET. The cost map is its owner's, who applies marks to it between calls.
+    way, and what changes meanwhile is made up for when it is adopted. Before the first tree all routes are
+    NO_TARGET. The cost map is its owner's, who applies marks to it between calls.
 
     stopwatch       times growths on this thread; without one they take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
@@ -87,38 +93,50 @@ class Planner:
         self._newest_mark_ns = newest_mark_ns
         self._push_ns = int(config.push_s * NS_PER_S)
         self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
+        # The newest pose heard; the tick takes it in.
         self._pose: TargetPose | None = None
-        self._told: tuple[int, int] | None = None  # target cell and map version that the tree knows
+        # (target cell, map version) that the tree was last told.
+        self._told: tuple[int, int] | None = None
+        # When the full growth under way was begun, and the map's changes since; None and empty without one.
         self._growing_since_ns: int | None = None
         self._dirty_since_snapshot: list[Window] = []
+        # Stamp of the newest mark that is in the map and not yet in the tree.
         self._unseen_mark_ns: int | None = None
+        # A full growth is to begin as soon as none is under way; loose bounds may ask for one again from then on.
         self._wants_full = False
         self._full_due_ns = 0
+        # Cells that were forced since the tree changed last: forcing them again would change nothing.
         self._forced: set[int] = set()
+        # When the tree was last exact, as of the map that it was grown on; None before.
         self._exact_ns: int | None = None
+        # For the status: the part grown last, and how long the last full growth took.
         self._window: Window = Window(0, 0, 0, 0)
         self._growth_ms = 0.0
-        self._gaps = GapBooks(self._grid, config, counters, cost_map.terrain.climb)
+        self._gaps = GapStatistics(self._grid, config, counters, cost_map.terrain.climb)
         self._took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._status_due_ns = 0
         for name in COUNTS:
             counters.count(name, 0)
 
-    def handle(self, event: Event, now_ns: int) -> list[Action]:
-        match event:
-            case PoseHeard(pose):
-                self._hear_pose(pose)
-            case FleetHeard(fleet):
-                self.followers.hear(fleet, now_ns)
-            case RoutesAsked(ask, request) if len(request.cells) > MOST_ROUTES:
-                return [Refuse(ask, f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")]
-            case RoutesAsked(ask, request):
-                return [AnswerRoutes(ask, self._routes(request, now_ns))]
-            case CostsAsked(ask, request):
-                return [AnswerCosts(ask, self._costs(request, now_ns))]
-            case TreeGrown(grown, took_ns):
-                return self._adopt(grown, took_ns, now_ns)
-        return []
+    def hear_pose(self, pose: TargetPose) -> None:
+        """Note where the target is, if the pose is newer than what is known. The next tick takes it in."""
+        known = self._pose
+        if pose.target != self.target:
+            return
+        if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):
+            self._pose = pose
+
+    def hear_fleet(self, fleet: Fleet, now_ns: int) -> None:
+        """Note where an agent's vehicles are, and which of them chase this target."""
+        self.followers.hear(fleet, now_ns)
+
+    def answer(self, request: RouteRequest | CostRequest, now_ns: int) -> RouteReply | CostReply | Refusal:
+        """Answer from the tree as it is. Never waits for a growth that is under way."""
+        if isinstance(request, CostRequest):
+            return self._costs(request, now_ns)
+        if len(request.cells) > MOST_ROUTES:
+            return Refusal(f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")
+        return self._routes(request, now_ns)
 
     def tick(self, now_ns: int) -> list[Action]:
         """Bring the tree up to date, push newer routes, tell how we are doing."""
@@ -127,24 +145,36 @@ class Planner:
         actions.extend(self._pushes(now_ns))
         if now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + STATUS_NS
-            actions.append(Tell(self.status(now_ns)))
+            actions.append(self.status(now_ns))
         return actions
 
-    def growth(self, action: GrowTree) -> Callable[[], GrownTree]:
-        """The long work of a `GrowTree`, on a snapshot of the map as it was decided on."""
-        snapshot = self._cost_map.snapshot()
-        if snapshot.version != action.map_version:
-            raise RuntimeError(f"growth was decided on map {action.map_version}, the map is at {snapshot.version}")
-        return self.tree.full_job(snapshot.pace_s_per_m, action.target_cell, action.map_version)
+    def adopt(self, grown: GrownTree, took_ns: int, now_ns: int) -> list[Action]:
+        """Replace the tree by what the worker grew, and make up for what happened meanwhile."""
+        if self._growing_since_ns is None or self._pose is None:
+            return []
+        snapshot_ns = self._growing_since_ns
+        news = (self._pose.cell, self._cost_map.version)
+        dirty = self._take_dirty()
+        self._growing_since_ns = None
+        update = self.tree.adopt(
+            grown,
+            self._cost_map.pace_s_per_m,
+            *(news[0], self._dirty_since_snapshot, news[1]),
+            self.followers.cells,
+        )
+        self._told = news
+        self._wants_full = False  # all that happened until now is in what `adopt` says
+        self._grown(took_ns, usual=grown.skeleton is None)
+        if grown.map_version == news[1] and grown.target_cell == news[0]:
+            self._exact_ns = now_ns
+        else:
+            self.counters.count("growths_late")
+            self._exact_ns = snapshot_ns
+        self._gaps.adopted(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
+        self._changed(update, dirty, now_ns)
+        return [self._grow(now_ns)] if self._wants_full else []
 
     # --- the tree -----------------------------------------------------------------------------------------------
-
-    def _hear_pose(self, pose: TargetPose) -> None:
-        known = self._pose
-        if pose.target != self.target:
-            return
-        if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):
-            self._pose = pose
 
     def _keep_up(self, now_ns: int) -> list[Action]:
         """Take in the newest pose and all map changes since the last time, if there are any."""
@@ -179,33 +209,8 @@ class Planner:
         self._growing_since_ns = now_ns
         self._dirty_since_snapshot = []
         self._wants_full = False
-        return GrowTree(*self._told)
-
-    def _adopt(self, grown: GrownTree, took_ns: int, now_ns: int) -> list[Action]:
-        """Replace the tree by what the worker grew, and make up for what happened meanwhile."""
-        if self._growing_since_ns is None or self._pose is None:
-            return []
-        snapshot_ns = self._growing_since_ns
-        news = (self._pose.cell, self._cost_map.version)
-        dirty = self._take_dirty()
-        self._growing_since_ns = None
-        update = self.tree.adopt(
-            grown,
-            self._cost_map.pace_s_per_m,
-            *(news[0], self._dirty_since_snapshot, news[1]),
-            self.followers.cells,
-        )
-        self._told = news
-        self._wants_full = False  # all that happened until now is in what `adopt` says
-        self._grown(took_ns, usual=grown.skeleton is None)
-        if grown.map_version == news[1] and grown.target_cell == news[0]:
-            self._exact_ns = now_ns
-        else:
-            self.counters.count("growths_late")
-            self._exact_ns = snapshot_ns
-        self._gaps.adopted(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
-        self._changed(update, dirty, now_ns)
-        return [self._grow(now_ns)] if self._wants_full else []
+        snapshot = self._cost_map.snapshot()
+        return GrowTree(self.tree.full_job(snapshot.pace_s_per_m, self._told[0], snapshot.version))
 
     def _changed(self, update: Update, dirty: Sequence[Window], now_ns: int) -> None:
         """The tree is another than before."""
@@ -252,7 +257,7 @@ class Planner:
             self._force(cells, now_ns)
         most = MOST_STEPS // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
-        routes = self.tree.routes(self._cost_map.pace_s_per_m, cells, max_cells)
+        routes = self.tree.routes(cells, max_cells)
         self.counters.count("routes_served", len(routes))
         self._certify(routes, now_ns)
         for index, vehicle in enumerate(request.vehicles):
@@ -274,7 +279,7 @@ class Planner:
         if not fresh:
             return
         began_ns = self._now()
-        update = self.tree.force(self._cost_map.pace_s_per_m, fresh)
+        update = self.tree.force(fresh)
         self._timed(update, self._now() - began_ns, now_ns)
         if update.kind != "none":
             self._changed(update, (), now_ns)
@@ -282,10 +287,10 @@ class Planner:
         self._forced.update(fresh)
 
     def _certify(self, routes: RouteBatch, now_ns: int) -> None:
-        """Too wide a proven gap asks for a full growth, now and then; the paper's strategies know no such thing."""
+        """Note the proven gaps; one that is too wide asks for a full growth, now and then, if the strategy does."""
         widest = self._gaps.certify(routes)
-        forces = self._config.strategy in ("rotation", "auto")
-        if forces and widest > self._config.max_gap and now_ns >= self._full_due_ns:
+        loose = widest > self._config.max_gap and self.tree.strategy.renews_loose_bounds
+        if loose and now_ns >= self._full_due_ns:
             self._full_due_ns = now_ns + self._push_ns
             self._wants_full = True
 
@@ -324,13 +329,13 @@ class Planner:
         pushes: list[Action] = []
         for max_cells, batch in due.items():
             cells = [follower.cell for _, follower in batch]
-            routes = self.tree.routes(self._cost_map.pace_s_per_m, cells, max_cells)
+            routes = self.tree.routes(cells, max_cells)
             for (id, follower), route in zip(batch, routes, strict=True):
                 follower.stale = False
                 if route.status not in _WORTH_PUSHING or not self.followers.is_news(follower, route):
                     continue
                 self.followers.sent(follower, route, now_ns + self._push_ns)
-                pushes.append(Push(self._pushed(id, route, target_cell)))
+                pushes.append(self._pushed(id, route, target_cell))
         self.counters.count("pushes", len(pushes))
         return pushes
 

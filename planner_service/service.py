@@ -1,26 +1,13 @@
-"""The planner's shell: the core's events from the bus, its actions to the bus and the worker."""
+"""The planner's shell: messages from the bus to the core, its answers and actions to the bus and the worker."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
 
-from planner_service.events import (
-    Action,
-    AnswerCosts,
-    AnswerRoutes,
-    CostsAsked,
-    FleetHeard,
-    GrowTree,
-    PoseHeard,
-    Push,
-    Refuse,
-    RoutesAsked,
-    Tell,
-    TreeGrown,
-)
-from planner_service.planner import Planner
-from planner_service.target_tree import GrownTree, TargetTree
+from planner_service.full_growth import GrownTree
+from planner_service.planner import Action, GrowTree, Planner, Refusal
+from planner_service.target_tree import TargetTree
 from shared_map.cost_map import CostMap
 from shared_map.replication.filter import Reading, readable_for_target
 from shared_map.replication.replica import MapReplica
@@ -31,7 +18,7 @@ from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.config.scenario import agent_of
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.planning import CostRequest, RouteRequest
+from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
@@ -80,8 +67,6 @@ class PlannerService:
             stopwatch=stopwatch,
             newest_mark_ns=self._replica.take_newest_stamp_ns,
         )
-        self._asked: dict[int, Asked] = {}
-        self._asks = 0
         self._served = False
         self.counters.count("marks_merged", 0)
 
@@ -98,19 +83,22 @@ class PlannerService:
             return
         match event:
             case Heard(message=TargetPose() as pose):
-                self._perform(self._planner.handle(PoseHeard(pose), now_ns))
+                self._planner.hear_pose(pose)
             case Heard(message=Sighted() as sighted):
                 if self._sightings.hear(sighted):
                     for seen in self._sightings.best(now_ns).values():
-                        self._perform(self._planner.handle(PoseHeard(pose_of(seen)), now_ns))
+                        self._planner.hear_pose(pose_of(seen))
             case Heard(message=Fleet() as fleet):
-                self._perform(self._planner.handle(FleetHeard(fleet), now_ns))
-            case Asked(request=RouteRequest() as routes):
-                self._perform(self._planner.handle(RoutesAsked(self._remember(event), routes), now_ns))
-            case Asked(request=CostRequest() as costs):
-                self._perform(self._planner.handle(CostsAsked(self._remember(event), costs), now_ns))
+                self._planner.hear_fleet(fleet, now_ns)
+            case Asked(request=RouteRequest() | CostRequest() as request):
+                reply = self._planner.answer(request, now_ns)
+                if isinstance(reply, Refusal):
+                    event.refuse(reply.reason)
+                else:
+                    event.answer(reply, target=self._target)
+                event.end()
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag == _GROW:
-                self._perform(self._planner.handle(TreeGrown(grown, took_ns), now_ns))
+                self._perform(self._planner.adopt(grown, took_ns, now_ns))
             case _:
                 pass
 
@@ -129,26 +117,12 @@ class PlannerService:
         self._bus.publish(STATUS, self._planner.status(now_ns), target=self._target)
         self._member.publish_stats(now_ns)
 
-    def _remember(self, asked: Asked) -> int:
-        self._asks += 1
-        self._asked[self._asks] = asked
-        return self._asks
-
     def _perform(self, actions: list[Action]) -> None:
         for action in actions:
             match action:
-                case AnswerRoutes(ask, reply) | AnswerCosts(ask, reply):
-                    asked = self._asked.pop(ask)
-                    asked.answer(reply, target=self._target)
-                    asked.end()
-                case Refuse(ask, reason):
-                    asked = self._asked.pop(ask)
-                    asked.refuse(reason)
-                    asked.end()
-                case GrowTree():
-                    model_ns = self._planner.tree.measured_model_ns()
-                    self._worker.submit(_GROW, self._planner.growth(action), self._post, model_ns)
-                case Push(pushed):
-                    self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(pushed.vehicle), vehicle=pushed.vehicle)
-                case Tell(status):
+                case GrowTree(job):
+                    self._worker.submit(_GROW, job, self._post, self._planner.tree.measured_model_ns())
+                case PushedRoute(vehicle=vehicle) as pushed:
+                    self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
+                case PlannerStatus() as status:
                     self._bus.publish(STATUS, status, target=self._target)

@@ -1,23 +1,100 @@
-"""What `auto` does: the best that fits its share of a core."""
+"""The strategies by which a tree follows its target: one table, a row per strategy, in the terms of the paper.
+
+A strategy says what is grown when the target moves, how wide, when the whole tree is due, and whether far cells are
+thinned out. `TargetTree` and `Planner` ask the row that is in force and compare no names: a new strategy is a row
+here, and its name in `swarm.config.scenario.Strategy`. Sections are those of Wan et al.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Literal
 
 from planner_service.tree.windows import AHEAD
+from swarm.config.scenario import Strategy
+
+
+class OnMove(Enum):
+    """What is grown when the target moves."""
+
+    WHOLE_TREE = "whole tree"
+    """Brute force, section 3.3.1: the exact tree, with every move."""
+    BLOCK_WINDOW = "block window"
+    """Variable range, section 3.3.2: a window around the target, as wide as the largest block of 2**k cells whose
+    border the target crossed."""
+    SCHEDULED_WINDOW = "scheduled window"
+    """Ours: windows of doubling width, each grown anew once the target has come a 16th of its reach."""
+
+
+class FullGrowth(Enum):
+    """When a strategy with windows asks for the exact tree, besides where a window cannot be grown."""
+
+    WHEN_FORCED = "when forced"
+    """Section 3.3.2, the passive strategy: only when a vehicle whose route has run out asks."""
+    EVERY_FEW_MOVES = "every few moves"
+    """Every `planner.full_every` moves, on small maps sooner."""
+    WITHIN_BUDGET = "within the budget"
+    """As often as `planner.cpu_budget` allows, but no sooner than a window as wide as the map were due."""
+
+
+class WidestWindow(Enum):
+    """How wide a scheduled window gets before something else takes its place."""
+
+    WHILE_CHEAPER = "while cheaper than a full growth"
+    SHARE_OF_MAP = "a 16th of the map's side"
+    """The fine part of multi-resolution: what lies beyond belongs to the corridors."""
+
+
+@dataclass(frozen=True, slots=True)
+class StrategyRow:
+    """One strategy.
+
+    thins_far_cells     section 3.3.3, multi-resolution: far from the target only cells that carry traffic are
+                        grown. The paper takes every second, fourth, ... cell instead, and so jumps over walls
+    renews_loose_bounds a served route whose certified gap exceeds `planner.max_gap` asks for a full growth; the
+                        strategies of the paper never do
+    """
+
+    on_move: OnMove
+    full_growth: FullGrowth = FullGrowth.WHEN_FORCED
+    thins_far_cells: bool = False
+    widest_window: WidestWindow = WidestWindow.WHILE_CHEAPER
+    renews_loose_bounds: bool = False
+
+
+STRATEGIES: Mapping[Strategy, StrategyRow] = {
+    "full": StrategyRow(OnMove.WHOLE_TREE),
+    "variable_range": StrategyRow(OnMove.BLOCK_WINDOW),
+    "multi_resolution": StrategyRow(
+        OnMove.SCHEDULED_WINDOW, thins_far_cells=True, widest_window=WidestWindow.SHARE_OF_MAP
+    ),
+    "variable_range+multi_resolution": StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True),
+    "rotation": StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.EVERY_FEW_MOVES, renews_loose_bounds=True),
+}
+"""Every strategy but `auto`, which goes through the rows of `STAGES`."""
 
 Stage = Literal["exact", "rotate", "coarsen"]
-BACK = 0.7
-"""A better stage is gone back to once it takes less than this share of what it may: times are noisy, and must not
-make the stage flap."""
+
+_ROTATE = StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.WITHIN_BUDGET, renews_loose_bounds=True)
+STAGES: Mapping[Stage, StrategyRow] = {
+    "exact": StrategyRow(OnMove.WHOLE_TREE, renews_loose_bounds=True),
+    "rotate": _ROTATE,
+    "coarsen": replace(_ROTATE, thins_far_cells=True),
+}
+"""`auto`: exact trees while one fits into a tick; then windows, with full growths in turn; and where these come so
+seldom that the target leaves what the widest window can make up for, corridors beyond that."""
+
+HYSTERESIS = 0.7
+"""`auto` returns to the better stage only below this share of the budget: times are noisy."""
 
 
-class Auto:
-    """Exact trees while one fits into a tick; then windows, with full growths in turn; and where these come so
-    seldom that the target leaves what the widest window can make up for, rings beyond that.
+class AutoStage:
+    """Which stage `auto` is in: a function of the times observed alone, so that a model decides alike everywhere.
 
     budget_ns  CPU time that a tick may take
-    stage      what to do now; a function of the times observed alone, so that a model decides alike everywhere
+    stage      what to do now; `observe` alone changes it
     """
 
     def __init__(self, budget_ns: float) -> None:
@@ -25,13 +102,19 @@ class Auto:
         self.stage: Stage = "exact"
 
     def observe(self, full_ns: float, widest: int) -> None:
-        """What a full growth takes; and how far, in cells, the widest window reaches that is grown in between."""
+        """Choose the stage by what a full growth takes, and by how far, in cells, the widest window reaches."""
         slowest_exact = self.budget_ns
         # The target comes one cell a tick, and a window is due once it has come an `AHEAD`th of its width.
         slowest_rotation = max(self.budget_ns * widest / AHEAD, slowest_exact)
-        if full_ns > slowest_rotation * (BACK if self.stage == "coarsen" else 1.0):
+        if full_ns > slowest_rotation * (HYSTERESIS if self.stage == "coarsen" else 1.0):
             self.stage = "coarsen"
-        elif full_ns > slowest_exact * (1.0 if self.stage == "exact" else BACK):
+        elif full_ns > slowest_exact * (1.0 if self.stage == "exact" else HYSTERESIS):
             self.stage = "rotate"
         else:
             self.stage = "exact"
+
+
+def row_of(strategy: Strategy, stage: Stage, *, directed: bool) -> StrategyRow:
+    """The row in force. Where uphill is not downhill only whole trees are grown."""
+    row = STAGES[stage] if strategy == "auto" else STRATEGIES[strategy]
+    return replace(STAGES["exact"], renews_loose_bounds=row.renews_loose_bounds) if directed else row

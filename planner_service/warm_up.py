@@ -57,9 +57,9 @@ def _live(tree: TargetTree, pace: NDArray[np.float32]) -> None:
     for version, change in ((4, np.inf), (5, 0.05)):
         pace[3:5, 3:5] = change
         tree.update(pace, middle + 3, [Window(3, 3, 5, 5)], version)
-    tree.force(pace, [0, 1])
+    tree.force([0, 1])
     grown = tree.full_job(pace.copy(), middle + 3, 5)()
     tree.update(pace, middle + 4, [], 6)
     tree.adopt(grown, pace, middle + 5, [], 6, np.array([0, 1]))
-    tree.routes(pace, [0, 1, -1], 0)
+    tree.routes([0, 1, -1], 0)
     tree.cost_to_go_at([0, 1])

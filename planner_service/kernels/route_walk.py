@@ -49,29 +49,6 @@ def relabel(weight, parent, stride, rule, root, cost):
 
 
 @njit(cache=True, nogil=True)
-def path_lengths(parent, stride, straight, diagonal, root, length):
-    """length (float32) := how long the way of each cell along its parents is; inf where there is none."""
-    offsets = step_offsets(stride)
-    unknown = np.float32(-1.0)
-    for i in range(length.size):
-        length[i] = unknown if parent[i] != NONE else INF
-    length[root] = np.float32(0.0)
-    trail = np.empty(length.size, np.uint32)
-    for i in range(length.size):
-        v = i
-        many = 0
-        while length[v] == unknown:
-            trail[many] = v
-            many += 1
-            v += offsets[parent[v]]
-        so_far = np.float64(length[v])
-        for j in range(many - 1, -1, -1):
-            v = np.int64(trail[j])
-            so_far += diagonal if parent[v] & 1 else straight
-            length[v] = so_far
-
-
-@njit(cache=True, nogil=True)
 def _walk_on(weight, parent, offsets, lengths, cells, sums, trails, fill, steps):
     """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
     a, b, c, d = np.uint64(cells[0]), np.uint64(cells[1]), np.uint64(cells[2]), np.uint64(cells[3])

@@ -204,15 +204,6 @@ class CostToGoTree:
             self._now = 2
             self._stamps = None
 
-    def lengths(self) -> Floats:
-        """(rows, cols) float32, m: how long the way of each cell is; inf where there is none."""
-        ground = self.ground
-        straight = ground.grid.resolution_m
-        length = np.empty(ground.size, np.float32)
-        root = ground.pad(self.root)
-        route_walk.path_lengths(self.parent, ground.stride, straight, straight * ground.diagonal, root, length)
-        return np.ascontiguousarray(self.inner(length), np.float32)
-
     def relabel(self) -> None:
         """Make every cost what is really driven along the parents."""
         ground = self.ground

@@ -32,7 +32,7 @@ def assert_lengths(scenario: Path, most: int | None) -> None:
     for goal, problems in by_goal.items():
         tree.update(pace, goal, [], 0)
         starts = [int(line[5]) * grid.cols + int(line[4]) for line in problems]
-        for line, route in zip(problems, tree.routes(pace, starts), strict=True):
+        for line, route in zip(problems, tree.routes(starts), strict=True):
             if float(line[8]) == 0 and line[4:6] != line[6:8]:  # published as a problem that has no solution
                 assert route.status is RouteStatus.UNREACHABLE
                 continue

@@ -69,7 +69,7 @@ class Play:
             )
             self.grown = None
         elif event.what == "force":
-            self.tree.force(self.pace, [0, self.grid.cells - 1])
+            self.tree.force([0, self.grid.cells - 1])
 
     def _mark(self, event: Marks) -> Window:
         rng = np.random.default_rng(event.seed)
@@ -82,7 +82,7 @@ class Play:
 
     def check(self) -> None:
         """Laws (a) to (c), certificates and upper bounds, for a route from every cell."""
-        routes = self.tree.routes(self.pace, np.arange(self.grid.cells))
+        routes = self.tree.routes(np.arange(self.grid.cells))
         if not np.isfinite(self.pace.flat[self.target]):
             assert all(route.status is RouteStatus.NO_TARGET for route in routes)
             return
@@ -207,8 +207,8 @@ def test_a_forced_full_growth_is_a_full_growth() -> None:
     )
     while play.last.kind != "window":
         play.happen(Move(1, 1))
-    assert play.tree.force(play.pace, [0]).kind == "full"
-    assert play.tree.force(play.pace, [0]).kind == "none", "there is nothing better to be had"
+    assert play.tree.force([0]).kind == "full"
+    assert play.tree.force([0]).kind == "none", "there is nothing better to be had"
 
 
 @given(st.integers(0, 63), st.integers(0, 63), st.integers(0, 63), st.integers(0, 63), st.integers(0, 5))

@@ -223,7 +223,7 @@ class _Crowd:
         return cells, self._tree_of(n).cost_to_go_at(cells)
 
     def _driven(self, n: int) -> Cells:
-        routes = self._tree_of(n).routes(self._field.pace, self.places[n], self._plan.speed)
+        routes = self._tree_of(n).routes(self.places[n], self._plan.speed)
         ends = [walk(self._field.grid, route.start, route.directions)[-1] for route in routes]
         fresh = self._field.draw(len(ends), self._rng)
         return np.where(np.array(ends) == self.targets[n], fresh, ends)
@@ -274,7 +274,7 @@ class _Racer:
         def follow_and_read() -> None:
             for n, cell in enumerate(crowd.targets):
                 self._follow(n, cell, followed=crowd.places[n])
-                self._trees[n].routes(self._pace, crowd.places[n], self._plan.max_cells)
+                self._trees[n].routes(crowd.places[n], self._plan.max_cells)
 
         took_ms = self._timed(follow_and_read)
         self._spent_ms += took_ms
@@ -284,7 +284,7 @@ class _Racer:
             self.tally.frame_ms[frame] += took_ms
 
     def judged(self, n: int, cells: Cells, optimum: NDArray[np.float32]) -> None:
-        self.tally.judge(self._trees[n].routes(self._pace, cells, self._plan.max_cells), optimum)
+        self.tally.judge(self._trees[n].routes(cells, self._plan.max_cells), optimum)
 
     def done(self, frame: int, seconds: float) -> bool:
         if self._frames is not None:

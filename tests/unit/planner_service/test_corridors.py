@@ -12,8 +12,8 @@ from laws.test_tree_under_every_strategy import Play
 from support import slow_twins as naive
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
-from planner_service import target_tree as planner_strategies
-from planner_service.strategy import Auto
+from planner_service import target_tree
+from planner_service.strategy import AutoStage
 from planner_service.tree import corridors as skeletons
 from planner_service.tree.corridors import Skeleton, find_skeleton
 from planner_service.tree.cost_grid import Ground
@@ -41,8 +41,8 @@ def small_rings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(skeletons, "LEAST", 3)
     monkeypatch.setattr(skeletons, "AROUND", 2)
     monkeypatch.setattr("planner_service.tree.cost_to_go.INNER", 6)
-    monkeypatch.setattr(planner_strategies, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
-    monkeypatch.setattr(planner_strategies, "WIDE_SHARE", 64)
+    monkeypatch.setattr(target_tree, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
+    monkeypatch.setattr(target_tree, "WIDE_SHARE", 64)
 
 
 @pytest.mark.usefixtures("small_rings")
@@ -84,7 +84,7 @@ def test_far_from_the_target_rings_hold_where_windows_alone_drift() -> None:
             play.happen(Job("end"))
         for _ in range(50):
             play.happen(Move(0, 1))
-        routes = play.tree.routes(play.pace, np.arange(3600))
+        routes = play.tree.routes(np.arange(3600))
         optimum = naive.cost_to_go(pace, play.target, **play.rules).reshape(-1)
         some = np.isfinite(optimum) & (optimum > 0)
         gaps[has_skeleton] = float((routes.cost_s[some] / optimum[some]).mean())
@@ -141,7 +141,7 @@ def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_w
 
 
 def test_auto_grows_exactly_then_rotates_then_coarsens_and_does_not_flap() -> None:
-    auto = Auto(budget_ns=10e6)
+    auto = AutoStage(budget_ns=10e6)
     stages = []
     for full_ms in (2, 9, 11, 9, 8, 6, 11, 150, 330, 300, 250, 200, 50, 6):
         auto.observe(full_ms * 1e6, widest=512)
@@ -158,15 +158,12 @@ def test_each_cells_length_is_that_of_its_way(rules: dict, length_weight: float)
     rng = np.random.default_rng(4)
     pace = random_pace(rng, 18, 23, 10.0, 0.2)
     play = Play(pace, PlannerConfig(strategy="full", length_weight=length_weight, **rules))
-    lengths = play.tree.lengths().reshape(-1)
-    routes = play.tree.routes(pace, np.arange(pace.size))
-    for cell, route in enumerate(routes):
-        if not math.isfinite(lengths[cell]):
+    for route in play.tree.routes(np.arange(pace.size)):
+        if not math.isfinite(route.length_m):
             assert not route.directions
             continue
         diagonal = math.sqrt(2) if config_octile(rules) else 1.0
         steps = sum(diagonal if code & 1 else 1.0 for code in route.directions)
-        assert lengths[cell] == pytest.approx(steps, rel=1e-5)
         assert route.length_m == pytest.approx(steps, rel=1e-5)
 
 
@@ -179,8 +176,8 @@ def test_a_dearer_length_makes_ways_shorter_and_slower() -> None:
     found = {}
     for weight in (0.0, 10.0):
         play = Play(pace, PlannerConfig(strategy="full", length_weight=weight))
-        lengths = play.tree.lengths()
-        costs = play.tree.routes(pace, np.arange(900)).cost_s
+        routes = play.tree.routes(np.arange(900))
+        lengths, costs = routes.length_m, routes.cost_s
         found[weight] = float(lengths[np.isfinite(lengths)].sum()), float(costs[np.isfinite(costs)].sum())
     assert found[10.0][0] < found[0.0][0]
     assert found[10.0][1] > found[0.0][1]
@@ -211,16 +208,16 @@ def test_what_is_asked_for_costs_what_is_driven_however_far_the_target_went() ->
 def test_on_a_large_map_a_forced_range_is_a_window_over_vehicle_and_target_until_a_worker_has_grown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(planner_strategies, "INLINE_NS", 60_000)
+    monkeypatch.setattr(target_tree, "INLINE_NS", 60_000)
     pace = random_pace(np.random.default_rng(1), 100, 100, 5.0, 0.1)
     play = Play(pace, PlannerConfig(strategy="rotation", k_min=0))
     for _ in range(4):
         play.happen(Move(1, 1))
     row, col = play.grid.row_col(play.target)
     near = play.grid.cell(row + 9, col)
-    update = play.tree.force(pace, [near])
+    update = play.tree.force([near])
     assert update.kind == "forced"
     assert update.wants_full
     assert update.window.contains(row + 9, col)
-    assert play.tree.force(pace, [9999]).kind == "none"
+    assert play.tree.force([9999]).kind == "none"
     play.check()

@@ -155,7 +155,7 @@ def test_routes_end_at_the_target_over_passable_cells_and_cost_what_they_say(see
     root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
     tree.update(pace, root, [], 0)
-    routes = tree.routes(pace, np.arange(pace.size))
+    routes = tree.routes(np.arange(pace.size))
     ways = [route for route in routes if route.status is RouteStatus.OK]
     assert len(ways) > 100
     for route in ways:
@@ -177,7 +177,7 @@ def test_a_part_of_a_route_says_what_is_left_of_it():
     pace = np.full((5, 30), 0.1, np.float32)
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
     tree.update(pace, 2 * 30 + 29, [], 0)
-    whole, part = tree.routes(pace, [60], 0)[0], tree.routes(pace, [60], 7)[0]
+    whole, part = tree.routes([60], 0)[0], tree.routes([60], 7)[0]
     assert len(part.directions) == 7
     assert part.cost_s == pytest.approx(whole.cost_s)
     assert part.remaining_s == pytest.approx(whole.cost_s * 22 / 29)
@@ -202,7 +202,7 @@ def test_a_ridge_is_crossed_where_it_is_low_only_if_the_climb_is_worth_the_detou
     pace = np.full((31, 31), 0.1, np.float32)
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
     tree.update(pace, 20 * 31 + 30, [], 0)
-    cells = walk(climb.grid, 20 * 31, tree.routes(pace, [20 * 31])[0].directions)
+    cells = walk(climb.grid, 20 * 31, tree.routes([20 * 31])[0].directions)
     assert all(heights.reshape(-1)[cell] == 0 for cell in cells)
 
 
@@ -309,7 +309,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
         if set_out_s is None and not (motion.at_rest and motion.cell == start):
             set_out_s = (tick - 1) * 0.05
         if set_out_s is not None and motion.at_rest and motion.cell == target:
-            return tick * 0.05 - set_out_s, tree.routes(level, [start])[0].cost_s
+            return tick * 0.05 - set_out_s, tree.routes([start])[0].cost_s
         asks = agent.decide(now_ns)
         agent.rights.speak()
         for asked in asks:
@@ -317,7 +317,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
                 agent.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))
                 agent.costs_ended(asked.request, now_ns)
             elif isinstance(asked, AskRoutes):
-                routes = tree.routes(level, asked.cells)
+                routes = tree.routes(asked.cells)
                 reply = RouteReply(
                     target="t",
                     incarnation=1,

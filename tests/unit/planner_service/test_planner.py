@@ -11,22 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from planner_service.events import (
-    Action,
-    AnswerCosts,
-    AnswerRoutes,
-    CostsAsked,
-    FleetHeard,
-    GrowTree,
-    PoseHeard,
-    Push,
-    RoutesAsked,
-    Tell,
-    TreeGrown,
-)
 from planner_service.followers import route_cells
-from planner_service.planner import FOLLOWER_LEASE_NS, Planner
-from planner_service.target_tree import GrownTree, TargetTree, Update
+from planner_service.full_growth import GrownTree
+from planner_service.planner import FOLLOWER_LEASE_NS, Action, GrowTree, Planner
+from planner_service.target_tree import TargetTree, Update
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -34,7 +22,14 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import column, pack_column
-from swarm.wire.messages.planning import CostRequest, RouteReply, RouteRequest
+from swarm.wire.messages.planning import (
+    CostReply,
+    CostRequest,
+    PlannerStatus,
+    PushedRoute,
+    RouteReply,
+    RouteRequest,
+)
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
@@ -81,11 +76,11 @@ class ScriptedTree(TargetTree):
         self.last_gaps = self.gaps
         return self._answer(target_cell, map_version, Update("full", GRID.window, GRID.cells))
 
-    def force(self, pace: NDArray[np.float32], cells: Any) -> Update:
+    def force(self, cells: Any) -> Update:
         self.calls.append(("force", list(cells)))
         return Update("forced", GRID.window, len(cells))
 
-    def routes(self, pace: NDArray[np.float32], cells: Any, max_cells: int = 0) -> RouteBatch:
+    def routes(self, cells: Any, max_cells: int = 0) -> RouteBatch:
         return RouteBatch.of([self._route(int(cell), max_cells) for cell in cells])
 
     def cost_to_go_at(self, cells: Any) -> NDArray[np.float32]:
@@ -153,7 +148,7 @@ class World:
             newest_mark_ns=self._newest,
         )
         self.now_ns = 0
-        self.told: list[Tell] = []
+        self.told: list[PlannerStatus] = []
 
     def _newest(self) -> int | None:
         stamp_ns, self.newest_mark_ns = self.newest_mark_ns, None
@@ -161,7 +156,7 @@ class World:
 
     def pose(self, row: int, col: int, seq: int = 1, incarnation: int = 1) -> None:
         cell = GRID.cell(row, col)
-        assert self.planner.handle(PoseHeard(pose(cell, seq, incarnation)), self.now_ns) == []
+        self.planner.hear_pose(pose(cell, seq, incarnation))
 
     def mark(self, *cells: int, stamp_ns: int | None = None) -> None:
         kinds = np.full(len(cells), MarkKind.LETHAL, np.uint8)
@@ -172,24 +167,23 @@ class World:
         """All that a tick brings, but for the status twice a second."""
         self.now_ns += TICK
         actions = self.planner.tick(self.now_ns)
-        self.told.extend(action for action in actions if isinstance(action, Tell))
-        return [action for action in actions if not isinstance(action, Tell)]
+        self.told.extend(action for action in actions if isinstance(action, PlannerStatus))
+        return [action for action in actions if not isinstance(action, PlannerStatus)]
 
     def ask(self, *cells: int, **fields: Any) -> RouteReply:
         request = RouteRequest(cells=list(cells), **fields)
-        (answer,) = self.planner.handle(RoutesAsked(3, request), self.now_ns)
-        assert isinstance(answer, AnswerRoutes)
-        assert answer.ask == 3
-        return answer.reply
+        reply = self.planner.answer(request, self.now_ns)
+        assert isinstance(reply, RouteReply)
+        return reply
 
     def fleet(self, *vehicles: tuple[str, int, str | None], stamp_ns: int | None = None) -> None:
         report = fleet(*vehicles, stamp_ns=self.now_ns if stamp_ns is None else stamp_ns)
-        assert self.planner.handle(FleetHeard(report), self.now_ns) == []
+        self.planner.hear_fleet(report, self.now_ns)
 
     def grow(self, action: Action, took_ns: int = 5_000_000) -> list[Action]:
         """Do a growth that was asked for."""
         assert isinstance(action, GrowTree)
-        return self.planner.handle(TreeGrown(self.planner.growth(action)(), took_ns), self.now_ns)
+        return self.planner.adopt(action.job(), took_ns, self.now_ns)
 
 
 def pose(cell: int, seq: int = 1, incarnation: int = 1, target: str = "t0") -> TargetPose:
@@ -269,7 +263,7 @@ def test_the_newest_pose_wins_in_whatever_order_poses_arrive(order: list[tuple[i
 
 
 def test_the_pose_of_another_target_is_not_ours(world: World) -> None:
-    world.planner.handle(PoseHeard(pose(5, target="t1")), 0)
+    world.planner.hear_pose(pose(5, target="t1"))
     assert world.tick() == []
     assert world.planner.status(0).target_cell is None
 
@@ -287,7 +281,9 @@ def test_a_full_growth_is_handed_to_the_worker_with_its_snapshot_and_version(wor
     world.pose(10, 20)
     world.mark(5)
     world.tree.answers = [Update("none", wants_full=True)]
-    assert world.tick() == [GrowTree(GRID.cell(10, 20), 1)]
+    (grow,) = world.tick()
+    assert isinstance(grow, GrowTree)
+    assert world.tree.named("full_job") == [("full_job", GRID.cell(10, 20), 1)]
     assert world.tick() == []
     assert not world.tree.ready
 
@@ -307,13 +303,13 @@ def test_marks_seen_while_growing_cost_one_more_tree_not_one_each(ready: World) 
     ready.tree.answers = [Update("none", wants_full=True)] * 4
     ready.mark(1)
     (grow,) = ready.tick()
-    job = ready.planner.growth(grow)  # type: ignore[arg-type]
+    assert isinstance(grow, GrowTree)
     for cell in (10, 20, 29):
         ready.mark(cell)
         assert ready.tick() == []
     ready.tree.answers = [Update("full", GRID.window, 600, wants_full=True)]
-    again = ready.planner.handle(TreeGrown(job(), 1), ready.now_ns)
-    assert again == [GrowTree(GRID.cell(10, 20), 4)]
+    again = ready.planner.adopt(grow.job(), 1, ready.now_ns)
+    assert ready.tree.named("full_job")[1:] == [("full_job", GRID.cell(10, 20), 4)]
     assert ready.grow(again[0]) == []
     assert ready.tick() == []
     assert len(ready.tree.named("full_job")) == 2
@@ -323,12 +319,12 @@ def test_adoption_is_told_all_that_changed_since_the_snapshot_and_only_that(read
     ready.tree.answers = [Update("none", wants_full=True), Update("repair", Window(0, 0, 3, 3), 9)]
     ready.mark(0)
     (grow,) = ready.tick()
-    job = ready.planner.growth(grow)  # type: ignore[arg-type]
+    assert isinstance(grow, GrowTree)
     ready.mark(GRID.cell(5, 5))
     ready.tick()
     ready.mark(GRID.cell(15, 15))
     ready.pose(11, 20, seq=2)
-    ready.planner.handle(TreeGrown(job(), 1), ready.now_ns)
+    ready.planner.adopt(grow.job(), 1, ready.now_ns)
     windows = [Window(5, 5, 6, 6), Window(15, 15, 16, 16)]
     assert ready.tree.named("adopt") == [("adopt", 1, GRID.cell(11, 20), windows, 3)]
     ready.tree.calls.clear()
@@ -336,9 +332,14 @@ def test_adoption_is_told_all_that_changed_since_the_snapshot_and_only_that(read
     assert ready.tree.calls == []
 
 
-def test_a_growth_of_another_map_than_it_was_decided_on_is_a_bug(ready: World) -> None:
-    with pytest.raises(RuntimeError, match="decided on map 5, the map is at 0"):
-        ready.planner.growth(GrowTree(3, 5))
+def test_a_growth_is_of_the_map_that_it_was_decided_on_whatever_changes_before_it_runs(ready: World) -> None:
+    ready.tree.answers = [Update("none", wants_full=True)]
+    ready.mark(1)
+    (grow,) = ready.tick()
+    ready.mark(2)
+    assert isinstance(grow, GrowTree)
+    assert grow.job().map_version == 1
+    assert ready.map.version == 2
 
 
 @settings(deadline=None)
@@ -348,7 +349,7 @@ def test_whatever_happens_the_tree_ends_up_with_the_newest_pose_and_map(chance: 
     jobs: list[Callable[[], GrownTree]] = []
 
     def take(actions: list[Action]) -> None:
-        jobs.extend(world.planner.growth(action) for action in actions if isinstance(action, GrowTree))
+        jobs.extend(action.job for action in actions if isinstance(action, GrowTree))
 
     for seq in range(1, 30):
         world.tree.answers = [Update("full", GRID.window, 1, wants_full=chance.random() < 0.4)]
@@ -360,13 +361,13 @@ def test_whatever_happens_the_tree_ends_up_with_the_newest_pose_and_map(chance: 
             case 2:
                 take(world.tick())
             case 3 if jobs:
-                take(world.planner.handle(TreeGrown(jobs.pop()(), 1), world.now_ns))
+                take(world.planner.adopt(jobs.pop()(), 1, world.now_ns))
         assert len(jobs) <= 1
     world.pose(3, 4, 100)
     world.tree.answers = []
     take(world.tick())
     while jobs:
-        take(world.planner.handle(TreeGrown(jobs.pop()(), 1), world.now_ns))
+        take(world.planner.adopt(jobs.pop()(), 1, world.now_ns))
     assert world.tree.target_cell == GRID.cell(3, 4)
     assert world.tree.map_version == world.map.version
     assert world.map.take_dirty() == []
@@ -385,10 +386,9 @@ def test_outside_is_a_status(ready: World) -> None:
 
 
 def test_costs_come_as_a_column_with_inf_outside(ready: World) -> None:
-    (answer,) = ready.planner.handle(CostsAsked(4, CostRequest(cells=[3, GRID.cells])), ready.now_ns)
-    assert isinstance(answer, AnswerCosts)
-    assert answer.ask == 4
-    assert column(answer.reply.cost_to_go_s, "<f4").tolist() == [3.0, math.inf]
+    reply = ready.planner.answer(CostRequest(cells=[3, GRID.cells]), ready.now_ns)
+    assert isinstance(reply, CostReply)
+    assert column(reply.cost_to_go_s, "<f4").tolist() == [3.0, math.inf]
 
 
 def test_asking_again_gives_the_same_answer(ready: World) -> None:
@@ -425,9 +425,9 @@ def test_a_follower_inside_the_updated_window_is_pushed_a_newer_route(ready: Wor
     ready.tree.answers = [Update("window", Window(8, 0, 12, 30), 100)]
     ready.pose(11, 20, seq=2)
     (push,) = ready.tick()
-    assert isinstance(push, Push)
-    assert (push.pushed.vehicle, push.pushed.target, push.pushed.incarnation) == ("near", "t0", 7)
-    assert walk(GRID, push.pushed.route.start, push.pushed.route.directions)[-1] == GRID.cell(11, 20)
+    assert isinstance(push, PushedRoute)
+    assert (push.vehicle, push.target, push.incarnation) == ("near", "t0", 7)
+    assert walk(GRID, push.route.start, push.route.directions)[-1] == GRID.cell(11, 20)
 
 
 def test_a_follower_whose_route_a_map_change_crosses_is_pushed_a_newer_route(ready: World) -> None:
@@ -446,9 +446,9 @@ def test_a_follower_whose_route_a_map_change_crosses_is_pushed_a_newer_route(rea
     ready.tree.answers = [Update("repair", Window(9, 12, 12, 13), 3)]
     ready.mark(GRID.cell(9, 12))
     (push,) = ready.tick()
-    assert isinstance(push, Push)
-    assert push.pushed.vehicle == "crossed"
-    assert push.pushed.route.start == GRID.cell(11, 6)
+    assert isinstance(push, PushedRoute)
+    assert push.vehicle == "crossed"
+    assert push.route.start == GRID.cell(11, 6)
 
 
 def test_routes_are_pushed_to_a_vehicle_at_most_every_push_s(ready: World) -> None:
@@ -456,7 +456,7 @@ def test_routes_are_pushed_to_a_vehicle_at_most_every_push_s(ready: World) -> No
     pushed_ns: list[int] = []
     for seq in range(2, 42):
         ready.pose(10 + seq % 2, 20, seq)
-        pushed_ns += [ready.now_ns for action in ready.tick() if isinstance(action, Push)]
+        pushed_ns += [ready.now_ns for action in ready.tick() if isinstance(action, PushedRoute)]
     assert len(pushed_ns) >= 2
     assert all(np.diff([0, *pushed_ns]) >= NS_PER_S)
 
@@ -504,8 +504,8 @@ def test_after_a_restart_those_who_report_to_follow_are_pushed_routes_without_as
     world.fleet(("v", GRID.cell(10, 0), "t0"))
     world.pose(10, 20)
     (push,) = world.tick()
-    assert isinstance(push, Push)
-    assert push.pushed.vehicle == "v"
+    assert isinstance(push, PushedRoute)
+    assert push.vehicle == "v"
 
 
 def test_a_mark_is_timed_from_its_stamp_to_the_tree_that_knows_it(ready: World) -> None:
@@ -576,7 +576,7 @@ def test_the_status_is_told_twice_a_second(ready: World) -> None:
     for _ in range(20):
         ready.tick()
     assert len(ready.told) == 4
-    status = ready.told[-1].status
+    status = ready.told[-1]
     assert (status.target, status.target_cell, status.growths, status.window) == (
         "t0",
         GRID.cell(10, 20),

@@ -13,7 +13,6 @@ from support.memory_world import MemoryWorld
 from support.slow_twins import cost_to_go
 
 from launch_scripts.world.targets import TargetsService
-from planner_service.events import AnswerRoutes, PoseHeard, RoutesAsked
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.service import PlannerService
 from planner_service.target_tree import TargetTree
@@ -458,16 +457,16 @@ def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
         pace[row + 1, 199 if row % 4 == 0 else 0] = 0.1
     tree = TargetTree(GridSpec(200, 200, RES), PlannerConfig())
     planner = Planner("t", 1, PlannerConfig(), tree, CostMap(terrain_of_pace(pace, RES)), Counters())
-    planner.handle(PoseHeard(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0)), 0)
+    planner.hear_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0))
     planner.tick(0)
-    (whole,) = planner.handle(RoutesAsked(1, RouteRequest(cells=[198 * 200])), 0)
-    assert isinstance(whole, AnswerRoutes)
-    assert len(whole.reply.routes[0].directions) > 20_000
-    assert whole.reply.routes[0].remaining_s == 0
-    (answer,) = planner.handle(RoutesAsked(2, RouteRequest(cells=[198 * 200] * MOST_ROUTES)), 0)
-    assert isinstance(answer, AnswerRoutes)
-    assert all(route.remaining_s > 0 for route in answer.reply.routes)
-    assert len(encode(answer.reply)) < MAX_PAYLOAD_BYTES
+    whole = planner.answer(RouteRequest(cells=[198 * 200]), 0)
+    assert isinstance(whole, RouteReply)
+    assert len(whole.routes[0].directions) > 20_000
+    assert whole.routes[0].remaining_s == 0
+    reply = planner.answer(RouteRequest(cells=[198 * 200] * MOST_ROUTES), 0)
+    assert isinstance(reply, RouteReply)
+    assert all(route.remaining_s > 0 for route in reply.routes)
+    assert len(encode(reply)) < MAX_PAYLOAD_BYTES
 
 
 def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
@@ -481,11 +480,11 @@ def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
     def stand(col: int, seq: int, now_ns: int) -> None:
         cell = GRID.cell(20, col)
         pose = TargetPose(target="t", incarnation=1, seq=seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
-        planner.handle(PoseHeard(pose), now_ns)
+        planner.hear_pose(pose)
         planner.tick(now_ns)
 
     stand(20, 1, 0)
-    planner.handle(RoutesAsked(1, RouteRequest(cells=[GRID.cell(20, 0)], vehicles=["v"])), 0)
+    planner.answer(RouteRequest(cells=[GRID.cell(20, 0)], vehicles=["v"]), 0)
     stand(30, 2, NS_PER_S)
     assert counters.histograms["held_gap_excess"].quantile(1.0) == pytest.approx(0.0, abs=1e-6)
     stand(10, 3, 2 * NS_PER_S)
