@@ -50,11 +50,16 @@ class Rungs:
 
 
 def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:
-    """The paper's variable range: the largest k >= k_min whose block index of 2**k cells changed between two cells
-    gives a window that reaches 2**(k+1) cells to every side; if none did, the one of k_min. At least twice as far
-    as the move was long, so that the window holds both cells and some room around them."""
+    """How far, in cells, the window of variable range reaches to every side (section 3.3.2).
+
+    With the largest k >= k_min of which the target crossed the border of a block of 2**k cells the window is
+    2**(k+2) + 1 cells wide, without any 2**(k_min+1) + 1 as in figure 3: 9 cells with k_min = 2. The printed rule
+    asks that row and column cross at once, which a move along an axis never does; here either is enough. At least
+    twice as far as the move was long, so that the window holds both cells and some room around them.
+    """
     row, col = grid.row_col(new)
     old_row, old_col = grid.row_col(old)
-    # Of numbers that differ, the highest bit in which they do is the largest block that has changed.
-    k = max(k_min, ((row ^ old_row) | (col ^ old_col)).bit_length() - 1)
-    return max(2 << k, 2 * grid.distance_cells(old, new))
+    # Of numbers that differ, the highest bit in which they do is the largest block whose border was crossed.
+    k = ((row ^ old_row) | (col ^ old_col)).bit_length() - 1
+    half = 2 << k if k >= k_min else 1 << k_min
+    return max(half, 2 * grid.distance_cells(old, new))

@@ -178,7 +178,8 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
 
     edge           octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
     length_weight  lambda of the paper's length-aware key, seconds per metre
-    k_min          smallest block exponent: the paper's windows are 2**(k+2)+1 cells wide, others twice as wide
+    k_min          smallest block exponent, as in the paper: the narrowest window of variable range is
+                   2**(k_min+1) + 1 cells wide; that of the other strategies 2**(k_min+3) + 1
     full_every     rotation: a full growth every so many moves, on small maps sooner
     cpu_budget     auto: share of one core that this planner may use
     max_gap        rotation, auto: a served route whose certified gap exceeds this asks for a full growth

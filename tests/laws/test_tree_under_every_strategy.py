@@ -160,15 +160,22 @@ def printed_half(grid: GridSpec, old: int, new: int) -> int:
     """The paper's rule as it is printed: a block must be crossed in row and column at once."""
     (row, col), (old_row, old_col) = grid.row_col(new), grid.row_col(old)
     crossed = [k for k in range(1, 10) if row >> k != old_row >> k and col >> k != old_col >> k]
-    return 2 << max(crossed, default=1)
+    return 2 << max(crossed) if crossed else 1 << 1
 
 
 def test_the_printed_rule_never_widens_for_a_move_along_an_axis() -> None:
     grid = GridSpec(512, 512, 1.0)
     old, new = grid.cell(256, 255), grid.cell(256, 256)
-    assert printed_half(grid, old, new) == 4
+    assert printed_half(grid, old, new) == 2
     assert block_half(grid, old, new, 1) == 512
     assert printed_half(grid, grid.cell(255, 255), new) == 512
+
+
+def test_the_windows_of_variable_range_are_as_wide_as_in_the_papers_figure_3() -> None:
+    """k_min = 2: 9 cells with every move, 17 from one block of 4 to the next, 33 from one of 8 to the next."""
+    grid = GridSpec(64, 64, 1.0)
+    widths = [2 * block_half(grid, grid.cell(33, col - 1), grid.cell(33, col), 2) + 1 for col in range(33, 49)]
+    assert widths == [9, 9, 9, 17, 9, 9, 9, 33, 9, 9, 9, 17, 9, 9, 9, 65]
 
 
 @pytest.mark.parametrize("outside", [-1, 10**6])

@@ -1,0 +1,110 @@
+"""Planning without a network: from an array of paces to routes with their certificates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.target_tree import TargetTree
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec, Window, walk
+from swarm.wire.routes import Route, RouteStatus
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundRoute:
+    """A route from a cell to the target, or why there is none.
+
+    status         RouteStatus: "ok", or "unreachable", "outside", "lethal-start", "no-target"
+    cells          int64 (steps + 1, 2), row and col of every cell from the start to the target; the start alone
+                   where there is no route
+    cost_s         s, what driving it takes; inf where there is no route
+    lower_bound_s  s, proven: no route from there to the target takes less
+    length_m       m
+    """
+
+    status: RouteStatus
+    cells: NDArray[np.int64]
+    cost_s: float
+    lower_bound_s: float
+    length_m: float
+
+    @property
+    def gap(self) -> float:
+        """Cost over proven lower bound: 1 is proven to be optimal, 1.05 is at most 5 % above the optimum."""
+        return max(self.cost_s / self.lower_bound_s, 1.0) if self.lower_bound_s > 0 else np.inf
+
+
+class RouteFinder:
+    """Cheapest routes from everywhere to one target, kept up with as the target moves and the map changes.
+
+    Parameters
+    ----------
+    pace : array_like (rows, cols), s/m
+        Seconds that a metre takes in each cell; inf is lethal. It is copied.
+    target : (row, col)
+        Where all routes lead. On a lethal cell there is no route; outside the grid raises OutsideGridError.
+    resolution_m : float
+        Side of a cell.
+    **settings
+        Fields of `PlannerConfig`, such as ``strategy`` (here "full" unless given), ``edge``, ``corner_cutting``.
+
+    Raises
+    ------
+    ValueError
+        On a pace that is NaN, zero or negative, or an array without two dimensions.
+    """
+
+    def __init__(self, pace: Any, target: tuple[int, int], *, resolution_m: float = 1.0, **settings: Any) -> None:
+        self._pace = np.array(pace, np.float32, order="C")
+        if self._pace.ndim != 2:
+            raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
+        self.grid = GridSpec(*self._pace.shape, resolution_m)
+        self._tree = TargetTree(self.grid, PlannerConfig(**{"strategy": "full", **settings}))
+        self._version = 0
+        self._target = self.grid.cell(*target)
+        self._update([])
+
+    def move(self, target: tuple[int, int]) -> None:
+        """The target is in another cell. Raises OutsideGridError, and changes nothing, outside the grid."""
+        self._target = self.grid.cell(*target)
+        self._update([])
+
+    def change(self, pace: Any, row: int = 0, col: int = 0) -> None:
+        """Overwrite paces: `pace` is a (height, width) block, whose upper left cell is (row, col).
+
+        Raises ValueError, and changes nothing, on a block that leaves the grid or a pace that is not positive.
+        """
+        block = np.atleast_2d(np.asarray(pace, np.float32))
+        window = Window(row, col, row + block.shape[0], col + block.shape[1])
+        if block.ndim != 2 or row < 0 or col < 0 or window.row1 > self.grid.rows or window.col1 > self.grid.cols:
+            raise ValueError(f"{window} is not inside {self.grid.rows} x {self.grid.cols} cells")
+        if not (block > 0).all():
+            raise ValueError("a pace is NaN, zero or negative; lethal is inf")
+        self._pace[row : window.row1, col : window.col1] = block
+        self._version += 1
+        self._update([window])
+
+    def route(self, row: int, col: int) -> FoundRoute:
+        """The cheapest route that is known from a cell, with its proven lower bound. Outside is a status."""
+        cell = self.grid.cell(row, col) if self.grid.inside(row, col) else -1
+        found: Route = self._tree.routes([cell])[0]
+        cells = np.array([(row, col)], np.int64)
+        if found.status is RouteStatus.OK:
+            cells = np.stack(np.divmod(np.array(walk(self.grid, cell, found.directions)), self.grid.cols), axis=1)
+        return FoundRoute(found.status, cells, found.cost_s, found.lower_bound_s, found.length_m)
+
+    def cost_to_go_s(self) -> NDArray[np.float32]:
+        """(rows, cols) float32, s: what driving to the target takes from every cell; inf where there is no way."""
+        costs: NDArray[np.float32] = self._tree.cost_to_go_at(np.arange(self.grid.cells))
+        return costs.reshape(self.grid.rows, self.grid.cols)
+
+    def _update(self, dirty: list[Window]) -> None:
+        tree, pace = self._tree, self._pace
+        update = tree.update(pace, self._target, dirty, self._version)
+        if update.wants_full:
+            grown = tree.full_job(pace, self._target, self._version)()
+            tree.adopt(grown, pace, self._target, [], self._version, [])

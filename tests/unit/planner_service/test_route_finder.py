@@ -1,0 +1,101 @@
+"""Planning without a network: the example of the docs, and that no cell, target or pace ends the interpreter."""
+
+from __future__ import annotations
+
+import doctest
+import math
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from support import slow_twins
+from support.planner_strategies import random_pace
+
+import planner_service
+from planner_service import RouteFinder
+from swarm.config.scenario import Strategy
+from swarm.errors import OutsideGridError
+from swarm.wire.routes import RouteStatus
+
+
+def test_the_example_does_what_it_says() -> None:
+    assert doctest.testmod(planner_service).failed == 0
+
+
+@pytest.mark.parametrize("strategy", get_args(Strategy))
+def test_routes_are_driven_as_they_say_and_their_bounds_hold_while_target_and_map_change(
+    strategy: Strategy,
+) -> None:
+    pace = random_pace(np.random.default_rng(5), 30, 40, 8.0, 0.15)
+    finder = RouteFinder(pace, target=(15, 10), resolution_m=5.0, strategy=strategy, k_min=0)
+    for col in range(11, 30):
+        finder.change([[1.0, 1.0]], row=15, col=col)
+        pace[15, col : col + 2] = 1.0
+        finder.move((15, col))
+        optimum = slow_twins.cost_to_go(pace, 15 * 40 + col) * 5.0
+        for row, start in ((0, 0), (29, 39), (15, 20), (3, 30)):
+            found = finder.route(row, start)
+            if found.status is RouteStatus.OK:
+                rows, cols = found.cells[1:].T
+                steps = np.hypot(*np.diff(found.cells, axis=0).T) * 5.0
+                assert found.cost_s == pytest.approx(float((pace[rows, cols] * steps).sum()), rel=1e-5)
+                assert found.length_m == pytest.approx(float(steps.sum()))
+                assert found.lower_bound_s <= optimum[row, start] * (1 + 1e-9)
+                assert found.gap >= 1.0
+            else:
+                assert math.isinf(optimum[row, start])
+
+
+def test_cost_to_go_is_that_of_an_independent_dijkstra() -> None:
+    pace = random_pace(np.random.default_rng(6), 20, 30, 8.0, 0.2)
+    target = np.argwhere(np.isfinite(pace))[50]
+    finder = RouteFinder(pace, target=(int(target[0]), int(target[1])))
+    expected = slow_twins.cost_to_go(pace, int(target[0]) * 30 + int(target[1]))
+    np.testing.assert_allclose(finder.cost_to_go_s(), expected, rtol=1e-5)
+
+
+def test_every_cell_has_an_answer_and_none_ends_the_interpreter() -> None:
+    pace = np.ones((6, 7), np.float32)
+    pace[2, 2] = np.inf
+    finder = RouteFinder(pace, target=(0, 0))
+    for row, col in ((-1, 0), (0, -1), (6, 0), (0, 7), (10**6, 10**9), (-(10**12), 3)):
+        found = finder.route(row, col)
+        assert (found.status, found.gap) == (RouteStatus.OUTSIDE, math.inf)
+        with pytest.raises(OutsideGridError, match="6 x 7"):
+            finder.move((row, col))
+    assert finder.route(2, 2).status is RouteStatus.LETHAL_START
+    assert finder.route(5, 6).status is RouteStatus.OK
+    finder.move((2, 2))
+    assert finder.route(5, 6).status is RouteStatus.NO_TARGET
+    assert np.isinf(finder.cost_to_go_s()).all()
+    finder.move((5, 5))
+    assert finder.route(5, 6).cost_s == 1.0
+
+
+@pytest.mark.parametrize(
+    ("pace", "complaint"),
+    [
+        (np.ones(4), "1 dimensions, expected 2"),
+        (np.full((3, 3), np.nan), "NaN, zero or negative"),
+        (np.zeros((3, 3)), "NaN, zero or negative"),
+        (np.empty((0, 3)), "at least one cell"),
+    ],
+)
+def test_a_pace_that_is_none_is_refused(pace: Any, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        RouteFinder(pace, target=(0, 0))
+
+
+def test_a_change_that_is_refused_changes_nothing() -> None:
+    finder = RouteFinder(np.ones((6, 7)), target=(0, 0))
+    before = finder.cost_to_go_s()
+    for block, row, col in (
+        ([[1.0]], 6, 0),
+        ([[1.0, 1.0]], 0, 6),
+        ([[np.nan]], 1, 1),
+        ([[0.0]], 1, 1),
+        ([[1]], -1, 0),
+    ):
+        with pytest.raises(ValueError, match=r"inside|NaN"):
+            finder.change(block, row, col)
+    np.testing.assert_array_equal(finder.cost_to_go_s(), before)
