@@ -62,7 +62,8 @@ class RouteFinder:
         self._pace = np.array(pace, np.float32, order="C")
         if self._pace.ndim != 2:
             raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
-        self.grid = GridSpec(*self._pace.shape, resolution_m)
+        rows, cols = self._pace.shape
+        self.grid = GridSpec(rows, cols, resolution_m)
         self._tree = TargetTree(self.grid, PlannerConfig(**{"strategy": "full", **settings}))
         self._version = 0
         self._target = self.grid.cell(*target)
