@@ -54,8 +54,8 @@ class Followers:
     """The followers of one target, at most `CAPACITY`, each on a cell of the grid.
 
     Registered by a request that names them, or by a report that they chase this target; dropped when they report
-    another target, when they have been silent for the lease, and, beyond the capacity, in the order in which they were
-    registered. A vehicle that reports registers itself again with its next report.
+    another target, when they have been silent for the lease, and, beyond the capacity, in the order in which they
+    were registered. A vehicle that reports registers itself again with its next report.
     """
 
     def __init__(self, target: str, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
