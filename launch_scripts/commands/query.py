@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -173,20 +174,33 @@ def status(
         bus.subscribe(STATS, inbox.post)
         bus.subscribe(STATUS, inbox.post)
         until_s = time.monotonic() + _STATUS_LISTEN_S
-        members = ask_run(bus)
+        found = ask_run(bus, routers=True)
         while (left_s := until_s - time.monotonic()) > 0:
             match inbox.take(left_s):
                 case Heard(message=Stats() as message):
                     stats[message.role, message.id] = message
                 case Heard(message=PlannerStatus() as message):
                     planners[message.target] = message
-    if not members:
+    runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
+    if not runs:
         raise BusError(f"nobody answers in namespace {namespace!r} at {connect}: is the swarm running?")
-    members.sort(key=lambda info: (info.role, info.id))
+    # The run is that of most; routers belong to none; whoever answers with another is a stranger.
+    run = runs.most_common(1)[0][0]
+    found.sort(key=lambda info: (info.role, info.id))
+    members = [info for info in found if (info.run_id, info.terrain) == run]
+    routers = [info for info in found if not info.run_id]
+    strangers = [info for info in found if info not in members and info not in routers]
     if as_json:
-        typer.echo(json.dumps(_status_fields(members, stats, planners), indent=2))
+        fields = _status_fields([*members, *routers], stats, planners)
+        fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
+        typer.echo(json.dumps(fields, indent=2))
     else:
-        _print_status(members, stats, planners)
+        _print_status([*members, *routers], stats, planners)
+        for info in strangers:
+            typer.secho(
+                f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}",
+                fg="yellow",
+            )
 
 
 def _status_fields(

@@ -28,7 +28,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, SwarmError
-from swarm.runtime.membership import check_same_run
+from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -205,8 +205,7 @@ class _Run:
         if found and self._options.run_id is None and not set(ROLES[1:]) <= set(self._options.roles):
             self._run_id = found[0].run_id
         mine = self._setup_of(ProcessSpec("launcher", "0", "")).info(self._terrain.grid, self._terrain.digest)
-        for other in found:
-            check_same_run(mine, other)
+        check_belongs(mine, found)
         for running in self._swarm.running:
             check_vacant(found, running.spec.role, running.spec.id)
 

@@ -9,6 +9,7 @@ from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Re
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.membership import NO_RUN
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo
@@ -81,8 +82,8 @@ class Watcher:
         self.notes.append(note)
 
 
-def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S) -> list[RunInfo]:
-    """Who is in the namespace, as everybody there answers."""
+def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:
+    """Who is in the namespace, as everybody there answers; with `routers` also those, which belong to no run."""
     inbox = Inbox()
     bus.ask(RUN, Nothing(), inbox.post, tag=_TAG, timeout_s=timeout_s)
     found: list[RunInfo] = []
@@ -90,7 +91,8 @@ def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S) -> list[RunInfo]:
     while time.monotonic() < deadline_s:
         match inbox.take(0.1):
             case Replied(message=RunInfo() as info):
-                found.append(info)
+                if routers or info.run_id != NO_RUN:
+                    found.append(info)
             case AskEnded():
                 break
     return found

@@ -40,6 +40,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig, Scenario, TlsConfig
 from swarm.errors import SwarmError
+from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
@@ -118,7 +119,7 @@ def run_child(side: str, role: str, id: str, folder: Path) -> None:
         bus = stack.enter_context(open_bus(network, mode="router" if role == "router" else "client"))
         service: RouterService | KeeperService | MapService
         if role == "router":
-            service = RouterService(setup.info(terrain.grid, terrain.digest), bus, inbox.post)
+            service = RouterService(Peer(role, setup.id, started_ns), bus, inbox.post)
         elif role == "keeper":
             store = stack.enter_context(KeeperStore(folder / f"{side}.sqlite"))
             service = KeeperService(setup, terrain, bus, inbox.post, store)

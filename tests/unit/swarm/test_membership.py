@@ -9,9 +9,9 @@ from support.memory_world import MemoryWorld
 from swarm.bus.bus import Event, Heard, LinkChanged
 from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
-from swarm.runtime.membership import Member, check_same_run
+from swarm.runtime.membership import NO_RUN, Member, check_same_run
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import NOTE, STATS
+from swarm.wire.topics import NOTE, RUN, STATS
 
 INFO = RunInfo(
     run_id="r1", role="planner", id="t0", incarnation=7, scenario="demo", terrain="aaaa", rows=4, cols=5,
@@ -140,3 +140,48 @@ def test_a_note_reaches_whoever_watches():
 
 def test_the_same_run_from_anywhere_is_the_same_run():
     check_same_run(INFO, msgspec.structs.replace(INFO, role="agent", id="a0", incarnation=9, started_ns=5))
+
+
+def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_stranger_is_named_once():
+    world, notes = MemoryWorld(), []
+    world.bus("watcher").subscribe(NOTE, notes.append)
+    nodes = [Node(world, id=id) for id in ("t0", "t1")]
+    for node in nodes:
+        node.member.join()
+        world.settle()
+    liar = Node(world, role="agent", id="zz", run_id="another", terrain="bbbb")
+    liar.bus.serve(RUN, liar.post, role="agent", id="zz")
+    for turn in range(3):
+        world.bus("r").declare_alive(Peer("router", "0", turn + 1))  # everybody asks anew
+        world.settle()
+        for node in nodes:
+            node.member.tick(world.scheduler.clock.now_ns())
+    world.settle()
+    assert [node.failure for node in nodes] == [None, None]
+    assert [node.member.counters.counts["strangers"] for node in nodes] == [1, 1]
+    assert sorted(event.message.id for event in notes) == ["t0", "t1"]
+    assert "belongs to run r1, but agent zz" in notes[0].message.text
+
+
+def test_a_process_that_starts_beside_a_stranger_joins_those_who_agree():
+    world = MemoryWorld()
+    first, liar = Node(world), Node(world, role="agent", id="zz", run_id="another")
+    first.member.join()
+    world.settle()
+    liar.bus.serve(RUN, liar.post, role="agent", id="zz")
+    late = Node(world, id="t1")
+    late.member.join()
+    world.settle()
+    assert late.failure is None
+
+
+def test_a_router_belongs_to_no_run_and_ends_nobody():
+    world = MemoryWorld()
+    router = Node(world, role="router", id="0", run_id=NO_RUN, terrain="", rows=0)
+    router.member.join()
+    world.settle()
+    runs = [Node(world, id="t0"), Node(world, id="t1")]
+    for node in runs:
+        node.member.join()
+        world.settle()
+    assert [node.failure for node in (router, *runs)] == [None] * 3
