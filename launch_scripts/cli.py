@@ -94,7 +94,7 @@ def demo(
 ) -> None:
     """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 18 processes.
 
-    The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/TIME/ with run.rrd,
+    The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
     report.json, report.png and a log file per process.
     """
     _up("jacksboro", seconds, seed, runs, port, no_live, plain, as_json)

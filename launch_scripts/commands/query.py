@@ -181,21 +181,20 @@ def status(
                     stats[message.role, message.id] = message
                 case Heard(message=PlannerStatus() as message):
                     planners[message.target] = message
-    runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
-    if not runs:
+    if not found:
         raise BusError(f"nobody answers in namespace {namespace!r} at {connect}: is the swarm running?")
     # The run is that of most; routers belong to none; whoever answers with another is a stranger.
-    run = runs.most_common(1)[0][0]
-    found.sort(key=lambda info: (info.role, info.id))
-    members = [info for info in found if (info.run_id, info.terrain) == run]
-    routers = [info for info in found if not info.run_id]
-    strangers = [info for info in found if info not in members and info not in routers]
+    runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
+    run = runs.most_common(1)[0][0] if runs else ("", "")
+    found.sort(key=lambda info: (not info.run_id, info.role, info.id))
+    strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
+    members = [info for info in found if info not in strangers]
     if as_json:
-        fields = _status_fields([*members, *routers], stats, planners)
+        fields = _status_fields(members, stats, planners)
         fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
         typer.echo(json.dumps(fields, indent=2))
     else:
-        _print_status([*members, *routers], stats, planners)
+        _print_status(members, stats, planners)
         for info in strangers:
             typer.secho(
                 f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}",
@@ -242,9 +241,11 @@ def _print_status(
 
     first = members[0]
     console = Console()
-    console.print(
-        f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells", highlight=False
-    )
+    if first.run_id:
+        run = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells"
+    else:
+        run = "no run yet: only routers answer"
+    console.print(run, highlight=False)
     now_ns = time.time_ns()
     crew = Table("process", "up s", "messages out", "in", "dropped", pad_edge=False)
     for info in members:

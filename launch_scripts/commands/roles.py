@@ -162,7 +162,7 @@ def _run(
     from launch_scripts.launcher.run_terrain import fetch_if_missing
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import ENTRIES, processes_of
-    from swarm.errors import ConfigError, StoreError
+    from swarm.errors import ConfigError
     from swarm.runtime.role import RoleSetup
 
     scenario = options.with_network(
@@ -186,18 +186,14 @@ def _run(
         found = _found(scenario.network)
         check_vacant(found, role, id)
         run_id = run_id or (found[0].run_id if found else None)
-    run_id = run_id or options.new_run_id()
-    run_dir = runs / run_id
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"cannot make {run_dir}: {error.strerror or error}") from error
+    run_id = run_id or options.common_run_id(scenario)
+    run_dir = options.make_run_dir(runs, run_id)
     if role != "router":
         with bars() as progress:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=progress)
     now_ns = time.time_ns()
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
-    setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir.resolve())
+    setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir)
     load_entry(ENTRIES[role])(setup, None, **(more or {}))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import errno
+import hashlib
 import secrets
 import socket
 import time
@@ -13,8 +14,9 @@ from pathlib import Path
 import msgspec
 
 from swarm.config.load import check_endpoint, load_scenario
-from swarm.config.scenario import NetworkConfig, Scenario, TlsConfig
+from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
+from swarm.wire.fields import check_id
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
@@ -141,17 +143,25 @@ def new_run_id() -> str:
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
 
 
-def make_run_dir(runs: Path, name: str) -> Path:
-    """A new folder for a run. Raises StoreError if it cannot be made."""
+def common_run_id(scenario: Scenario) -> str:
+    """Names the run that parts of a swarm belong to which are started on several machines, each by itself: the same
+    for the same scenario, wherever it meets."""
+    same = msgspec.structs.replace(scenario, network=NetworkConfig(), monitor=MonitorConfig())
+    digest = hashlib.blake2b(msgspec.json.encode(same, order="deterministic"), digest_size=4).hexdigest()
+    return f"{scenario.name}-{digest}"
+
+
+def make_run_dir(runs: Path, run_id: str) -> Path:
+    """The folder of a run on this machine: what belongs to the run, such as a keeper's store, is found there again
+    when its processes are started anew. Raises ConfigError on an id that no folder may have, StoreError where the
+    folder cannot be made."""
     try:
-        for suffix in ("", *(f"-{n}" for n in range(2, 100))):
-            run_dir = runs / f"{name}{suffix}"
-            try:
-                run_dir.mkdir(parents=True)
-                return run_dir.resolve()
-            except FileExistsError:
-                if not runs.is_dir():
-                    break
+        check_id("run id", run_id)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    run_dir = runs / run_id
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(f"cannot make a run folder in {runs}: {error.strerror or error}") from error
-    raise StoreError(f"cannot make a run folder in {runs}: it is no folder or holds this second's runs already")
+    return run_dir.resolve()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from launch_scripts.launcher.child import log_to
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
-from launch_scripts.launcher.options import check_ports, listening, make_run_dir, new_run_id
+from launch_scripts.launcher.options import check_ports, common_run_id, listening, make_run_dir, new_run_id
 from launch_scripts.launcher.progress import bars
 from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
 from launch_scripts.launcher.terminal import Screen
@@ -47,7 +47,7 @@ class UpOptions:
     """What a user chose.
 
     joins      there is a router elsewhere: none is started here
-    run_id     the run to take part in; if None, a new one, or that of the namespace where only `roles` are started
+    run_id     the run to take part in; if None it is made or found
     began_s    time.monotonic() at which the command was given
     table      other processes than the scenario's
     """
@@ -94,20 +94,35 @@ def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     if not options.joins:
         check_ports(options.scenario, options.roles)
-    run_dir = make_run_dir(options.runs, time.strftime("%Y%m%d-%H%M%S"))
+    run_id = _run_id(options)
+    run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / "launcher.log")
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
-    return _Run(options, run_dir).run()
+    return _Run(options, run_id, run_dir).run()
+
+
+def _run_id(options: UpOptions) -> str:
+    """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario."""
+    if options.run_id is not None:
+        return options.run_id
+    if set(ROLES[1:]) <= set(options.roles):
+        return new_run_id()
+    if options.joins:
+        with open_bus(options.scenario.network) as bus:
+            found = ask_run(bus)
+        if found:
+            return found[0].run_id
+    return common_run_id(options.scenario)
 
 
 class _Run:
     """The run in hand, all of it on the main thread."""
 
-    def __init__(self, options: UpOptions, run_dir: Path) -> None:
+    def __init__(self, options: UpOptions, run_id: str, run_dir: Path) -> None:
         self._options = options
         self._scenario = options.scenario
         self._run_dir = run_dir
-        self._run_id = options.run_id or new_run_id()
+        self._run_id = run_id
         self._started_ns = time.time_ns()
         self._screen = Screen(options.as_json, options.plain)
         self._stop_asked = _StopAsked()
@@ -198,12 +213,10 @@ class _Run:
         return False
 
     def _join(self, bus: Bus) -> None:
-        """Refuse to share a namespace with another run; a part of a swarm belongs to the run that it finds."""
+        """Refuse to share a namespace with another run, or to start a process that runs already."""
         if not self._options.joins:
             return
         found = ask_run(bus)
-        if found and self._options.run_id is None and not set(ROLES[1:]) <= set(self._options.roles):
-            self._run_id = found[0].run_id
         mine = self._setup_of(ProcessSpec("launcher", "0", "")).info(self._terrain.grid, self._terrain.digest)
         check_belongs(mine, found)
         for running in self._swarm.running:

@@ -58,12 +58,16 @@ def hands(tmp_path: Path) -> Iterator[Hands]:
 
 def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) -> None:
     scenario = (str(hands.path),)
-    hands.start("router", *scenario, "--run-id", "by-hand")
+    hands.start("router", *scenario)
     eventually(lambda: swarm("status", "--connect", hands.network.connect[0]).returncode == 0, 30, "the router")
-    for role in (("keeper",), ("targets",), ("planner", "--target", "t0")):
+    hands.start("keeper", *scenario, "--run-id", "by-hand")
+    eventually(lambda: ("keeper", "0", "by-hand") in hands.members(), 60, "the keeper")
+    for role in (("targets",), ("planner", "--target", "t0")):
         hands.start(*role, *scenario)
     eventually(lambda: len(hands.members()) == 4, 60, "all four")
-    assert {run_id for _, _, run_id in hands.members()} == {"by-hand"}
+    assert {(role, run_id) for role, _, run_id in hands.members()} == {
+        ("router", ""), ("keeper", "by-hand"), ("targets", "by-hand"), ("planner", "by-hand"),
+    }  # fmt: skip
 
     def is_served() -> bool:
         with client(hands.network) as bus:
