@@ -25,11 +25,10 @@ from swarm.wire.codec import (
     decode,
     decode_either,
     decode_many,
-    decode_parameters,
     encode,
-    encode_readable,
 )
 from swarm.wire.messages.base import Message
+from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic
 
 log = logging.getLogger(__name__)
