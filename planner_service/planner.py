@@ -43,6 +43,8 @@ from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2
+MAX_GAP = 1.5
+"""A served route whose certified gap (cost over proven bound) exceeds this asks for a full growth."""
 MOST_ROUTES = 20_000
 MOST_STEPS = 4 << 20
 """In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
@@ -285,7 +287,7 @@ class Planner:
         """Too wide a proven gap asks for a full growth, now and then; the paper's strategies know no such thing."""
         widest = self._gaps.certify(routes)
         forces = self._config.strategy in ("rotation", "auto")
-        if forces and widest > self._config.max_gap and now_ns >= self._full_due_ns:
+        if forces and widest > MAX_GAP and now_ns >= self._full_due_ns:
             self._full_due_ns = now_ns + self._push_ns
             self._wants_full = True
 
