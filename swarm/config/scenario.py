@@ -1,8 +1,8 @@
 """A scenario: frozen settings, read once from a TOML file and handed down by section.
 
 Every setting is declared here: its unit in its name, its range in its type, its meaning as one row of its section's
-docstring (`swarm.config.describe` reads the rows). A wrong key, type or value is rejected with the file, the key, what
-was found and what is allowed.
+docstring (`swarm.config.describe` reads the rows). A wrong key, type or value is rejected with the file, the key,
+what was found and what is allowed.
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ class MapConfig(Section, frozen=True, kw_only=True):
                         only. Planners, keepers and the monitor hold all
     interest_m          near: distance up to which an agent holds marks around its vehicles
     digest_s            every replica publishes this often which sets it holds
-    author_marks_per_s  an author that changes more cells than this for ten seconds is named and its sets are delayed
+    author_marks_per_s  an author which changes more cells than this for ten seconds is named, its sets delayed
     total_marks_per_s   the same of all authors together: the sets of those above an equal share of it are delayed
     fold_after_s        an author of whom a keeper has heard nothing for so long is taken for dead, and what it said
                         is folded with what other dead authors said; longer than a partition is likely to last

@@ -4,16 +4,6 @@ from __future__ import annotations
 
 import msgspec
 
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
-
 WIRE_VERSION = 2
 
 

@@ -8,16 +8,7 @@ import msgspec
 
 from swarm.grid import GridSpec
 from swarm.wire.fields import GridSide, Metres, Natural, check_column, check_id
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
 
 
 class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):

@@ -83,7 +83,7 @@ def test_no_thread_meets_a_message_type_that_msgspec_has_not_finished_describing
     # description crashes the process. So each type is converted to once, on import.
     program = """
 import msgspec, msgspec._utils as utils
-from swarm import topics
+from swarm.wire import topics
 
 def describe(*_):
     raise SystemExit("described a struct after the import")
