@@ -8,9 +8,9 @@ Threads     No method but `close` waits for the network: what comes back is post
 Order       Samples of one publisher on one topic come in the order of their publishing, as do replies to one query
             from one process. Nothing else has an order: not two publishers, not two topics, not samples and
             replies.
-Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is congested or down, where nobody
-            subscribes, and where a reader falls behind by more than `Topic.buffer` samples (the oldest go). Queries
-            and replies are lost with their link. On the memory bus a sample may come twice or late.
+Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is congested or down, without
+            a subscriber, and where a reader falls behind by more than `Topic.buffer` samples (the oldest go).
+            Queries and replies are lost with their link. On the memory bus a sample may come twice or late.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
             logged once per key and minute, and never posted.
 Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the
@@ -70,7 +70,7 @@ class Asked:
         self.answerer.refuse(reason)
 
     def end(self) -> None:
-        """There are no more answers. A query that is never ended ends for the one who asked by its timeout."""
+        """There are no more answers. A query that is never ended ends by the timeout of `ask`."""
         self.answerer.end()
 
 
@@ -86,7 +86,7 @@ class Replied:
 
 @dataclass(frozen=True, slots=True)
 class AskEnded:
-    """No more replies to `tag`. No reply at all is normal (nobody serves it, link lost): ask again.
+    """No more replies to `tag`. No reply at all is normal (not served, link lost): ask again.
 
     replies  how many were posted
     failure  the last refusal, "timeout" if the time ran out; None if neither happened

@@ -1,4 +1,4 @@
-"""One query on the simulated network: who asked, who still has to answer, and how the answers travel."""
+"""One query on the simulated network: which queryables have not ended yet, and how their answers travel."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ _TOGETHER = 1024
 
 
 def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
-    """Open a session. Raises BusError with a sentence when it cannot listen or nobody answers.
+    """Open a session. Raises BusError when it cannot listen or no router answers.
 
     mode  "client" connects to `network.connect`; "router" listens on `network.listen` and passes messages on
     """

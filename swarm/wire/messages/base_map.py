@@ -12,7 +12,7 @@ from swarm.wire.messages.base import Message, schema_of
 
 
 class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
-    """What a keeper has of the run's terrain, for those who lack its files.
+    """What a keeper has of the run's terrain, for machines without its files.
 
     digests  layer -> 8 bytes per region (256 x 256 cells): BLAKE2b of its bytes, in order of region
     notes    sentences about where the terrain came from
@@ -49,7 +49,7 @@ class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map
 
 class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
     """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
-    row, then the next, as like bytes beside each other pack better."""
+    row, then the next. Similar bytes side by side compress better."""
 
     layer: str
     region: Natural

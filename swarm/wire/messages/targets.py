@@ -7,8 +7,12 @@ from swarm.wire.messages.base import Message, schema_of
 
 
 class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
-    """Where a target is. `seq` grows within an incarnation of whoever tracks it; `jumps` counts the times it
-    was put somewhere else, as after a capture."""
+    """Where a target is.
+
+    seq       grows within an incarnation of the process that tracks it
+    captures  how often it was captured
+    jumps     how often it was put somewhere else, as after a capture
+    """
 
     target: str
     incarnation: Natural
@@ -25,8 +29,8 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
 
 
 class Sighted(Message, frozen=True, kw_only=True, tag=schema_of("sighted")):
-    """A target-sighted mark: where a vehicle of this author saw a target, within `uncertainty_m` of the place. It
-    says nothing about the ground, ends by itself, and the author's next about this target replaces it."""
+    """A sighting: a vehicle of this author saw a target within `uncertainty_m` of the place. It expires at
+    `until_ns`, and the author's next sighting of the target replaces it."""
 
     author: str
     group: str
