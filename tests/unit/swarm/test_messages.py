@@ -1,4 +1,4 @@
-"""The wire: every message survives the trip, and no payload at all gets past the door untyped."""
+"""The wire: every message is decoded as it was encoded, and no payload at all becomes anything but a message."""
 
 from __future__ import annotations
 
