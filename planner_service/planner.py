@@ -31,6 +31,8 @@ from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2
+MAX_GAP = 1.5
+"""A served route whose certified gap (cost over proven bound) exceeds this asks for a full growth."""
 MOST_ROUTES = 20_000
 MOST_STEPS = 4 << 20
 """In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
@@ -289,7 +291,7 @@ class Planner:
     def _certify(self, routes: RouteBatch, now_ns: int) -> None:
         """Note the proven gaps; one that is too wide asks for a full growth, now and then, if the strategy does."""
         widest = self._gaps.certify(routes)
-        loose = widest > self._config.max_gap and self.tree.strategy.renews_loose_bounds
+        loose = widest > MAX_GAP and self.tree.strategy.renews_loose_bounds
         if loose and now_ns >= self._full_due_ns:
             self._full_due_ns = now_ns + self._push_ns
             self._wants_full = True

@@ -397,9 +397,7 @@ class Agent:
             costs = {target: float(column[index]) for target, column in self._costs.items()}
             given_up = vehicle.planner_gone and not vehicle.route.left
             given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
-            choice = choose(
-                costs, self.targets, self._planners, vehicle.target, self._config.hysteresis, not given_up
-            )
+            choice = choose(costs, self.targets, self._planners, vehicle.target, not given_up)
             if choice.target is not None:
                 vehicle.handle(Assigned(choice.target), now_ns)
                 if vehicle.target not in self._planners and not vehicle.planner_gone:

@@ -20,19 +20,22 @@ class Choice:
 UNSETTLED = Choice(None, settled=False)
 
 
+HYSTERESIS = 0.15
+"""Another target must be cheaper than the current one by this share, so that vehicles do not turn round at every
+change of the map."""
+
+
 def choose(
     costs_s: Mapping[str, float],
     allowed: Sequence[str],
     alive: Mapping[str, int],
     current: str | None,
-    hysteresis: float,
     keep_silent: bool,
 ) -> Choice:
     """The cheapest of a vehicle's targets.
 
     costs_s      per target that answered, inf where there is no way
     alive        targets whose planner is there
-    hysteresis   another target must be cheaper than the current one by this share
     keep_silent  stay with a current target whose planner has not answered
     """
     if current is not None and current not in costs_s and (keep_silent or current in alive):
@@ -46,6 +49,6 @@ def choose(
         answered = [target for target in allowed if target in costs_s]
         silent = [target for target in allowed if target in alive and target not in costs_s]
         return Choice(None) if answered and not silent else UNSETTLED
-    if current is not None and best_s > (1.0 - hysteresis) * costs_s.get(current, math.inf):
+    if current is not None and best_s > (1.0 - HYSTERESIS) * costs_s.get(current, math.inf):
         return Choice(current)
     return Choice(best)

@@ -87,7 +87,6 @@ class AgentService:
             self._cost_map,
             author=self._author,
             group=group,
-            publish_hz=scenario.map.publish_hz,
             reading=Reading(grid, readable_groups(scenario, group)),
         )
         near = scenario.map.interest == "near"
@@ -114,7 +113,6 @@ class AgentService:
             self._author,
             group,
             scenario.vehicles.sense_range_m,
-            scenario.vehicles.sighting_lasts_s,
         )
         self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation, self._presence, self._ground)
         self._fleet = FleetReport(grid, self._author, group)

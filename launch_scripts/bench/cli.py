@@ -355,8 +355,8 @@ def terrain(
 @app.command()
 def wire(
     parts: Annotated[
-        str, typer.Option(help="latency, flood, join, route, positions, replica; several with commas.")
-    ] = "latency,flood,join,route,positions,replica",
+        str, typer.Option(help="latency, flood, join, route, positions, replica, codec; several with commas.")
+    ] = "latency,flood,join,route,positions,replica,codec",
     marks: Annotated[int, typer.Option(min=10, help="latency: marks, and as many raw puts.")] = 400,
     sets: Annotated[int, typer.Option(min=100, help="flood: sets in a round.")] = 20_000,
     rounds: Annotated[int, typer.Option(min=1, help="flood: rounds of ours and raw, in turn.")] = 3,

@@ -66,8 +66,8 @@ def route(
     from swarm.bus.zenoh_bus import open_bus
     from swarm.errors import BusError, ConfigError
     from swarm.runtime.inbox import Inbox
-    from swarm.wire.codec import encode_readable
     from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+    from swarm.wire.readable import encode_readable
     from swarm.wire.topics import COST, ROUTE
 
     network = _network(connect, namespace, (tls_ca, tls_cert, tls_key))
@@ -141,7 +141,7 @@ def _strides(directions: bytes) -> str:
     """Runs of equal steps: 12 N, 3 NE, ..."""
     from itertools import groupby
 
-    from swarm.wire.codec import COMPASS
+    from swarm.wire.readable import COMPASS
 
     return (
         ", ".join(f"{len(list(steps))} {COMPASS[code]}" for code, steps in groupby(directions)) or "already there"

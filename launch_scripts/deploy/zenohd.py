@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from swarm.bus.zenoh_bus import tls_settings
+from swarm.bus.zenoh_config import tls_settings
 from swarm.config.scenario import NetworkConfig
 from swarm.wire.codec import MAX_PAYLOAD_BYTES
 from swarm.wire.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, SIGHTED, STATS

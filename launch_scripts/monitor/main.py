@@ -16,6 +16,9 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
 
+_FRAME_HZ = 10.0
+"""How often the view is drawn: as often as vehicles publish their positions."""
+
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Record and show the run until SIGTERM, SIGINT or the end of the launcher."""
@@ -32,7 +35,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         service = MonitorService(
             setup, terrain, bus, inbox.post, outlets.rec, ground=ground, live_url=outlets.live_url
         )
-        process = Process(service, inbox, MonotonicClock(), config.frame_hz)
+        process = Process(service, inbox, MonotonicClock(), _FRAME_HZ)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

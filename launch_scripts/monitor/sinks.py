@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 APPLICATION = "terrain-swarm"
 _PORT_PATIENCE_S = 3.0
+_MEMORY = "256MiB"
+"""What the stream keeps for viewers that come later; the oldest goes first."""
 
 T = TypeVar("T")
 
@@ -60,8 +62,7 @@ class Outlets:
             self.stream_url = stream_url = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
             page = _patiently(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
             self._page = page
-            limit = f"{config.memory_mib}MiB"
-            sinks.append(rr.GrpcServerSink(bind_ip=LOOPBACK, port=grpc_port, server_memory_limit=limit))
+            sinks.append(rr.GrpcServerSink(bind_ip=LOOPBACK, port=grpc_port, server_memory_limit=_MEMORY))
         self.rec.set_sinks(*sinks, default_blueprint=blueprint)
 
     @property

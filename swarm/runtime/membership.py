@@ -1,4 +1,5 @@
-"""What every process does besides its work: says that it is alive, which run it belongs to, and what it counted."""
+"""What every process does besides its work: shows that it is alive, which run it belongs to, and what it
+counted."""
 
 from __future__ import annotations
 
@@ -36,6 +37,7 @@ class Member:
     def __init__(self, info: RunInfo, bus: Bus, post: Post) -> None:
         self.info = info
         self.counters = Counters()
+        """All that this process counts; never reset."""
         self._bus = bus
         self._post = post
         self._stats_due_ns = 0
@@ -52,7 +54,8 @@ class Member:
         return Peer(self.info.role, self.info.id, self.info.incarnation)
 
     def join(self) -> None:
-        """Serve our run, then ask for the others': of two that start at once, at least one notices."""
+        """Serve our run, then ask for those of others, in this order: of two processes that start at once at least
+        one hears the other. Called once."""
         self._bus.serve(RUN, self._post, role=self.info.role, id=self.info.id)
         self._bus.watch_links(self._post)
         self._bus.watch_alive(self._post, role=ROUTER)
@@ -60,7 +63,7 @@ class Member:
         self._ask()
 
     def handle(self, event: Event) -> bool:
-        """True if the event was about membership. Raises RunMismatchError."""
+        """Whether the event was about membership only and is done with. Raises RunMismatchError."""
         match event:
             case Asked(topic=topic) if topic is RUN:
                 event.answer(self.info)
@@ -81,7 +84,7 @@ class Member:
                 return True
             case LinkChanged(up=True):
                 self._ask()
-                return False  # replicas want to know, too
+                return False  # replicas compare what they hold when a link comes back
         return False
 
     def tick(self, now_ns: int) -> None:
@@ -94,6 +97,7 @@ class Member:
             self.publish_stats(now_ns)
 
     def publish_stats(self, now_ns: int) -> None:
+        """Publish the counters now: the last time when the service stops."""
         counts = {**self.counters.counts, **self._bus.counts}
         stats = Stats(
             role=self.info.role,
@@ -107,7 +111,7 @@ class Member:
         self._bus.publish(STATS, stats, role=self.info.role, id=self.info.id)
 
     def note(self, now_ns: int, kind: str, text: str, cell: int | None = None) -> None:
-        """Tell whoever watches."""
+        """Publish a sentence for people who watch the run."""
         info = self.info
         note = Note(role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text, cell=cell)
         self._bus.publish(NOTE, note, role=info.role, id=info.id)
@@ -149,7 +153,7 @@ def check_belongs(mine: RunInfo, others: Iterable[RunInfo]) -> None:
 
 
 def check_same_run(mine: RunInfo, other: RunInfo) -> None:
-    """Raises RunMismatchError, in words, where two processes must not share a namespace."""
+    """Raise RunMismatchError, with a sentence on the difference, where two processes must not share a namespace."""
     who = f"{other.role} {other.id}"
     if other.run_id != mine.run_id:
         raise RunMismatchError(

@@ -1,5 +1,5 @@
-"""What every bus does, as tests: `test_memory_bus` runs them on the simulated network, `integration/test_zenoh_bus`
-on real sessions. Whatever holds on one and not on the other would make the simulation lie."""
+"""The rules of `swarm.bus.bus.Bus` as tests: `tests/unit/swarm/test_memory_bus` runs them on the simulated network,
+`tests/live/test_zenoh_bus` on real sessions. A rule that held on one only would make simulations misleading."""
 
 from __future__ import annotations
 
@@ -20,7 +20,12 @@ from swarm.wire.topics import CLAIMS, MARKS, NOTE, POSE, RUN, Topic
 
 
 class World(Protocol):
-    """A network under test."""
+    """A network under test.
+
+    until   waits until `true()` is; fails after `within_s`
+    settle  waits until declarations have reached all buses
+    cut     takes the link of one bus down; `heal` brings it back
+    """
 
     def bus(self, name: str, namespace: str = "swarm") -> Bus: ...
     def put_bytes(self, bus: Bus, topic: Topic, payload: bytes, **fields: str) -> None: ...
@@ -31,7 +36,7 @@ class World(Protocol):
 
 
 class Box(list[Any]):
-    """A post that keeps what it is given."""
+    """A `Post` that keeps the events."""
 
     def __call__(self, event: Event) -> None:
         self.append(event)
@@ -62,7 +67,7 @@ def marks(author: str, tile: int) -> MarkSet:
 
 
 def answering(*replies: Any) -> Callable[[Event], None]:
-    """A queryable that gives (message, fields) replies."""
+    """A `Post` for `serve` that answers with these (message, fields) and ends."""
 
     def post(event: Event) -> None:
         assert isinstance(event, Asked)
@@ -74,7 +79,7 @@ def answering(*replies: Any) -> Callable[[Event], None]:
 
 
 def asked(world: World, bus: Bus, topic: Topic, request: Any, **options: Any) -> Box:
-    """Everything that came of one query, once it has ended."""
+    """The events of one query, once it has ended."""
     box = Box()
     bus.ask(topic, request, box, tag="q", **options)
     world.until(lambda: box.of(AskEnded))

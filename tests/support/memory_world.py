@@ -1,4 +1,4 @@
-"""A simulated network for tests, as `bus_behaviour.World` wants it."""
+"""A simulated network for tests: `bus_behaviour.World` in memory."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from swarm.wire.topics import Topic
 
 
 class MemoryWorld:
+    """Buses on one simulated network, its clock, and all deliveries so far."""
+
     def __init__(self, links: LinkModel | None = None) -> None:
         self.scheduler = Scheduler(ManualClock(1_000_000_000))
         self.deliveries: list[tuple[int, str, str, str, bytes]] = []

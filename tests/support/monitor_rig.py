@@ -30,7 +30,7 @@ from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import FLEET, FOLLOWED, MARKS, NOTE, POSE, SIGHTED, STATS, STATUS
 
 SILENT = MonitorConfig(live=False)
-LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0, memory_mib=16)
+LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0)
 FRAME_NS = NS_PER_S // 10
 
 

@@ -14,12 +14,16 @@ _TELL_NS = NS_PER_S // 2
 """A target that stays in sight is told of so often."""
 _RANGE_SHARE = 0.02
 """The simulated sensor is off by this share of the distance, besides half a cell."""
+SIGHTING_LASTS_S = 30.0
+"""A sighting expires after this many seconds: by then a target may be anywhere within some hundred metres."""
 
 
 class Lookout:
     """The simulated sensor for targets: it knows where they truly are, and tells only of those within its range."""
 
-    def __init__(self, grid: GridSpec, author: str, group: str, range_m: float, lasts_s: float) -> None:
+    def __init__(
+        self, grid: GridSpec, author: str, group: str, range_m: float, lasts_s: float = SIGHTING_LASTS_S
+    ) -> None:
         self._grid = grid
         self._author = author
         self._group = group

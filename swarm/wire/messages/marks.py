@@ -4,17 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm.wire.fields import Natural, check_column, check_id
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
+from swarm.wire.fields import Natural, check_column, check_id, column
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
 from swarm.wire.statements import check_lengths, check_statements, faulty_sets
 
 FOLDS = 1 << 16

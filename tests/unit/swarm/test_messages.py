@@ -1,19 +1,21 @@
-"""The wire: every message survives the trip, and no payload at all gets past the door untyped."""
+"""The wire: every message is decoded as it was encoded, and no payload at all becomes anything but a message."""
 
 from __future__ import annotations
 
 import json
 import math
 import random
+import tracemalloc
 
 import msgpack
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.wire_strategies import EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
-from swarm.wire.codec import MAX_PAYLOAD_BYTES, decode, decode_parameters, encode, encode_readable
+from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES, decode, encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.base import Message, Nothing, schema_of
 from swarm.wire.messages.marks import MarkSet
@@ -21,6 +23,7 @@ from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, Rou
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Claims
+from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.routes import Route, RouteStatus
 from swarm.wire.topics import TOPICS
 
@@ -35,11 +38,13 @@ def test_every_message_of_every_topic_has_an_example_and_a_strategy():
 
 
 @pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)
-def test_a_message_comes_out_as_it_went_in(kind):
+def test_a_message_comes_out_as_it_went_in_and_msgspec_alone_would_write_the_same_bytes(kind):
     @settings(max_examples=60, deadline=None)
     @given(MESSAGES[kind])
     def round_trip(message):
-        assert decode(encode(message), kind) == message
+        payload = encode(message)
+        assert decode(payload, kind) == message
+        assert payload == msgspec.msgpack.encode(message)
 
     round_trip()
 
@@ -139,6 +144,21 @@ def test_any_value_in_any_field_parses_or_is_refused(data, kind):
 def test_a_hostile_payload_is_refused(payload):
     for kind in TYPES:
         assert not _attempt(payload, kind)
+
+
+@pytest.mark.parametrize("junk", [{}, [], {1: 1}], ids=["map", "list", "pair"])
+def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(junk):
+    half = [junk] * (MAX_ITEMS // 2)
+    fields = msgpack.unpackb(encode(BY_TYPE[Note])) | {"mood": [half] * 8}
+    payload = msgpack.packb(fields)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ProtocolError, match="more than 262144 items"):
+            decode(payload, Note)
+        assert tracemalloc.get_traced_memory()[1] < 40 << 20
+    finally:
+        tracemalloc.stop()
+    assert _attempt(msgpack.packb(fields | {"mood": [b"abc"] * (MAX_ITEMS - 100)}), Note)
 
 
 @pytest.mark.parametrize(

@@ -170,28 +170,28 @@ TARGETS = ["t0", "t1", "t2"]
 
 def test_the_cheapest_of_the_allowed_targets_is_chosen() -> None:
     costs = {"t0": 9.0, "t1": 5.0, "t2": 1.0}
-    assert choose(costs, ["t0", "t1"], ALIVE, None, 0.15, True) == Choice("t1")
+    assert choose(costs, ["t0", "t1"], ALIVE, None, True) == Choice("t1")
 
 
 @pytest.mark.parametrize(("other_s", "chosen"), [(8.6, "t0"), (8.4, "t1")])
 def test_another_target_must_be_worth_the_change(other_s: float, chosen: str) -> None:
-    assert choose({"t0": 10.0, "t1": other_s}, TARGETS, {"t0": 1}, "t0", 0.15, True) == Choice(chosen)
+    assert choose({"t0": 10.0, "t1": other_s}, TARGETS, {"t0": 1}, "t0", True) == Choice(chosen)
 
 
 def test_a_target_that_cannot_be_reached_any_more_is_left_for_any_other() -> None:
-    assert choose({"t0": math.inf, "t1": 1e6}, TARGETS, ALIVE, "t0", 0.15, True) == Choice("t1")
+    assert choose({"t0": math.inf, "t1": 1e6}, TARGETS, ALIVE, "t0", True) == Choice("t1")
 
 
 def test_a_silent_planner_keeps_its_vehicles_until_they_give_it_up() -> None:
-    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", 0.15, True) == Choice("t0")
-    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", 0.15, False) == Choice("t1")
+    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", True) == Choice("t0")
+    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", False) == Choice("t1")
 
 
 def test_no_way_is_certain_only_when_all_live_planners_have_said_so() -> None:
     walled_in = {"t0": math.inf, "t1": math.inf}
-    assert choose(walled_in, TARGETS, ALIVE, None, 0.15, True) == UNSETTLED
-    assert choose(walled_in, TARGETS, {"t0": 1, "t1": 1}, None, 0.15, True) == Choice(None)
-    assert choose({}, TARGETS, {}, None, 0.15, True) == UNSETTLED
+    assert choose(walled_in, TARGETS, ALIVE, None, True) == UNSETTLED
+    assert choose(walled_in, TARGETS, {"t0": 1, "t1": 1}, None, True) == Choice(None)
+    assert choose({}, TARGETS, {}, None, True) == UNSETTLED
 
 
 # --- where they start ---------------------------------------------------------------------------------------
