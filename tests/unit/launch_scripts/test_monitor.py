@@ -88,7 +88,7 @@ def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
         cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
     )  # fmt: skip
     rig.play([(NS_PER_S // 2, seen)])
-    rig.until(3 * NS_PER_S)
+    rig.run(3)
     rig.close()
     assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 2
 
@@ -98,7 +98,7 @@ def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
 ) -> None:
     assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
     rig = Rig(scenario, terrain, tmp_path / "late.rrd")
-    rig.scheduler.run_until(20 * NS_PER_S)
+    rig.run(20)
     rig.play((now_ns + 20 * NS_PER_S, told) for now_ns, told in fake_run(terrain, hidden_truth(terrain), scenario))
     rig.close()
     assert rows_by_entity(tmp_path / "late.rrd")["/world/vehicles"] >= 12
@@ -119,7 +119,7 @@ def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
         agent="a0",
         vehicle="v",
     )
-    rig.until(NS_PER_S)
+    rig.run(1)
     assert rig.service.counters.counts["routes_unreadable"] == 1
     rig.close()
 
@@ -128,7 +128,7 @@ def test_where_to_watch_is_told_once(scenario: Scenario, terrain: Terrain) -> No
     rig = Rig(scenario, terrain, None, live_url="http://127.0.0.1:1/")
     heard: list[Event] = []
     rig.speaker.subscribe(NOTE, heard.append)
-    rig.until(3 * NS_PER_S)
+    rig.run(3)
     rig.close()
     notes = [event.message for event in heard]  # type: ignore[union-attr]
     assert [(note.kind, note.text) for note in notes if isinstance(note, Note)] == [

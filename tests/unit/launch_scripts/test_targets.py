@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.memory_world import MemoryWorld
+from support.swarm_model import SwarmModel
 
 from launch_scripts.world.referee import Collision, LethalEntry, Referee
 from launch_scripts.world.targets import (
@@ -28,7 +28,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import CostConfig, Scenario, TargetConfig, VehicleConfig
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
-from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import TargetPose
@@ -498,33 +497,19 @@ def test_a_start_nobody_can_stand_on_is_refused(start: tuple[int, int], sentence
 # --- on the bus ---------------------------------------------------------------------------------------------
 
 
-class Driven:
-    """The service on a memory bus, ticked ten times a second."""
-
-    def __init__(self, world: MemoryWorld, pace: NDArray[np.float32], plan: Scenario, incarnation: int = 1) -> None:
-        self.world = world
-        self.bus = world.bus(f"targets{incarnation}")
-        setup = RoleSetup(plan, "r1", "targets", "0", incarnation, 0)
-        self.service = TargetsService(setup, terrain_of_pace(pace, RES), pace, self.bus, self._post)
-        self.service.start(self._now())
-        self._tick()
-
-    def _now(self) -> int:
-        return self.world.scheduler.clock.now_ns()
-
-    def _post(self, event: Event) -> None:
-        self.service.handle(event, self._now())
-
-    def _tick(self) -> None:
-        if not self.bus.closed:
-            self.service.tick(self._now())
-            self.world.scheduler.after(TICK, self._tick)
+def targets_on(pace: NDArray[np.float32], plan: Scenario) -> tuple[SwarmModel, Ear]:
+    """A swarm of nothing but targets, and what it says."""
+    model = SwarmModel(terrain=terrain_of_pace(pace, RES), scenario=plan)
+    ear = Ear(model)
+    setup = model.setup("targets", "0")
+    model.start("targets", lambda bus, post: TargetsService(setup, model.terrain, pace, bus, post), phase_ns=0)
+    return model, ear
 
 
 class Ear:
     """Hears everything that is published on some topics."""
 
-    def __init__(self, world: MemoryWorld) -> None:
+    def __init__(self, world: SwarmModel) -> None:
         self.bus = world.bus("ear")
         self.heard: list[Any] = []
         for topic in (POSE, NOTE, STATS):
@@ -539,27 +524,25 @@ class Ear:
 
 
 def test_the_service_tells_poses_captures_and_broken_laws() -> None:
-    world = MemoryWorld()
     pace = flat()
     pace[0, 0] = np.inf
-    ear = Ear(world)
-    Driven(world, pace, scenario(still()))
-    world.run_ms(2000)
+    world, ear = targets_on(pace, scenario(still()))
+    world.run(2)
     assert len(ear.of(TargetPose)) == pytest.approx(10, abs=1)
     cell = 20 * 50 + 25
     for n in range(4):
         for author, ids in (("a0.1", ["v", "x"]), ("a1.1", ["w"])):
             at = {"v": cell, "x": 0 if n else 1, "w": cell}
             report = fleet(
-                world.scheduler.clock.now_ns() / 1e6,
+                world.now_ns / 1e6,
                 *((id, at[id]) for id in ids),
                 author=author,
                 seq=n,
                 at_m=(255.0, 205.0),
             )
             ear.bus.publish(FLEET, report, region=0, author=author)
-        world.run_ms(100)
-    world.run_ms(1500)
+        world.run(0.1)
+    world.run(1.5)
     assert [note.kind for note in ear.of(Note)] == ["capture", "lethal-entry", "collision"]
     assert ear.of(Note)[0].cell == cell
     counts = ear.of(Stats)[-1].counts
@@ -568,9 +551,7 @@ def test_the_service_tells_poses_captures_and_broken_laws() -> None:
 
 
 def test_counts_are_declared_before_anything_happens() -> None:
-    world = MemoryWorld()
-    ear = Ear(world)
-    Driven(world, flat(), scenario(still()))
-    world.run_ms(10)
+    world, ear = targets_on(flat(), scenario(still()))
+    world.run(0.01)
     counts = ear.of(Stats)[0].counts
     assert [counts[name] for name in ("captures", "collisions", "lethal_entries", "poses")] == [0, 0, 0, 0]
