@@ -30,11 +30,15 @@ NARROW: dict[Strategy, str] = {
 }
 
 
-def table(title: str, *columns: str, tight: bool = False) -> Table:
-    """Columns of numbers; a name that begins with < is one of words. A tight one saves a space between columns."""
-    padding = (0, 0) if tight else (0, 1, 0, 0)
+def table(title: str, *columns: str) -> Table:
+    """Columns of numbers; a name that begins with < is one of words."""
     found = Table(
-        title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=padding, pad_edge=False
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
     )
     for name in columns:
         words = name.startswith("<")
