@@ -120,3 +120,11 @@ def held_winners(replica: MapReplica) -> dict[tuple[int, int], tuple[int, float]
         for tile in replica.tiles
         for cell, kind, pace in zip(*(v.tolist() for v in replica.winners(tile)[:3]), strict=True)
     }
+
+
+def replica_of(sets: list[MarkSet]) -> tuple[MapReplica, Composite]:
+    composite = Composite()
+    replica = MapReplica(GRID, composite)
+    for each in sets:
+        replica.merge(each)
+    return replica, composite

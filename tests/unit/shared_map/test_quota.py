@@ -1,3 +1,5 @@
+"""Quotas: an author that overdraws its budget waits, loses nothing and holds nobody up."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Sync: marks reach everybody once links are back, whatever was lost, and hostile digests cost little."""
+
 from __future__ import annotations
 
 import socket

@@ -130,7 +130,7 @@ print("fine")
 def test_kernels_do_the_same_uncompiled_and_never_leave_their_arrays(
     setting: str, count: int, tmp_path: Path
 ) -> None:
-    here = Path(__file__).parents[2]
+    here = Path(__file__).parents[1]
     environment = {**os.environ, setting: "1", "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(here.parent)}
     script = _SMALL.format(tests=str(here), count=count)
     done = subprocess.run(
