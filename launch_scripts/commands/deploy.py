@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from launch_scripts.commands.roles import Namespace, TlsCa, TlsCert, TlsKey
+from launch_scripts.commands.shared_options import Namespace, Tls, spread
 from swarm.errors import ConfigError, StoreError
 
 app = typer.Typer(help="Certificates and configurations for a swarm on several machines.", no_args_is_help=True)
@@ -51,16 +51,15 @@ def certs(
 
 
 @app.command()
+@spread
 def zenohd(
     out: Annotated[Path, typer.Argument(help="The file to write, for `zenohd -c FILE`.")],
+    tls: Tls,
     listen: Annotated[
         list[str] | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447; several times if need be.")
     ] = None,
     peer: Annotated[list[str] | None, typer.Option(help="Another router to connect to.")] = None,
     namespace: Namespace = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     trust: Annotated[
         list[str] | None,
         typer.Option(help="Name of a certificate whose bearer may do everything in the namespace."),
@@ -85,15 +84,15 @@ def zenohd(
     import msgspec
 
     from launch_scripts.deploy.zenohd import zenohd_config
-    from launch_scripts.launcher.options import tls_of, with_network
+    from launch_scripts.launcher.options import with_network
     from swarm.config.load import check_endpoint
     from swarm.config.scenario import Scenario
 
-    if (trust or agent) and tls_ca is None:
+    if (trust or agent) and tls.tls_ca is None:
         raise ConfigError(
             "--trust and --agent go by the names in certificates: give --tls-ca, --tls-cert, --tls-key"
         )
-    network = with_network(Scenario(), namespace=namespace, tls=tls_of(tls_ca, tls_cert, tls_key)).network
+    network = with_network(Scenario(), namespace=namespace, tls=tls.config()).network
     for option, endpoints in (("--listen", listen), ("--peer", peer)):
         for endpoint in endpoints or ():
             check_endpoint(endpoint, network.tls is not None, option)
@@ -101,8 +100,8 @@ def zenohd(
     if network.tls is not None:  # zenohd may run elsewhere than here
         files = (network.tls.ca, network.tls.certificate, network.tls.key)
         ca, certificate, key = (str(Path(file).resolve()) for file in files)
-        tls = msgspec.structs.replace(network.tls, ca=ca, certificate=certificate, key=key)
-        network = msgspec.structs.replace(network, tls=tls)
+        absolute = msgspec.structs.replace(network.tls, ca=ca, certificate=certificate, key=key)
+        network = msgspec.structs.replace(network, tls=absolute)
     config = zenohd_config(
         network,
         trusted=trust or (),

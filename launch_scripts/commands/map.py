@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from launch_scripts.commands.shared_options import AsJson
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
 from swarm.errors import StoreError
@@ -31,7 +32,7 @@ def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
 
 
 @app.command()
-def inspect(store: Store, as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
+def inspect(store: Store, as_json: AsJson = False) -> None:
     """Say what a store holds, by author."""
     terrain, grid, sets = _read(store)
     _, kind = stored_marks.to_bands(grid, sets, time.time_ns())

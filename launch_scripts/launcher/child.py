@@ -25,7 +25,7 @@ _GRACE_S = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class LastWords:
+class ExitReason:
     """Why a process ended, in one sentence. `refused`: it was a SwarmError, no bug, so a restart may not help."""
 
     sentence: str
@@ -33,7 +33,7 @@ class LastWords:
     refused: bool
 
 
-def run_child(entry: str, setup: RoleSetup, log_path: Path, words: Connection) -> None:
+def run_child(entry: str, setup: RoleSetup, log_path: Path, pipe: Connection) -> None:
     """Run a role until it is told to stop. Ends the process with the role's exit code."""
     _redirect(log_path)
     # The launcher alone decides when to stop: it keeps SIGINT blocked for all of us, and SIGTERM until here.
@@ -45,11 +45,11 @@ def run_child(entry: str, setup: RoleSetup, log_path: Path, words: Connection) -
         load_entry(entry)(setup, wait_for_launcher)
     except SwarmError as error:
         log.error("%s", error)
-        words.send(LastWords(str(error), error.exit_code, refused=True))
+        pipe.send(ExitReason(str(error), error.exit_code, refused=True))
         _leave(error.exit_code)
     except BaseException as error:
         log.critical("crashed", exc_info=True)
-        words.send(LastWords(f"{type(error).__name__}: {error}", CRASHED, refused=False))
+        pipe.send(ExitReason(f"{type(error).__name__}: {error}", CRASHED, refused=False))
         _leave(CRASHED)
     log.info("ended as asked")
     _leave(0)

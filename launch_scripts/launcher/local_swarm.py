@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
-from launch_scripts.launcher.child import LastWords, run_child
+from launch_scripts.launcher.child import ExitReason, run_child
 from launch_scripts.process_table import STOP_ORDER, ProcessSpec
 from swarm.runtime.role import RoleSetup
 
@@ -67,7 +67,7 @@ class Running:
 
     spec: ProcessSpec
     process: ForkServerProcess | None = None
-    words: Connection | None = None
+    pipe: Connection | None = None
     began_s: float = 0.0
     due_s: float | None = None
     restarts: int = 0
@@ -126,7 +126,7 @@ class LocalSwarm:
         self,
         while_waiting: Callable[[], None] = lambda: None,
         before_role: Callable[[str], None] = lambda _: None,
-        hurry: Callable[[], bool] = lambda: False,
+        force: Callable[[], bool] = lambda: False,
     ) -> list[str]:
         """End everything, role by role. Returns a sentence for each process that did not end as asked."""
         for running in self.running:
@@ -137,7 +137,7 @@ class LocalSwarm:
             of_role = [running for running in self.running if running.spec.role == role and running.alive]
             if of_role:
                 before_role(role)
-                failures += self._stop(of_role, while_waiting, hurry)
+                failures += self._stop(of_role, while_waiting, force)
         return failures
 
     def kill(self) -> None:
@@ -161,49 +161,49 @@ class LocalSwarm:
         with _without_main():
             process.start()
         tell.close()
-        running.process, running.words = process, listen
+        running.process, running.pipe = process, listen
         running.began_s, running.due_s = time.monotonic(), None
 
     def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
         """Decide what follows on an end that nobody asked for."""
-        words = self._last_words(running, process)
+        reason = self._exit_reason(running, process)
         self._forget(running)
         now_s = time.monotonic()
         restart = running.spec.restart == "always"
-        if words.refused:
+        if reason.refused:
             running.refusals += 1
             # Whatever the first start refuses, the next will refuse too; later it may be the network.
             restart = restart and running.restarts > 0 and running.refusals < REFUSALS_ALLOWED
         wait_s = running.backoff.crashed(now_s - running.began_s) if restart else None
         if wait_s is not None:
             running.due_s = now_s + wait_s
-        return Ending(running.spec, words.sentence, words.exit_code, words.refused, wait_s, running.restarts + 1)
+        return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)
 
-    def _last_words(self, running: Running, process: ForkServerProcess) -> LastWords:
+    def _exit_reason(self, running: Running, process: ForkServerProcess) -> ExitReason:
         code = process.exitcode if process.exitcode is not None else 1
         if code == 255 and process.pid is not None:
             # The forkserver is gone, and with it the word of how its children fare: two of one id must not run.
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL)
         with contextlib.suppress(EOFError, OSError):
-            if running.words is not None and running.words.poll():
-                words = running.words.recv()
-                assert isinstance(words, LastWords)
-                return words
+            if running.pipe is not None and running.pipe.poll():
+                reason = running.pipe.recv()
+                assert isinstance(reason, ExitReason)
+                return reason
         if code < 0:
-            return LastWords(f"killed by {signal.Signals(-code).name}", 1, refused=False)
+            return ExitReason(f"killed by {signal.Signals(-code).name}", 1, refused=False)
         how = "ended by itself" if code == 0 else f"ended with exit code {code}"
-        return LastWords(how, 1, refused=False)
+        return ExitReason(how, 1, refused=False)
 
     def _stop(
-        self, of_role: list[Running], while_waiting: Callable[[], None], hurry: Callable[[], bool]
+        self, of_role: list[Running], while_waiting: Callable[[], None], force: Callable[[], bool]
     ) -> list[str]:
         for running in of_role:
             assert running.process is not None
             running.process.terminate()
         deadline_s = time.monotonic() + STOP_GRACE_S
         waiting = list(of_role)
-        while waiting and time.monotonic() < deadline_s and not hurry():
+        while waiting and time.monotonic() < deadline_s and not force():
             while_waiting()
             waiting = [running for running in waiting if running.process and running.process.exitcode is None]
         failures = []
@@ -215,17 +215,17 @@ class LocalSwarm:
                 process.join(1.0)
                 failures.append(f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed")
             elif process.exitcode not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
-                words = self._last_words(running, process)
-                failures.append(f"{running.spec.name} was asked to end, but {words.sentence}")
+                reason = self._exit_reason(running, process)
+                failures.append(f"{running.spec.name} was asked to end, but {reason.sentence}")
             self._forget(running)
         return failures
 
     def _forget(self, running: Running) -> None:
-        if running.words is not None:
-            running.words.close()
+        if running.pipe is not None:
+            running.pipe.close()
         if running.process is not None:
             running.process.join(1.0)
-        running.process = running.words = None
+        running.process = running.pipe = None
 
 
 class WarmUp:

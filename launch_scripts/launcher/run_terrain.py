@@ -56,7 +56,7 @@ def fetch_if_missing(
         raise TerrainError(f"{why}, and nobody in the namespace could send the base map: start the keeper first")
     key = scenario_key(scenario)
     looks = not _LOOK.isdisjoint(roles)
-    with _alone(run_dir):
+    with _locked(run_dir):
         here = load_prepared(run_dir, key)
         if here is not None and (here.photo.any() or not looks):
             return True
@@ -72,7 +72,7 @@ def fetch_if_missing(
 
 
 @contextlib.contextmanager
-def _alone(run_dir: Path) -> Iterator[None]:
+def _locked(run_dir: Path) -> Iterator[None]:
     """Of processes that share a run's folder one fetches, the others wait for it."""
     try:
         lock = (run_dir / "terrain.lock").open("wb")

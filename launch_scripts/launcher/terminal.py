@@ -44,7 +44,7 @@ REPORTED = {
 }
 
 
-class Screen:
+class Terminal:
     """Shows how a run goes. With `as_json`, standard output stays free for the report."""
 
     def __init__(self, as_json: bool, plain: bool) -> None:

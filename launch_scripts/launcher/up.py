@@ -14,9 +14,9 @@ from pathlib import Path
 from launch_scripts.launcher.child import log_to
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.launcher.options import check_ports, listening, make_run_dir, new_run_id
-from launch_scripts.launcher.progress import bars
+from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
-from launch_scripts.launcher.terminal import Screen
+from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import ROLES, ProcessSpec, processes_of
 from launch_scripts.report.recorder import Recorder
@@ -86,7 +86,7 @@ class _StopAsked:
     def __bool__(self) -> bool:
         return self.times > 0
 
-    def hurry(self) -> bool:
+    def force(self) -> bool:
         return self.times > 1
 
 
@@ -109,7 +109,7 @@ class _Run:
         self._run_dir = run_dir
         self._run_id = options.run_id or new_run_id()
         self._started_ns = time.time_ns()
-        self._screen = Screen(options.as_json, options.plain)
+        self._terminal = Terminal(options.as_json, options.plain)
         self._stop_asked = _StopAsked()
         specs = list(options.table or processes_of(self._scenario, options.roles))
         self._swarm = LocalSwarm(specs, self._setup_of, run_dir)
@@ -146,13 +146,13 @@ class _Run:
                 finally:
                     failures = self._stop(watcher)
         finally:
-            self._screen.close()
+            self._terminal.close()
             self._swarm.kill()
         self._report(watcher.recorder, seconds)
         if self._startup_s is None and not self._stop_asked:
             failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
         for failure in failures:
-            self._screen.say(failure, "red")
+            self._terminal.say(failure, "red")
         return 1 if failures else 0
 
     def _prepared(self) -> tuple[Terrain, Floats]:
@@ -160,8 +160,8 @@ class _Run:
         if self._options.joins and missing_files(self._scenario):
             with open_bus(self._scenario.network) as bus:
                 found = ask_run(bus)
-            with bars() as progress:
-                fetch_if_missing(self._scenario, self._run_dir, found, roles=self._options.roles, progress=progress)
+            with progress() as tell:
+                fetch_if_missing(self._scenario, self._run_dir, found, roles=self._options.roles, progress=tell)
             setup = self._setup_of(ProcessSpec("launcher", "0", ""))
             terrain = load_terrain(setup)
             return terrain, load_truth(setup, terrain)
@@ -188,7 +188,7 @@ class _Run:
                 raise BusError(f"gave up {text} after {within_s:g} s; see {self._run_dir}")
             if not said and waited_s > _PATIENCE_S:
                 said = True
-                self._screen.say(f"{text} ...")
+                self._terminal.say(f"{text} ...")
 
     def _router_listens(self, timeout_s: float) -> bool:
         self._raise_refusals(self._swarm.poll())
@@ -221,7 +221,7 @@ class _Run:
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 began_s = now_s
-                self._screen.say(
+                self._terminal.say(
                     f"all processes are alive and routes are served, {self._startup_s:.1f} s after launch"
                 )
             # The time counts from when the swarm is up, but a swarm that never is must end, too.
@@ -243,15 +243,15 @@ class _Run:
     def _tell(self, watcher: Watcher) -> None:
         for note in watcher.take_notes():
             if note.kind == "live_view":
-                self._screen.say(f"live view: {note.text}", "bold")
+                self._terminal.say(f"live view: {note.text}", "bold")
             elif note.kind not in _QUIET_NOTES:
-                self._screen.say(f"{note.role}-{note.id}: {note.text}", "cyan")
-        if self._screen.due():
+                self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
+        if self._terminal.due():
             summary = watcher.recorder.summary(watcher.now_ns())
             title = f"{self._scenario.name}, {summary.elapsed_s:.0f} s" + (
                 f", live view {watcher.live_view}" if watcher.live_view else ""
             )
-            self._screen.show(title, summary, self._swarm.by_role(), self._swarm.restarts)
+            self._terminal.show(title, summary, self._swarm.by_role(), self._swarm.restarts)
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:
@@ -261,20 +261,20 @@ class _Run:
                 again = f"starts again in {ending.restart_in_s:g} s" + (
                     f", time {ending.times}" * (ending.times > 1)
                 )
-                self._screen.say(f"{ending.spec.name}: {ending.sentence}; {again}", "yellow")
+                self._terminal.say(f"{ending.spec.name}: {ending.sentence}; {again}", "yellow")
 
     def _stop(self, watcher: Watcher) -> list[str]:
         """In order, hearing everybody's last words except the router's, which carries them."""
-        self._screen.say("stopping")
-        return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), hurry=self._stop_asked.hurry)
+        self._terminal.say("stopping")
+        return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
 
     def _say_begin(self) -> None:
-        self._screen.say(
+        self._terminal.say(
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
             f"{len(self._swarm.running)} processes, {self._terrain.grid.rows} x {self._terrain.grid.cols} cells"
         )
         router = self._scenario.network.connect[0]
-        self._screen.say(f"router at {router}; logs, recording and report in {self._run_dir}")
+        self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 
     def _report(self, recorder: Recorder, seconds: float) -> None:
         report = write_report(
@@ -292,5 +292,5 @@ class _Run:
         if self._options.as_json:
             print(json.dumps(numbers, indent=2))
         else:
-            self._screen.report(numbers)
-            self._screen.say(f"report: {self._run_dir / 'report.json'}, picture: {self._run_dir / 'report.png'}")
+            self._terminal.report(numbers)
+            self._terminal.say(f"report: {self._run_dir / 'report.json'}, picture: {self._run_dir / 'report.png'}")

@@ -40,7 +40,7 @@ def new_recording_path(folder: Path) -> Path:
     raise StoreError(f"{folder} is full of recordings")
 
 
-class Outlets:
+class Sinks:
     """A recording stream and where it flows. `close` takes seconds at most, whatever a disk or a viewer does."""
 
     def __init__(
@@ -56,9 +56,9 @@ class Outlets:
         if path is not None:
             sinks.append(rr.FileSink(path, write_footer=True))
         if config.live:
-            grpc_port = _patiently(_free_port, config.grpc_port, "grpc_port")
+            grpc_port = _when_free(_free_port, config.grpc_port, "grpc_port")
             self.stream_url = stream_url = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
-            page = _patiently(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
+            page = _when_free(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
             self._page = page
             limit = f"{config.memory_mib}MiB"
             sinks.append(rr.GrpcServerSink(bind_ip=LOOPBACK, port=grpc_port, server_memory_limit=limit))
@@ -84,7 +84,7 @@ class Outlets:
         self.rec.disconnect()
 
 
-def _patiently(listen: Callable[[int], T], port: int, name: str) -> T:
+def _when_free(listen: Callable[[int], T], port: int, name: str) -> T:
     """Listen on a port, also if it only soon becomes free, as after a restart. Raises BusError."""
     deadline_s = time.monotonic() + _PORT_PATIENCE_S
     while True:

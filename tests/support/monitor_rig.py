@@ -12,7 +12,7 @@ from support.swarm_model import SwarmModel
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.scene import Ground
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.monitor.sinks import Outlets
+from launch_scripts.monitor.sinks import Sinks
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
 from swarm.config.load import parse_scenario
@@ -64,12 +64,12 @@ class Rig(SwarmModel):
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
         self.speaker = self.bus("speaker")
         ground = Ground(terrain)
-        self.outlets = Outlets("run.1", path, config, make_blueprint(ground))
+        self.sinks = Sinks("run.1", path, config, make_blueprint(ground))
         setup = self.setup("monitor", "0")
         self.service = self.start(
             "monitor",
             lambda bus, post: MonitorService(
-                setup, terrain, bus, post, self.outlets.rec, ground=ground, live_url=live_url
+                setup, terrain, bus, post, self.sinks.rec, ground=ground, live_url=live_url
             ),
         )
 
@@ -88,7 +88,7 @@ class Rig(SwarmModel):
 
     def close(self) -> None:
         self.service.stop(self.now_ns)
-        self.outlets.close()
+        self.sinks.close()
 
 
 def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:
