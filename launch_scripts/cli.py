@@ -18,7 +18,7 @@ from swarm.errors import SwarmError
 
 
 def _began_s() -> float:
-    """When this process began, on the monotonic clock: its imports are part of the start-up."""
+    """Start of this process on the monotonic clock, so that imports count as start-up time."""
     try:
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
@@ -96,7 +96,7 @@ def up(
         list[str] | None, typer.Option(help="Start only this role; may be given several times.")
     ] = None,
     run_id: Annotated[
-        str | None, typer.Option(help="Take part in this run; otherwise it is made or learnt.")
+        str | None, typer.Option(help="Take part in this run; by default a new one, or the one in the namespace.")
     ] = None,
     namespace: Namespace = None,
 ) -> None:
@@ -165,7 +165,7 @@ def simulate(
     seed: Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Simulated seconds.")] = None,
     trace: Annotated[
-        Path | None, typer.Option(help="Write the event log here; a seed always writes the same.")
+        Path | None, typer.Option(help="Write the event log here; the same seed writes the same log.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -181,7 +181,7 @@ app.add_typer(query.app)
 
 
 def _mount(name: str, module: str, help: str) -> None:
-    """A sub-command whose own typer app is imported when it is called."""
+    """Adds a sub-command whose own typer app is imported when it is called."""
 
     def forward(ctx: typer.Context) -> None:
         sub_app: Any = importlib.import_module(module).app
@@ -208,7 +208,7 @@ _mount(
 
 
 def main() -> int:
-    """Entry point: an error of the user's is one sentence and an exit code, never a traceback."""
+    """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
     try:
         app(prog_name="swarm")
     except SwarmError as error:

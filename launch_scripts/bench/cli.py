@@ -1,4 +1,4 @@
-"""`swarm bench`: figures, each from one command. With --json one object on standard output, progress on stderr."""
+"""`swarm bench`: one command per measurement. With --json one object on standard output; progress on stderr."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from swarm.errors import ConfigError
 
 app = typer.Typer(
     name="bench",
-    help="Measure: trees against other libraries, the paper's tables, scale, gaps, terrain, the wire.",
+    help="Measure: trees beside other libraries, the paper's tables, scale, gaps, terrain, the wire.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -35,7 +35,7 @@ _ALL = ",".join(_ALLOWED)
 
 
 def _names(text: str, what: str, allowed: Sequence[str]) -> tuple[Any, ...]:
-    """Several names with commas. Raises ConfigError on none and on one that is not allowed."""
+    """Names separated by commas. Raises ConfigError on none, and on one which is not allowed."""
     chosen = tuple(name.strip() for name in text.split(",") if name.strip())
     if not chosen:
         raise ConfigError(f"--{what} is {text!r}, expected some of {', '.join(allowed)}")
@@ -56,7 +56,7 @@ def _numbers(text: str, name: str, least: int = 1) -> tuple[int, ...]:
 
 
 def _check_picture(picture: Path | None) -> None:
-    """Before minutes are spent on what could not be written."""
+    """Raises ConfigError now, not after minutes of measuring."""
     if picture is None:
         return
     if picture.suffix.lower() != ".png":
@@ -102,7 +102,7 @@ def peers(
 def start(
     size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side of the first tree.")] = 512,
     runs: Annotated[int, typer.Option(min=1, help="Processes with a warm cache.")] = 7,
-    cold_runs: Annotated[int, typer.Option(min=1, help="Processes that compile everything.")] = 1,
+    cold_runs: Annotated[int, typer.Option(min=1, help="Processes that compile all kernels.")] = 1,
     kernels: Annotated[bool, typer.Option(help="Measure all kernels of a planner too.")] = True,
     as_json: AsJson = False,
 ) -> None:
@@ -215,7 +215,7 @@ def gap(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Driven cost over optimum for a moving target, and what the certificates prove of it.
+    """Driven cost over optimum for a moving target, and the gap that certificates prove.
 
     \b
     swarm bench gap --dem ridge.tif --walk random,evade --picture gap.png
@@ -262,12 +262,12 @@ def directed(
 def kernels(
     size: Annotated[int, typer.Option(min=64, max=8192, help="Cells a side; a file has its own.")] = 512,
     field: FieldOption = "terrain",
-    repeats: Annotated[int, typer.Option(min=1, help="Roots, each with all that is measured, in turn.")] = 15,
+    repeats: Annotated[int, typer.Option(min=1, help="Roots; every measurement is taken from each.")] = 15,
     side: Annotated[int, typer.Option(min=1, max=32, help="Cells a side of a patch that changes.")] = 17,
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """What a frame is made of: routes by the batch, windows, and repairs beside the growth that they stand for.
+    """The parts of a frame: batches of routes, windows, and repairs beside the growth that they replace.
 
     \b
     swarm bench kernels
@@ -340,7 +340,7 @@ def compaction(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """What a keeper holds after many lives of an agent, with and without folding what dead authors left.
+    """Size of a keeper's store after many lives of an agent, with and without folding of dead authors.
 
     \b
     swarm bench compaction --lives 1000
@@ -379,7 +379,7 @@ def presence(
     rounds: Annotated[int, typer.Option(min=1, help="Ticks; the median counts.")] = 50,
     as_json: AsJson = False,
 ) -> None:
-    """CPU time that an agent spends each tick on hearing of everybody else's vehicles.
+    """CPU time per tick that an agent spends on the positions of all other vehicles.
 
     \b
     swarm bench presence --vehicles 10000

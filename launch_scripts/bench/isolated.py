@@ -1,4 +1,4 @@
-"""What can only be measured in a process of its own: the memory that one tree takes, and a first call.
+"""Measurements that need a process of their own: memory of one tree, and a first call.
 
     python -m launch_scripts.bench.isolated memory FIELD.npy TOOL ROOT EDGE
     python -m launch_scripts.bench.isolated start WHAT SIZE STARTED_NS
@@ -51,7 +51,7 @@ def memory(field: Path, name: str, root: int, edge: str) -> dict[str, float | No
     make(small, edge).grow(5)  # type: ignore[arg-type]  # libraries are loaded, kernels compiled
     pace = np.load(field)
     try:
-        # Linux: the highest mark starts again at what is resident now.
+        # Linux: resets the peak to the memory that is resident now.
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
         before = _status_bytes("VmRSS")
         tool = make(pace, edge)  # type: ignore[arg-type]

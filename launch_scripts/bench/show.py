@@ -1,4 +1,4 @@
-"""How a report is shown: as one JSON object, or as its tables and sentences; progress on standard error."""
+"""Shows a report as one JSON object, or as tables and sentences; progress on standard error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def show(
     as_json: bool,
     tables: Callable[[dict[str, Any]], Iterable[Table | str]] | None = None,
 ) -> None:
-    """As one JSON object; or as its tables and sentences, and where it was measured."""
+    """Prints one JSON object; or tables, sentences and the machine."""
     if as_json:
         typer.echo(json.dumps(report, allow_nan=False))
         return
@@ -39,7 +39,7 @@ def show(
 
 
 def _plain_tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    """Every list of rows as a table, then what is left as lines, but for the machine, of which `show` tells."""
+    """Every list of rows as a table, then the other values as lines; the machine is left to `show`."""
     plain = {}
     for name, value in report.items():
         if name in ("cores", "machine", "python", "load"):

@@ -1,4 +1,4 @@
-"""`swarm deploy`: what a swarm on several machines needs."""
+"""`swarm deploy`: certificates, and zenohd's configuration, for several machines."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ app = typer.Typer(help="Certificates and configurations for a swarm on several m
 
 @app.command()
 def certs(
-    folder: Annotated[Path, typer.Argument(help="Where the authority's and all other certificates are kept.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of the authority and of all certificates.")],
     names: Annotated[
         list[str],
         typer.Argument(
             metavar="NAME[=HOST,...]...",
-            help="Whom to make a certificate for. A router needs the names or addresses that others connect to.",
+            help="Names to make certificates for. A router needs the hosts that others connect to.",
         ),
     ],
-    days: Annotated[int, typer.Option(min=1, max=3650, help="How long they are good for.")] = 365,
-    renew: Annotated[bool, typer.Option(help="Replace those that are there.")] = False,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="Days until they expire.")] = 365,
+    renew: Annotated[bool, typer.Option(help="Replace existing certificates.")] = False,
 ) -> None:
-    """Make certificates for mutual TLS, signed by an authority of the swarm's own, made when it is not there.
+    """Make certificates for mutual TLS, signed by the folder's own authority, which is made if missing.
 
     swarm deploy certs certs router=10.0.0.1,base.local car1 car2
 
@@ -62,7 +62,7 @@ def zenohd(
     namespace: Namespace = None,
     trust: Annotated[
         list[str] | None,
-        typer.Option(help="Name of a certificate whose bearer may do everything in the namespace."),
+        typer.Option(help="Name of a certificate which allows everything in the namespace."),
     ] = None,
     agent: Annotated[
         list[str] | None,
@@ -74,7 +74,7 @@ def zenohd(
         Path | None, typer.Option(help="Folder with libzenoh_plugin_storage_manager.so, to store marks, too.")
     ] = None,
     volume: Annotated[
-        str, typer.Option(help="Of the storage: memory, or one whose backend is installed.")
+        str, typer.Option(help="Volume of the storage: memory, or one whose backend is installed.")
     ] = "memory",
 ) -> None:
     """Write a configuration for zenohd as the router of a swarm, with its marks in zenohd's own storages.

@@ -28,7 +28,7 @@ _STATUS_LISTEN_S = 1.5
 
 @dataclass(frozen=True)
 class Where:
-    """Where the swarm is that a question goes to."""
+    """Router and namespace of the swarm that a command asks."""
 
     connect: Annotated[str, typer.Option(help="The router's endpoint.")] = "tcp/127.0.0.1:7447"
     namespace: Annotated[str, typer.Option(help="Prefix of all keys.")] = "swarm"
@@ -49,13 +49,13 @@ class Where:
 @app.command(rich_help_panel=_PANEL)
 @spread
 def route(
-    target: Annotated[str, typer.Option(help="To which target, such as t3.")],
-    row: Annotated[int, typer.Option(help="From this row, counted from the north.")],
-    col: Annotated[int, typer.Option(help="From this column, counted from the west.")],
+    target: Annotated[str, typer.Option(help="The target, such as t3.")],
+    row: Annotated[int, typer.Option(help="Row of the start, counted from the north.")],
+    col: Annotated[int, typer.Option(help="Column of the start, counted from the west.")],
     where: Where,
     tls: Tls,
-    steps: Annotated[int, typer.Option(min=0, help="At most so many steps, 1 for the next; 0 is all.")] = 0,
-    cost: Annotated[bool, typer.Option("--cost", help="Only what it costs, or that there is no way.")] = False,
+    steps: Annotated[int, typer.Option(min=0, help="Most steps to show; 1 is the next, 0 is all.")] = 0,
+    cost: Annotated[bool, typer.Option("--cost", help="Only the cost, or that there is no way.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Ask a planner for the cheapest route from a cell to its target.
@@ -212,7 +212,7 @@ def _status_fields(
 
 
 def _throttled(stats: dict[tuple[str, str], Stats]) -> list[str]:
-    """Authors of whom a keeper says that their sets wait."""
+    """Authors which a keeper throttles."""
     from shared_map.keeper.service import THROTTLED
 
     gauges = {name for each in stats.values() for name in each.gauges}
@@ -260,7 +260,7 @@ def _print_status(
 
 
 def simulate(name: str, seed: int | None, seconds: float | None, trace: Path | None, as_json: bool) -> None:
-    """See `swarm simulate`."""
+    """Runs `swarm simulate`."""
     import contextlib
 
     from launch_scripts.launcher.options import find_scenario

@@ -171,7 +171,7 @@ def _check_id(id: str) -> None:
 
 
 def _found(network: NetworkConfig) -> list[RunInfo]:
-    """Who is in the namespace."""
+    """Members of the run in the namespace."""
     from launch_scripts.launcher.watcher import ask_run
     from swarm.bus.zenoh_bus import open_bus
 

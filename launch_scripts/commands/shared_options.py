@@ -1,4 +1,4 @@
-"""Options that several commands share, each said once: as a field of a dataclass that commands take whole."""
+"""Options which several commands share: fields of dataclasses that a command takes whole."""
 
 from __future__ import annotations
 

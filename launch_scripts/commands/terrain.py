@@ -1,4 +1,4 @@
-"""`swarm terrain`: look at elevation and photo, see what they cost, make synthetic ones, classify a photo."""
+"""`swarm terrain`: inspect elevation and photo, build costs, make synthetic landscapes, classify a photo."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png)
 
 
 def _check_target(path: Path | None, option: str, *endings: str) -> None:
-    """Before all the work: a file that cannot be written is refused now. Raises ConfigError."""
+    """Raises ConfigError now, not after the work, if a file cannot be written."""
     if path is None:
         return
     if path.is_dir():

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 SETTLED_S = 10.0
-"""A process that ran for so long starts again after the shortest wait."""
+"""After a run of so many seconds the wait starts at its shortest again."""
 STOP_GRACE_S = 5.0
 REFUSALS_ALLOWED = 5
 
@@ -36,7 +36,7 @@ _HELD_BACK = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 @dataclass(slots=True)
 class Backoff:
-    """How long to wait before the next start: doubled at each crash, short again after a good run."""
+    """Wait before the next start: doubled at each crash, short again after a long run."""
 
     wait_s: float = FIRST_WAIT_S
 
@@ -51,7 +51,7 @@ class Backoff:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """A process that was not asked to end has ended."""
+    """End of a process that was not asked to end."""
 
     spec: ProcessSpec
     sentence: str
@@ -63,7 +63,7 @@ class Ending:
 
 @dataclass(slots=True, eq=False)
 class Running:
-    """A row of the table, as it is on this machine."""
+    """A process of the table and its state on this machine."""
 
     spec: ProcessSpec
     process: ForkServerProcess | None = None
@@ -106,13 +106,13 @@ class LocalSwarm:
         return counts
 
     def start(self, role: str | None = None) -> None:
-        """Start the processes of a role, or all that have not been started."""
+        """Starts the processes of a role, or all that have not been started."""
         for running in self.running:
             if running.process is None and running.due_s is None and role in (None, running.spec.role):
                 self._start(running)
 
     def poll(self) -> list[Ending]:
-        """Reap what ended, start again what is due."""
+        """Reaps processes which ended, and starts those which are due."""
         endings = []
         for running in self.running:
             if running.process is not None and running.process.exitcode is not None:
@@ -128,7 +128,7 @@ class LocalSwarm:
         before_role: Callable[[str], None] = lambda _: None,
         force: Callable[[], bool] = lambda: False,
     ) -> list[str]:
-        """End everything, role by role. Returns a sentence for each process that did not end as asked."""
+        """Ends all processes, role by role. Returns a sentence for each that did not end as asked."""
         for running in self.running:
             running.due_s = None
         roles = [*STOP_ORDER, *sorted({r.spec.role for r in self.running} - set(STOP_ORDER))]
@@ -141,7 +141,7 @@ class LocalSwarm:
         return failures
 
     def kill(self) -> None:
-        """End everything at once and without asking."""
+        """Kills all processes."""
         for running in self.running:
             running.due_s = None
             if running.process is not None:
@@ -165,14 +165,14 @@ class LocalSwarm:
         running.began_s, running.due_s = time.monotonic(), None
 
     def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
-        """Decide what follows on an end that nobody asked for."""
+        """Decides what follows an unexpected end."""
         reason = self._exit_reason(running, process)
         self._forget(running)
         now_s = time.monotonic()
         restart = running.spec.restart == "always"
         if reason.refused:
             running.refusals += 1
-            # Whatever the first start refuses, the next will refuse too; later it may be the network.
+            # A refused first start will be refused again; a later refusal may be the network's.
             restart = restart and running.restarts > 0 and running.refusals < REFUSALS_ALLOWED
         wait_s = running.backoff.crashed(now_s - running.began_s) if restart else None
         if wait_s is not None:
@@ -182,7 +182,7 @@ class LocalSwarm:
     def _exit_reason(self, running: Running, process: ForkServerProcess) -> ExitReason:
         code = process.exitcode if process.exitcode is not None else 1
         if code == 255 and process.pid is not None:
-            # The forkserver is gone, and with it the word of how its children fare: two of one id must not run.
+            # The forkserver is gone and reports no more ends: kill, because two processes of one id must not run.
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL)
         with contextlib.suppress(EOFError, OSError):
@@ -249,7 +249,7 @@ class WarmUp:
         self._thread.start()
 
     def done(self, timeout_s: float) -> bool:
-        """True when the next process starts without delay."""
+        """Whether the forkserver has loaded everything."""
         self._thread.join(timeout_s)
         if self._failure is not None:
             raise self._failure
@@ -266,12 +266,12 @@ class WarmUp:
 
 
 def _nothing() -> None:
-    """What the probe runs."""
+    """Does nothing; the probe's target."""
 
 
 @contextlib.contextmanager
 def _without_main() -> Iterator[None]:
-    """Keep multiprocessing from running the launcher's own script again in each child."""
+    """Keeps multiprocessing from running the launcher's own script in each child."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")
     try:

@@ -1,4 +1,4 @@
-"""The router: a zenoh session in router mode that passes everybody's messages on, and a member of the run."""
+"""The router: a Zenoh session in router mode, and a member of the run."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 class RouterService:
-    """Answers which run this is. A stranger in the namespace ends by itself: the router only tells of it."""
+    """Answers which run this is. A process of another run ends by itself; the router only reports it."""
 
     def __init__(self, info: RunInfo, bus: Bus, post: Post) -> None:
         self._member = Member(info, bus, post)

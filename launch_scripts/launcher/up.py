@@ -44,7 +44,7 @@ _QUIET_NOTES = frozenset({"live_view"})
 
 @dataclass(frozen=True, slots=True)
 class UpOptions:
-    """What a user chose.
+    """Options of a run.
 
     joins      there is a router elsewhere: none is started here
     run_id     the run to take part in; if None, a new one, or that of the namespace where only `roles` are started
@@ -65,7 +65,7 @@ class UpOptions:
 
 
 class _RefusedError(SwarmError):
-    """One of our processes said why it cannot run."""
+    """A process of this run refused to start, with its reason."""
 
     def __init__(self, ending: Ending) -> None:
         super().__init__(f"{ending.spec.name}: {ending.sentence}")
@@ -101,7 +101,7 @@ def run_swarm(options: UpOptions) -> int:
 
 
 class _Run:
-    """The run in hand, all of it on the main thread."""
+    """A run in progress; all of it happens on the main thread."""
 
     def __init__(self, options: UpOptions, run_dir: Path) -> None:
         self._options = options
@@ -116,7 +116,7 @@ class _Run:
         self._startup_s: float | None = None
 
     def run(self) -> int:
-        # One thread each: the processes share the cores already, and idle helpers would be in the way of forking.
+        # One thread each: the processes share the cores already, and idle threads make a fork unsafe.
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         warm_up = WarmUp(list(self._options.preload))
         warm_up.begin()
@@ -156,7 +156,7 @@ class _Run:
         return 1 if failures else 0
 
     def _prepared(self) -> tuple[Terrain, Floats]:
-        """Built of its files; where one is missing and there is a swarm to join, as its keeper has it."""
+        """Builds the terrain from its files, or fetches it from a keeper where one is missing and a swarm runs."""
         if self._options.joins and missing_files(self._scenario):
             with open_bus(self._scenario.network) as bus:
                 found = ask_run(bus)
@@ -179,7 +179,7 @@ class _Run:
         )
 
     def _wait(self, text: str, done: Callable[[float], bool], within_s: float = 600.0) -> None:
-        """Until `done(timeout_s)` or a signal; says what for if it takes long."""
+        """Waits for `done(timeout_s)` or a signal, and says so if it takes long."""
         began_s = time.monotonic()
         said = False
         while not self._stop_asked and not done(_TURN_S):
@@ -198,7 +198,7 @@ class _Run:
         return False
 
     def _join(self, bus: Bus) -> None:
-        """Refuse to share a namespace with another run; a part of a swarm belongs to the run that it finds."""
+        """Refuses to share a namespace with another run. A part of a swarm joins the run that it finds."""
         if not self._options.joins:
             return
         found = ask_run(bus)
@@ -211,7 +211,7 @@ class _Run:
             check_vacant(found, running.spec.role, running.spec.id)
 
     def _watch(self, watcher: Watcher) -> float:
-        """Until the time is over or somebody asks for the end. Returns how long the run lasted."""
+        """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = time.monotonic()
         while not self._stop_asked:
             self._raise_refusals(self._swarm.poll())
@@ -224,7 +224,7 @@ class _Run:
                 self._terminal.say(
                     f"all processes are alive and routes are served, {self._startup_s:.1f} s after launch"
                 )
-            # The time counts from when the swarm is up, but a swarm that never is must end, too.
+            # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
             if now_s - began_s >= limit_s:
                 break
@@ -264,7 +264,7 @@ class _Run:
                 self._terminal.say(f"{ending.spec.name}: {ending.sentence}; {again}", "yellow")
 
     def _stop(self, watcher: Watcher) -> list[str]:
-        """In order, hearing everybody's last words except the router's, which carries them."""
+        """Stops all roles in order, and records their last messages."""
         self._terminal.say("stopping")
         return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
 

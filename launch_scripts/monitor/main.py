@@ -18,7 +18,7 @@ from swarm.runtime.role import RoleSetup
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
-    """Record and show the run until SIGTERM, SIGINT or the end of the launcher."""
+    """Records and shows the run until SIGTERM, SIGINT or the end of the launcher."""
     config = setup.scenario.monitor
     terrain = load_terrain(setup)
     ground = Ground(terrain)

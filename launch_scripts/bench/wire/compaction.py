@@ -1,4 +1,4 @@
-"""What a keeper holds after many lives of an agent, with and without folding, on the memory bus."""
+"""Size of a keeper's store after many lives of an agent, with and without folding."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ SPREAD = 40
 
 
 def after_lives(lives: int, folds: bool, seed: int = 1) -> dict[str, float]:
-    """Each life says something about places that it drives by, most of them where the lives before it were, and
-    dies. The keeper folds after each, as if everybody had been dead for long enough."""
+    """Sizes of a keeper's store after many lives of one agent, which mark mostly the same places.
+
+    folds  the keeper folds after each life, as if all earlier authors had been dead for long enough
+    """
     grid = GridSpec(SIDE_CELLS, SIDE_CELLS, 10.0)
     chance = np.random.default_rng(seed)
     keeper = MapReplica(grid)

@@ -46,11 +46,11 @@ class _Child:
     author: bool
     replica: bool
     newest: tuple[float, str] = (0.0, "")
-    """When the digest became so, and the digest."""
+    """Time of the last change of its digest, and the digest."""
 
 
 class TwoSides:
-    """Two namespaces, their cable and their processes."""
+    """Two network namespaces, the cable between them, and their processes."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -101,7 +101,7 @@ class TwoSides:
         _ip("-n", self._spaces[side], "link", "set", self._ends[side], "up" if up else "down")
 
     def say(self, word: str) -> None:
-        """Tell all authors."""
+        """Sends a word to all authors."""
         for child in self.children:
             if child.author and child.process.stdin is not None:
                 child.process.stdin.write(word + "\n")
@@ -128,7 +128,7 @@ class TwoSides:
             self.listen(0.05)
 
     def equal_since(self) -> float | None:
-        """When the last replica came to the digest that all of them have; None while they differ."""
+        """Time at which the last replica reached the common digest; None while they differ."""
         newest = [child.newest for child in self.children if child.replica]
         if len({digest for _, digest in newest}) > 1 or not newest[0][1]:
             return None
@@ -160,7 +160,7 @@ class TwoSides:
 
 
 def rounds(count: int, seconds: float, folder: Path) -> Iterator[dict[str, float]]:
-    """Of each round: how long until all were equal after the cable was up, how many digests there were before."""
+    """For each round: seconds from the cable's return until all are equal, and the number of digests before it."""
     with TwoSides(folder) as sides:
         sides.say("write")
         sides.listen(1.0)
@@ -182,7 +182,7 @@ def rounds(count: int, seconds: float, folder: Path) -> Iterator[dict[str, float
 
 
 def why_not() -> str | None:
-    """Why this machine cannot play two; None if it can."""
+    """Why this machine cannot run two namespaces; None if it can."""
     if shutil.which("ip") is None:
         return "there is no command ip (iproute2)"
     space = f"swarm-try-{os.getpid()}"
@@ -203,10 +203,10 @@ def _ip(*arguments: str) -> None:
 
 
 def run(count: int, seconds: float, progress: Progress | None = None) -> dict[str, Any]:
-    """Quantiles over all rounds. Raises SwarmError where a machine cannot play two."""
+    """Quantiles over all rounds. Raises SwarmError where two namespaces cannot run."""
     reason = why_not()
     if reason is not None:
-        raise SwarmError(f"no partition can be played on this machine: {reason}")
+        raise SwarmError(f"this machine cannot run two network namespaces: {reason}")
     found: list[float] = []
     with tempfile.TemporaryDirectory() as name:
         for figures in rounds(count, seconds, Path(name)):

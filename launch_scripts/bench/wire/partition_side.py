@@ -44,7 +44,7 @@ _WRITE_NS = 50_000_000
 
 
 class MapService:
-    """A replica that takes part in the map; one with an author writes while it is told to."""
+    """A replica on the bus. One with an author writes marks while `writing` is set."""
 
     def __init__(self, setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post) -> None:
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
@@ -76,7 +76,7 @@ class MapService:
         self._member.publish_stats(now_ns)
 
     def _scribble(self, now_ns: int) -> None:
-        """Eight marks in a row, a few cells from the last, as by a vehicle on its way."""
+        """Writes eight marks in a row, a few cells from the last ones, like a driving vehicle."""
         self._at = (self._at + self._chance.integers(-8, 9, size=2)) % (_SIDE_CELLS - 8)
         start = self.replica.grid.cell(*self._at.tolist())
         kind = self._chance.choice([MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR])
@@ -84,7 +84,7 @@ class MapService:
 
 
 def run_child(side: str, role: str, id: str, folder: Path) -> None:
-    """One process: tells its digest in a line whenever it changes, does what standard input says."""
+    """Runs one process until its standard input ends."""
     names = {name: str(folder / f"{side}.{kind}") for name, kind in (("certificate", "pem"), ("key", "key"))}
     tls = TlsConfig(ca=str(folder / "ca.pem"), **names)
     other = SIDES[1 - SIDES.index(side)]
@@ -111,7 +111,7 @@ def run_child(side: str, role: str, id: str, folder: Path) -> None:
 
 
 class _Telling:
-    """A service that prints [monotonic seconds, digest] when its replica has changed, looking each tick."""
+    """Prints [monotonic seconds, digest] at each tick after which its service's replica has changed."""
 
     def __init__(self, service: RouterService | KeeperService | MapService) -> None:
         self._service = service

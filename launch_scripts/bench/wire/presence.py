@@ -1,4 +1,4 @@
-"""What presence costs an agent each tick, by how many vehicles there are."""
+"""CPU time of presence per tick of an agent, by the number of vehicles."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def cpu_ms(work: Callable[[], object], rounds: int) -> float:
 
 
 def measure(count: int, rounds: int = 50) -> dict[str, float]:
-    """CPU milliseconds of the parts of a tick in which everybody was heard anew."""
+    """CPU milliseconds of the parts of a tick in which all agents have reported."""
     grid = GridSpec(1024, 1024, 20.0)
     said = fleets(grid, count, seed=1)
     payloads = [encode(fleet) for fleet in said]
@@ -78,7 +78,7 @@ def measure(count: int, rounds: int = 50) -> dict[str, float]:
             presence.near(east, south, 100.0)
 
     def hear_one() -> None:
-        """After which the next to ask has to look at everybody."""
+        """Hears one report, after which the next query builds the index anew."""
         nonlocal seq
         seq += 1
         presence.hear(_again(mine, seq), seq)
@@ -102,7 +102,7 @@ def measure(count: int, rounds: int = 50) -> dict[str, float]:
 
 
 def _again(fleet: Fleet, seq: int) -> Fleet:
-    """As the network brings it the next time."""
+    """A copy with another sequence number, as the network delivers it."""
     return Fleet(**{name: getattr(fleet, name) for name in fleet.__struct_fields__ if name != "seq"}, seq=seq)
 
 

@@ -333,7 +333,7 @@ def test_presence_has_a_row_per_number_of_vehicles() -> None:
 
 def test_a_machine_that_cannot_play_two_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(partition, "why_not", lambda: "there is no command ip (iproute2)")
-    with pytest.raises(SwarmError, match=r"no partition can be played on this machine: there is no command ip"):
+    with pytest.raises(SwarmError, match=r"this machine cannot run two network namespaces: there is no command ip"):
         CliRunner().invoke(app, ["partition", "--rounds", "1"], catch_exceptions=False)
 
 
