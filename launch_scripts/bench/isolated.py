@@ -1,4 +1,4 @@
-"""What can only be measured in a process of its own: the memory that one tree takes, and a first call.
+"""Measurements that need a process of their own: memory of one tree, and a first call.
 
     python -m launch_scripts.bench.isolated memory FIELD.npy TOOL ROOT EDGE
     python -m launch_scripts.bench.isolated start WHAT SIZE STARTED_NS

@@ -1,4 +1,4 @@
-"""A configuration for zenohd: router of a swarm, its marks in zenohd's own storages, who may do what."""
+"""Configuration for zenohd as the router of a swarm: storages for marks, and access control."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def zenohd_config(
     plugins: str | None = None,
     volume: str = "memory",
 ) -> dict[str, Any]:
-    """What `zenohd -c FILE` reads, as JSON.
+    """The configuration that `zenohd -c FILE` reads, as JSON.
 
     trusted  certificate names that may do everything in the namespace: keepers, planners, routers
     agents   certificate names of agents, each its group and id (all.a0): may write only what is their own
@@ -60,17 +60,17 @@ def zenohd_config(
 
 
 def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]) -> dict[str, Any]:
-    """Zenoh's rules, by the common name of the certificate at the other end of a link.
+    """Access control rules, by the common name of the certificate at the other end of a link.
 
     An agent hears everything and writes under its own name only: authors are called `GROUP.ID.INCARNATION`. It
     answers for others, too, where it is asked for the last claims of those that are gone.
     """
     whole = [f"{namespace}/**"]
     rules = [_rule("all", (*PUTS, *READS), whole), _rule("hear", READS, whole)]
-    # What others said must reach those that may hear it: the way out to them is a matter of its own.
+    # Egress is a rule of its own: messages of others must reach those that may hear them.
     rules.append(_rule("told", PUTS, whole, flows=["egress"]))
     rules.append(_rule("asked", READS, whole, flows=["egress"]))
-    # Where the vehicles of an agent stand that is gone, only those that heard it last can tell.
+    # Only those which heard a dead agent last know where its vehicles stand.
     rules.append(_rule("words", ANSWERS, [CLAIMS.expression(namespace)]))
     policies = [{"rules": ["all"], "subjects": ["trusted"]}] if trusted else []
     subjects = [{"id": "trusted", "cert_common_names": list(trusted)}] if trusted else []
@@ -88,7 +88,7 @@ def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]
 
 
 def own_keys(name: str) -> list[str]:
-    """What the agent of a name such as all.a0 may write, below the namespace."""
+    """Keys below the namespace that an agent with a name such as all.a0 may write."""
     author, agent = f"{name}.$*", name.rpartition(".")[2]
     return [
         MARKS.key.format(region="*", tile="*", author=author),

@@ -1,4 +1,4 @@
-"""From what a user typed to a scenario: names, overrides, endpoints and ports."""
+"""Turns command-line options into a scenario: names, overrides, endpoints, ports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
 def find_scenario(name: str) -> Scenario:
-    """A built-in scenario by its name, or one from a file."""
+    """Loads a built-in scenario by name, or one from a file."""
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         return load_scenario(path)
@@ -43,7 +43,7 @@ def with_network(
     namespace: str | None = None,
     tls: TlsConfig | None = None,
 ) -> Scenario:
-    """The scenario with other endpoints. Raises ConfigError where they would leave the machine in the clear."""
+    """The scenario with other endpoints. Raises ConfigError where they would leave the machine unencrypted."""
     network = scenario.network
     tls = tls or network.tls
     changes: dict[str, object] = {"tls": tls}
@@ -88,7 +88,7 @@ def with_port(scenario: Scenario, port: int) -> Scenario:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of 127.0.0.1 that nobody listens on now."""
+    """Ports of 127.0.0.1 which are free now."""
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
         for each in sockets:
@@ -97,7 +97,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
-    """Raises BusError where something listens already on a port that this machine is to listen on."""
+    """Raises BusError if a port that this machine needs is taken."""
     wanted: list[tuple[str, str, int]] = []
     if "router" in roles:
         wanted += [("the router", *host_port(endpoint)) for endpoint in scenario.network.listen]
@@ -113,7 +113,7 @@ def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
 
 
 def host_port(endpoint: str) -> tuple[str, int]:
-    """Of an endpoint such as tcp/[::1]:7447."""
+    """Host and port of an endpoint such as tcp/[::1]:7447."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     return host.strip("[]"), int(port)
 
@@ -139,7 +139,7 @@ def _taken(host: str, port: int) -> bool:
 
 
 def new_run_id() -> str:
-    """Names a run: when it began, and four digits that tell it from another of the same second."""
+    """Id of a new run: the time, and four hexadecimal digits."""
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
 
 

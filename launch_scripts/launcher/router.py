@@ -1,4 +1,4 @@
-"""The router: a zenoh session in router mode that passes everybody's messages on."""
+"""The router: a Zenoh session in router mode that passes on all messages."""
 
 from __future__ import annotations
 

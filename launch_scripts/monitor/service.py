@@ -1,4 +1,4 @@
-"""The monitor's shell: everything that is said in the swarm, told to rerun frame by frame.
+"""The monitor's shell: draws what it hears of the swarm, frame by frame.
 
 It only listens. It may be late, stalled, killed or absent; nobody waits for it.
 """
@@ -47,7 +47,7 @@ from swarm.wire.topics import MARKS, SIGHTED
 
 _TRAILS_NS = NS_PER_S // 2
 _ROUTES_NS = 3 * NS_PER_S // 2
-"""How long until the routes to every target were drawn anew."""
+"""Period in which the routes to every target are drawn once."""
 _TEXTURES_PER_FRAME = 8
 _REFRESH_NS = NS_PER_S
 _ROUTES_SHOWN = 400
@@ -57,8 +57,8 @@ _ANNOUNCE_NS = NS_PER_S // 2
 class MonitorService:
     """Shows a run on a recording stream.
 
-    rec       whose sinks are set already
-    live_url  where people can watch; told to everybody once
+    rec       a recording stream whose sinks are set
+    live_url  address of the live view; published once
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class MonitorService:
                 self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
     def tick(self, now_ns: int) -> None:
-        """One frame."""
+        """Draws one frame."""
         self._feed.tick(now_ns)
         self._member.tick(now_ns)
         self._announce(now_ns)
@@ -176,7 +176,7 @@ class MonitorService:
         self._routes[followed.vehicle] = RouteNow(followed.target, np.array(cells, np.int64))
 
     def _announce(self, now_ns: int) -> None:
-        """Say where to watch, once the links have had time to learn who listens."""
+        """Publishes the live view's address, once links have had time to learn of subscribers."""
         if self._live_url is not None and now_ns - self._started_ns >= _ANNOUNCE_NS:
             self._member.note(now_ns, "live_view", self._live_url)
             self._live_url = None
@@ -187,7 +187,7 @@ class MonitorService:
     # --- out ----------------------------------------------------------------------------------------------------
 
     def _refresh(self, now_ns: int) -> None:
-        """Send one texture again: a viewer that joins late has only what the server still holds."""
+        """Sends one texture again: a viewer which joins late has only what the server still holds."""
         self._refresh_due_ns = now_ns + _REFRESH_NS
         self._stale_tiles[self._next_refresh] = None
         self._next_refresh = (self._next_refresh + 1) % (self._ground.tile_rows * self._ground.tile_cols)
@@ -229,14 +229,14 @@ class MonitorService:
             self._draw_windows()
 
     def _draw_windows(self) -> None:
-        """Which part of its tree each planner grew last; the whole terrain is no news."""
+        """Draws the window that each planner grew last, unless it is the whole terrain."""
         told = [status.window for _, status in sorted(self.recorder.observed.status.items())]
         windows = [Window(*window) for window in told if window]
         parts = [window for window in windows if not window.empty and window.cells < self._terrain.grid.cells]
         self._drawing.windows([window_outline(self._ground, window) for window in parts])
 
     def _draw_routes(self, now_ns: int, vehicles: dict[str, VehicleNow]) -> None:
-        """The routes to one target after the other, each what is left of it."""
+        """Draws what is left of the routes, one target after the other."""
         if now_ns < self._routes_due_ns or not self._target_ids:
             return
         self._routes_due_ns = now_ns + _ROUTES_NS // len(self._target_ids)

@@ -1,4 +1,4 @@
-"""What a run leaves behind for people: `report.json` and `report.png`."""
+"""Writes `report.json` and `report.png`."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def write_report(
     startup_s: float | None = None,
     extra: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Write both files and return the numbers. Raises StoreError if the folder cannot be written.
+    """Writes both files and returns the numbers. Raises StoreError if the folder cannot be written.
 
-    truth  what the ground was like, to outline what the map did not know; None if that is a secret or unknown
+    truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
     extra  further fields for report.json
     """
     report = recorder.report(
@@ -75,7 +75,7 @@ def _draw(
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Whole or not at all."""
+    """Replaces a file atomically."""
     partial = path.with_name(path.name + ".part")
     with partial.open("wb") as file:
         file.write(content)

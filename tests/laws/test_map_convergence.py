@@ -1,6 +1,6 @@
 """How soon replicas are equal again after loss, partitions and coming and going, on the memory bus, seeded.
 
-By hand, as in docs/map-figures.md: `python tests/laws/test_map_convergence.py`"""
+By hand, as in docs/map-figures.md: `PYTHONPATH=.:tests python tests/laws/test_map_convergence.py`"""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from support.map_strategies import FeedService, LossyLinks, MapSwarm
+from support.swarm_model import FeedService, LossyLinks, SwarmModel
 
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
@@ -26,7 +26,7 @@ def equal(services: Services) -> bool:
     return len({service.replica.fingerprint() for service in services}) == 1
 
 
-def until_equal_s(swarm: MapSwarm, services: Services, at_most_s: float = 60.0) -> float:
+def until_equal_s(swarm: SwarmModel, services: Services, at_most_s: float = 60.0) -> float:
     waited_s = 0.0
     while not equal(services):
         assert waited_s < at_most_s, "not equal in time"
@@ -35,7 +35,7 @@ def until_equal_s(swarm: MapSwarm, services: Services, at_most_s: float = 60.0) 
     return round(waited_s, 1)
 
 
-def scribble(swarm: MapSwarm, chance: random.Random, author: FeedService, marks: int) -> None:
+def scribble(swarm: SwarmModel, chance: random.Random, author: FeedService, marks: int) -> None:
     """Say something about cells of one place, as a vehicle does."""
     grid = swarm.terrain.grid
     row, col = chance.randrange(grid.rows), chance.randrange(grid.cols)
@@ -49,7 +49,7 @@ def after_loss_s(seed: int) -> float:
     """4 authors, a planner and a keeper write for 10 s at 30 % lost, 10 % doubled, 500 ms jitter; then quiet, with
     the links as bad as before."""
     chance = random.Random(seed)
-    swarm = MapSwarm(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
+    swarm = SwarmModel(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     authors = [swarm.writer(f"a{n}.1") for n in range(4)]
     listener = swarm.listener("p")
@@ -63,7 +63,7 @@ def after_partition_s(seed: int) -> float:
     """Writes on both sides of a partition of 30 s; from its healing on."""
     chance = random.Random(seed)
     links = LossyLinks(seed)
-    swarm = MapSwarm(links)
+    swarm = SwarmModel(links)
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     authors = [swarm.writer(f"a{n}.1") for n in range(4)]
     listener = swarm.listener("p")
@@ -79,7 +79,9 @@ def after_partition_s(seed: int) -> float:
 def lost_while_coming_and_going(seed: int, marks: int, agents: int = 6) -> dict[str, float]:
     """Agents start, write and are killed all the time; at the end nothing that any of them published is missing."""
     chance = random.Random(seed)
-    swarm = MapSwarm(LossyLinks(seed, dropped=0.02, jitter_ms=20), terrain_of_pace(np.ones((512, 512), np.float32)))
+    swarm = SwarmModel(
+        LossyLinks(seed, dropped=0.02, jitter_ms=20), terrain_of_pace(np.ones((512, 512), np.float32))
+    )
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     listener = swarm.listener("p")
     living: dict[str, FeedService] = {}

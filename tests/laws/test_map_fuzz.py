@@ -10,7 +10,8 @@ import random
 import msgspec
 import numpy as np
 import pytest
-from support.map_strategies import GRID, Composite, MapSwarm, held_winners, naive_winners, set_of
+from support.map_strategies import GRID, Composite, held_winners, naive_winners, set_of
+from support.swarm_model import SwarmModel
 
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.mark_sets import packed, unpacked
@@ -110,7 +111,7 @@ def test_mutated_payloads_that_wait_together_pass_the_door_as_each_would_alone()
 @pytest.mark.parametrize("topic", [MARKS, DIGEST])
 def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_from_it(topic: object) -> None:
     chance = random.Random(5)
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     store = KeeperStore(":memory:")
     keeper = swarm.keeper("keeper", store)
     author, listener = swarm.writer("a1.1"), swarm.listener("p")

@@ -1,18 +1,14 @@
-"""What a keeper holds after many lives of an agent, with and without folding, on the memory bus.
-
-python -m launch_scripts.bench.wire.compaction --lives 200 --json
-"""
+"""Size of a keeper's store after many lives of an agent, with and without folding."""
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+from launch_scripts.bench.machine import machine
+from launch_scripts.bench.tables import Progress
 from shared_map.keeper.compaction import fold
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.replica import MapReplica
@@ -26,8 +22,10 @@ SPREAD = 40
 
 
 def after_lives(lives: int, folds: bool, seed: int = 1) -> dict[str, float]:
-    """Each life says something about places that it drives by, most of them where the lives before it were, and
-    dies. The keeper folds after each, as if everybody had been dead for long enough."""
+    """Sizes of a keeper's store after many lives of one agent, which mark mostly the same places.
+
+    folds  the keeper folds after each life, as if all earlier authors had been dead for long enough
+    """
     grid = GridSpec(SIDE_CELLS, SIDE_CELLS, 10.0)
     chance = np.random.default_rng(seed)
     keeper = MapReplica(grid)
@@ -63,19 +61,11 @@ def after_lives(lives: int, folds: bool, seed: int = 1) -> dict[str, float]:
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--lives", type=int, default=200)
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-    chosen = parser.parse_args(arguments)
-    found = {label: after_lives(chosen.lives, folds) for label, folds in (("without", False), ("with", True))}
-    if chosen.json:
-        print(json.dumps(found))
-    else:
-        for label, figures in found.items():
-            print(f"{label} folding: " + ", ".join(f"{value:,} {key}" for key, value in figures.items()))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def run(lives: int, seed: int = 1, progress: Progress | None = None) -> dict[str, Any]:
+    """One row without folding and one with it, of the same lives."""
+    rows = []
+    for done, folds in enumerate((False, True), 1):
+        rows.append({"folding": "with" if folds else "without", **after_lives(lives, folds, seed)})
+        if progress is not None:
+            progress(done, 2)
+    return {"rows": rows, **machine()}

@@ -23,7 +23,7 @@ from launch_scripts.bench.wire.remote import Far
 
 PARTS = ("latency", "flood", "join", "route", "positions", "replica", "codec")
 WANTED = {"latency p50": 1.5, "latency p99": 2.0, "flood": 0.3, "late join": 1.5, "digest_ms": 50, "memory": 40}
-"""What the project set out to reach: ratios to raw Zenoh, milliseconds, bytes a mark."""
+"""Goals of the project: ratios to raw Zenoh, milliseconds, bytes per mark."""
 
 
 def run(
@@ -37,7 +37,7 @@ def run(
     seconds: float = 5.0,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Measure. Returns what was measured, by part, and `rows` that sum it up."""
+    """Measures all parts. Returns the figures of each, and `rows` which sum them up."""
     measure: dict[str, Callable[[Far], dict[str, Any]]] = {
         "latency": lambda far: wire_marks.latency(far, marks),
         "flood": lambda far: wire_marks.flood(far, sets, rounds),
@@ -58,7 +58,7 @@ def run(
 
 
 def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    """The rows as one table, and what has to be known to read it."""
+    """The rows as one table, and notes on how to read it."""
     found = table("The wire beside raw Zenoh", "<", "ours", "raw", "ours / raw", "wanted")
     for row in report["rows"]:
         ratio, wanted = row["ratio"], row["wanted"]

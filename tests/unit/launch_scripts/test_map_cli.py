@@ -1,3 +1,5 @@
+"""`swarm map`: what is exported comes back as it was, and the bands of a GeoTIFF show the winners."""
+
 from __future__ import annotations
 
 import json

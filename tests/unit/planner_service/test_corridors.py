@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from laws.test_tree_under_every_strategy import Play
 from support import slow_twins as naive
+from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
 from planner_service import target_tree

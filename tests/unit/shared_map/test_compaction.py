@@ -1,3 +1,5 @@
+"""Compaction changes no winner, in any order and with keepers that know different things."""
+
 from __future__ import annotations
 
 import random
@@ -6,17 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_strategies import (
-    AUTHORS,
-    GRID,
-    Composite,
-    LossyLinks,
-    MapSwarm,
-    held_winners,
-    mark_sets,
-    naive_winners,
-    set_of,
-)
+from support.map_strategies import AUTHORS, GRID, Composite, held_winners, mark_sets, naive_winners, set_of
+from support.swarm_model import LossyLinks, SwarmModel
 
 from shared_map.keeper.compaction import FoldPlan, fold, united, without
 from shared_map.keeper.store import KeeperStore
@@ -25,7 +18,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.tombstones import REMEMBERED_NS, Graves
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import MapConfig
+from swarm.config.scenario import MapConfig, Scenario
 from swarm.wire.messages.marks import FOLDS, MarkSet
 from swarm.wire.statements import MarkKind
 
@@ -269,10 +262,8 @@ def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> 
 # --- services -----------------------------------------------------------------------------------------------
 
 
-def folding_swarm() -> MapSwarm:
-    swarm = MapSwarm()
-    swarm.config = MapConfig(fold_after_s=5)
-    return swarm
+def folding_swarm() -> SwarmModel:
+    return SwarmModel(scenario=Scenario(map=MapConfig(fold_after_s=5)))
 
 
 def test_agents_that_come_and_go_leave_as_much_as_one_behind() -> None:
@@ -304,8 +295,8 @@ def test_agents_that_come_and_go_leave_as_much_as_one_behind() -> None:
 
 def test_an_author_that_was_only_cut_off_says_all_again() -> None:
     links = LossyLinks(1)
-    swarm = MapSwarm(links)
-    swarm.config = MapConfig(fold_after_s=5)
+    swarm = SwarmModel(links)
+    swarm.scenario = Scenario(map=MapConfig(fold_after_s=5))
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     cut_off, other = swarm.writer("a1.1"), swarm.writer("b1.1")
     swarm.run(2)
@@ -326,8 +317,8 @@ def test_an_author_that_was_only_cut_off_says_all_again() -> None:
 
 
 def test_a_full_disk_folds_nothing_and_a_store_grows_no_more_than_the_ground() -> None:
-    swarm = MapSwarm(terrain=terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32)))
-    swarm.config = MapConfig(fold_after_s=5)
+    swarm = SwarmModel(terrain=terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32)))
+    swarm.scenario = Scenario(map=MapConfig(fold_after_s=5))
     store = KeeperStore(":memory:")
     keeper = swarm.keeper("keeper", store)
     for name in ("a1.1", "a1.2"):

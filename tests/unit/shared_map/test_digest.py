@@ -1,3 +1,5 @@
+"""Digests: equal holdings give equal bytes, and a difference names exactly what is newer."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -168,14 +168,14 @@ def test_a_mark_reaches_another_group_only_if_its_own_lets_it(writes: list[str])
     world = AgentWorld(TWO_GROUPS.format(writes=writes), pace_of(PRIOR), pace_of(TRUTH))
     world.put_target("t", 1, 17)
     world.start_all()
-    world.run_s(5.0)
+    world.run(5.0)
     closed = np.isinf(pace_of(TRUTH)) & ~np.isinf(pace_of(PRIOR))
     red, blue = (service._cost_map.ground_s_per_m[closed] for service in world.agents.values())
     assert np.isinf(red).all()
     assert np.isinf(blue).all() == bool(writes)
     refused = world.agents["a1"].counters.counts["sets_foreign"]
     assert (refused > 0) == (not writes)
-    world.run_s(10.0)  # digests go on, and bring nothing more to refuse than what is put
+    world.run(10.0)  # digests go on, and bring nothing more to refuse than what is put
     assert world.agents["a1"].counters.counts["sets_foreign"] <= refused + 1
     world.assert_lawful()
     assert MARKS.key.endswith("/{author}")

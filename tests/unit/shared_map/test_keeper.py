@@ -1,3 +1,5 @@
+"""The keeper: what it acknowledges is on disk, and no other terrain's store is touched."""
+
 from __future__ import annotations
 
 import sqlite3
@@ -5,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.map_strategies import GRID, MapSwarm, set_of
+from support.map_strategies import GRID, set_of
+from support.swarm_model import SwarmModel
 
 from shared_map.keeper.store import Keeper, KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
@@ -129,7 +132,7 @@ def test_only_what_is_on_the_disk_counts_as_committed() -> None:
 
 
 def test_an_author_learns_from_the_keepers_digest_what_is_safe() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     store = KeeperStore(":memory:")
     swarm.keeper("keeper", store)
     author = swarm.writer("a1.1")
@@ -143,7 +146,7 @@ def test_an_author_learns_from_the_keepers_digest_what_is_safe() -> None:
 
 
 def test_a_full_disk_is_told_of_and_the_keeper_goes_on_serving_and_saves_when_there_is_room() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     store = KeeperStore(":memory:")
     keeper = swarm.keeper("keeper", store)
     author = swarm.writer("a1.1")
@@ -166,7 +169,7 @@ def test_a_full_disk_is_told_of_and_the_keeper_goes_on_serving_and_saves_when_th
 
 
 def test_the_marks_of_the_dead_outlive_the_keeper(tmp_path: Path) -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     swarm.keeper("keeper", KeeperStore(tmp_path / "map.sqlite"))
     author = swarm.writer("a1.1")
     author.feed.publish(author.replica.write([5, 6], [LETHAL, LETHAL], [0, 0], swarm.now_ns))
@@ -184,7 +187,7 @@ def test_the_marks_of_the_dead_outlive_the_keeper(tmp_path: Path) -> None:
 
 
 def test_two_keepers_agree_though_each_missed_what_the_other_heard() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     first = swarm.keeper("k1", KeeperStore(":memory:"))
     author = swarm.writer("a1.1")
     author.feed.publish(author.replica.write([5], [LETHAL], [0], swarm.now_ns))
@@ -199,4 +202,4 @@ def test_a_keeper_refuses_the_store_of_another_terrain() -> None:
     store = KeeperStore(":memory:")
     store.bind("another", GRID)
     with pytest.raises(StoreError, match="another"):
-        MapSwarm(terrain=terrain_of_pace(np.ones((9, 9), np.float32))).keeper("keeper", store)
+        SwarmModel(terrain=terrain_of_pace(np.ones((9, 9), np.float32))).keeper("keeper", store)

@@ -146,7 +146,7 @@ def test_a_parked_vehicle_is_driven_around_without_a_stop() -> None:
     world.put_target("t", 2, 22)
     world.put_target("s", 2, 12)  # the other has arrived before it begins
     world.start_all()
-    world.run_s(3.0)
+    world.run(3.0)
     assert world.states()["a1-00"] is VehicleState.ARRIVED
     took_s = world.until(lambda: world.states()["a0-00"] is VehicleState.ARRIVED, within_s=60)
     # 21 cells of a second each, two of them diagonal, the first of which it has driven: nobody waits five seconds.

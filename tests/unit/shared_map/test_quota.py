@@ -1,14 +1,17 @@
+"""Quotas: an author that overdraws its budget waits, loses nothing and holds nobody up."""
+
 from __future__ import annotations
 
 import numpy as np
-from support.map_strategies import MapSwarm, set_of
+from support.map_strategies import set_of
+from support.swarm_model import SwarmModel
 
 from shared_map.keeper.service import THROTTLED
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.quota import Quota
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import MapConfig
+from swarm.config.scenario import MapConfig, Scenario
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import NOTE
@@ -80,8 +83,7 @@ def test_two_that_wait_take_turns() -> None:
 
 
 def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up() -> None:
-    swarm = MapSwarm()
-    swarm.config = MapConfig(author_marks_per_s=20)
+    swarm = SwarmModel(scenario=Scenario(map=MapConfig(author_marks_per_s=20)))
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     keeper._feed._quota = Quota(20)
     notes: list[str] = []

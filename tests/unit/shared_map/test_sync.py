@@ -1,3 +1,5 @@
+"""Sync: marks reach everybody once links are back, whatever was lost, and hostile digests cost little."""
+
 from __future__ import annotations
 
 import socket
@@ -9,7 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_strategies import Composite, FeedService, LossyLinks, MapSwarm, set_of
+from support.map_strategies import Composite, set_of
+from support.swarm_model import FeedService, LossyLinks, SwarmModel
 
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
@@ -24,7 +27,6 @@ from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
 from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarksRequest
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import DIGEST, MARKS, NOTE
@@ -32,7 +34,7 @@ from swarm.wire.topics import DIGEST, MARKS, NOTE
 LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
 
 
-def write(service: FeedService, swarm: MapSwarm, cells: list[int], kind: MarkKind = LETHAL) -> None:
+def write(service: FeedService, swarm: SwarmModel, cells: list[int], kind: MarkKind = LETHAL) -> None:
     service.feed.publish(service.replica.write(cells, kind, 0.0, swarm.now_ns))
 
 
@@ -41,7 +43,7 @@ def all_equal(services: Sequence[FeedService | KeeperService]) -> bool:
 
 
 def test_a_mark_reaches_every_replica_at_once() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     author, listener = swarm.writer("a1.1"), swarm.listener("p")
     write(author, swarm, [5])
     swarm.run(0.01)
@@ -49,7 +51,7 @@ def test_a_mark_reaches_every_replica_at_once() -> None:
 
 
 def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     swarm.keeper("keeper", KeeperStore(":memory:"))
     dead, alive = swarm.writer("a1.1"), swarm.writer("a2.1")
     write(dead, swarm, [5, 900])
@@ -65,7 +67,7 @@ def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -
 
 def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> None:
     links = LossyLinks(1)
-    swarm = MapSwarm(links)
+    swarm = SwarmModel(links)
     author, listener = swarm.writer("a1.1"), swarm.listener("p")
     write(author, swarm, [5])
     swarm.run(0.5)
@@ -82,7 +84,7 @@ def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> No
 
 def test_when_a_partition_heals_all_replicas_are_equal_within_two_seconds() -> None:
     links = LossyLinks(2)
-    swarm = MapSwarm(links)
+    swarm = SwarmModel(links)
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     near, far, listener = swarm.writer("a1.1"), swarm.writer("a2.1"), swarm.listener("p")
     swarm.run(1)
@@ -100,7 +102,7 @@ def test_when_a_partition_heals_all_replicas_are_equal_within_two_seconds() -> N
 
 def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it() -> None:
     links = LossyLinks(3)
-    swarm = MapSwarm(links)
+    swarm = SwarmModel(links)
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     author, listener = swarm.writer("a1.1"), swarm.listener("p")
     swarm.run(1)
@@ -114,7 +116,7 @@ def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it()
 
 
 def test_nobody_speaks_under_anothers_key() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     listener = swarm.listener("p")
     liar = swarm.network.bus("liar")
     liar.publish(MARKS, set_of("a1.1", 0, 1, {5: (LETHAL, 0, 1)}), region=0, tile=0, author="liar")
@@ -125,7 +127,7 @@ def test_nobody_speaks_under_anothers_key() -> None:
 
 
 def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     liar = swarm.network.bus("liar")
     [lies] = packed([set_of("a1.1", tile, 9, {5: (LETHAL, 0, 1)}) for tile in range(3)])
     [truth] = packed([set_of("liar", 1, 1, {6: (LETHAL, 0, 1)})])
@@ -144,7 +146,7 @@ def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
 
 
 def test_digests_without_end_are_held_within_bounds() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     listener = swarm.listener("p")
     hostile = swarm.network.bus("hostile")
     rows = np.array([(tile, 1, 1) for tile in range(6)], DIGEST_ROW).tobytes()
@@ -159,7 +161,7 @@ def test_digests_without_end_are_held_within_bounds() -> None:
 
 
 def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     keeper_says = swarm.network.bus("k")
     listener = swarm.listener("p")
     kept = {seq: np.array([(3, 1, seq)], DIGEST_ROW).tobytes() for seq in (1, 2, 3)}
@@ -176,7 +178,7 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
 
 
 def test_events_of_others_are_left_to_others() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     listener = swarm.listener("p")
     note = set_of("a", 0, 1, {})
     assert not listener.feed.handle(Heard(NOTE, {}, note), 0)
@@ -194,7 +196,7 @@ def test_events_of_others_are_left_to_others() -> None:
 def test_with_30_percent_dropped_10_percent_doubled_and_500_ms_jitter_replicas_agree_after_quiet(
     seed: int, writes: list[tuple[int, int, MarkKind, float]]
 ) -> None:
-    swarm = MapSwarm(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
+    swarm = SwarmModel(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
     store = KeeperStore(":memory:")
     keeper = swarm.keeper("keeper", store)
     authors = [swarm.writer(f"a{n}.1") for n in range(3)]
@@ -217,17 +219,6 @@ def test_with_30_percent_dropped_10_percent_doubled_and_500_ms_jitter_replicas_a
 # --- on real zenoh ------------------------------------------------------------------------------------------
 
 
-class Ticking(FeedService):
-    """A feed as a whole service, so that a real `Process` can run it."""
-
-    def __init__(self, feed: MapFeed) -> None:
-        super().__init__(feed)
-        self.counters = Counters()
-
-    def stop(self, now_ns: int) -> None:
-        pass
-
-
 class Running:
     """Services on threads, each with its own zenoh session; closed in reverse order."""
 
@@ -237,10 +228,10 @@ class Running:
         self.scenario = Scenario(network=network)
         self._undo: list[Callable[[], None]] = []
 
-    def feed(self, author: str | None) -> Ticking:
+    def feed(self, author: str | None) -> FeedService:
         bus, inbox = open_bus(self.network), Inbox()
         replica = MapReplica(self.terrain.grid, Composite(self.terrain.grid), author=author)
-        service = Ticking(MapFeed(replica, bus, inbox.post, MapConfig(), "agent"))
+        service = FeedService(MapFeed(replica, bus, inbox.post, MapConfig(), "agent"))
         self._run(service, bus, inbox)
         return service
 
@@ -251,7 +242,7 @@ class Running:
         self._run(service, bus, inbox)
         return service
 
-    def _run(self, service: Ticking | KeeperService, bus: ZenohBus, inbox: Inbox) -> None:
+    def _run(self, service: FeedService | KeeperService, bus: ZenohBus, inbox: Inbox) -> None:
         process = Process(service, inbox, MonotonicClock(), 10.0)
         thread = threading.Thread(target=process.run)
         thread.start()

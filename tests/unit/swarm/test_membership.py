@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from support.memory_world import MemoryWorld
+from support.swarm_model import SwarmModel
 
 from swarm.bus.bus import Event, Heard, LinkChanged
 from swarm.errors import RunMismatchError
@@ -22,7 +22,7 @@ INFO = RunInfo(
 class Node:
     """A process that is nothing but a member."""
 
-    def __init__(self, world: MemoryWorld, **changes: object) -> None:
+    def __init__(self, world: SwarmModel, **changes: object) -> None:
         self.info = msgspec.structs.replace(INFO, **changes)
         self.bus = world.bus(self.info.id)
         self.member = Member(self.info, self.bus, self.post)
@@ -38,7 +38,7 @@ class Node:
 
 
 def test_members_of_one_run_get_along():
-    world = MemoryWorld()
+    world = SwarmModel()
     nodes = [Node(world, id=id) for id in ("t0", "t1", "t2")]
     for node in nodes:
         node.member.join()
@@ -61,7 +61,7 @@ def test_members_of_one_run_get_along():
     ],
 )
 def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(changes, words):
-    world = MemoryWorld()
+    world = SwarmModel()
     first, stranger = Node(world), Node(world, id="t1", **changes)
     first.member.join()
     world.settle()
@@ -73,7 +73,7 @@ def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(chan
 
 
 def test_of_two_that_start_at_once_at_least_one_notices():
-    world = MemoryWorld()
+    world = SwarmModel()
     one, other = Node(world), Node(world, id="t1", run_id="r2")
     one.member.join()
     other.member.join()
@@ -82,7 +82,7 @@ def test_of_two_that_start_at_once_at_least_one_notices():
 
 
 def test_who_meets_only_after_a_cut_heals_is_checked_then():
-    world = MemoryWorld()
+    world = SwarmModel()
     one, other = Node(world), Node(world, id="t1", run_id="r2")
     world.cut(other.bus)
     one.member.join()
@@ -97,7 +97,7 @@ def test_who_meets_only_after_a_cut_heals_is_checked_then():
 
 
 def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_to_be_up():
-    world = MemoryWorld()
+    world = SwarmModel()
     node = Node(world)
     node.member.join()
     world.settle()
@@ -109,16 +109,16 @@ def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_t
 
 
 def test_counters_are_told_once_a_second_and_at_the_end():
-    world, heard = MemoryWorld(), []
+    world, heard = SwarmModel(), []
     node = Node(world)
     world.bus("watcher").subscribe(STATS, heard.append)
     node.member.join()
     node.member.counters.count("marks", 3)
     node.member.counters.observe("tick_ms", 2.0)
     for _ in range(25):
-        node.member.tick(world.scheduler.clock.now_ns())
-        world.run_ms(100)
-    node.member.publish_stats(world.scheduler.clock.now_ns())
+        node.member.tick(world.now_ns)
+        world.run(0.1)
+    node.member.publish_stats(world.now_ns)
     world.settle()
     assert len(heard) == 4
     last = heard[-1].message
@@ -129,7 +129,7 @@ def test_counters_are_told_once_a_second_and_at_the_end():
 
 
 def test_a_note_reaches_whoever_watches():
-    world, heard = MemoryWorld(), []
+    world, heard = SwarmModel(), []
     node = Node(world)
     world.bus("watcher").subscribe(NOTE, heard.append)
     node.member.note(5, "closure", "road closed", cell=9)
@@ -143,7 +143,7 @@ def test_the_same_run_from_anywhere_is_the_same_run():
 
 
 def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_stranger_is_named_once():
-    world, notes = MemoryWorld(), []
+    world, notes = SwarmModel(), []
     world.bus("watcher").subscribe(NOTE, notes.append)
     nodes = [Node(world, id=id) for id in ("t0", "t1")]
     for node in nodes:
@@ -164,7 +164,7 @@ def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_s
 
 
 def test_a_process_that_starts_beside_a_stranger_joins_those_who_agree():
-    world = MemoryWorld()
+    world = SwarmModel()
     first, liar = Node(world), Node(world, role="agent", id="zz", run_id="another")
     first.member.join()
     world.settle()
@@ -176,7 +176,7 @@ def test_a_process_that_starts_beside_a_stranger_joins_those_who_agree():
 
 
 def test_a_router_belongs_to_no_run_and_ends_nobody():
-    world = MemoryWorld()
+    world = SwarmModel()
     router = Node(world, role="router", id="0", run_id=NO_RUN, terrain="", rows=0)
     router.member.join()
     world.settle()

@@ -1,3 +1,5 @@
+"""Certificates: signed by the folder's authority, keys for their owner only, faults told in a sentence."""
+
 from __future__ import annotations
 
 import datetime

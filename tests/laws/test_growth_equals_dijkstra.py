@@ -11,51 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import slow_twins as naive
+from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels.radix_heap import flood_wide
 from planner_service.tree.cost_grid import Ground
-from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.growth import MAX_RATIO, flood
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec
-
-RATIOS = (1.0, 2.0, 10.0, 100.0, 1e4, 1e6, 1e9)
-WALLS = (0.0, 0.1, 0.25, 0.45)
-
-
-def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:
-    ground = Ground(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig(**rules))
-    ground.load(pace)
-    tree = CostToGoTree(ground)
-    tree.grow(target)
-    return tree
-
-
-def assert_equals_dijkstra(pace: np.ndarray, target: int, rules: dict) -> None:
-    tree = grown(pace, target, rules)
-    mine, parents = tree.inner(tree.cost), tree.inner(tree.parent)
-    best = naive.cost_to_go(pace, target, **rules)
-    np.testing.assert_allclose(mine, np.where(np.isfinite(pace), best, np.inf), rtol=1e-5)
-    # Every reachable cell's parent is a neighbour whose offer is what the cell costs.
-    rows, cols = np.nonzero(np.isfinite(mine))
-    codes = parents[rows, cols]
-    away = codes != 255
-    assert away.sum() == rows.size - 1
-    rows, cols, codes = rows[away], cols[away], codes[away]
-    r, c = rows + np.array(STEP_ROW)[codes], cols + np.array(STEP_COL)[codes]
-    slanted = (codes % 2 == 1) & (rules["edge"] == "octile")
-    step = pace[r, c].astype(np.float64) * np.where(slanted, np.sqrt(2.0), 1.0)
-    np.testing.assert_allclose(mine[rows, cols], mine[r, c] + step, rtol=1e-5)
-
-
-def random_grids(count: int, seed: int, most: int) -> None:
-    rng = np.random.default_rng(seed)
-    for n in range(count):
-        rows, cols = (int(side) for side in rng.integers(1, most, 2))
-        pace = random_pace(rng, rows, cols, RATIOS[n % 7], WALLS[n // 7 % 4])
-        target = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-        assert_equals_dijkstra(pace, target, RULES[n // 28 % 5])
+from swarm.grid import GridSpec
 
 
 def test_a_thousand_random_grids_equal_dijkstra() -> None:
@@ -147,14 +110,14 @@ _SMALL = """
 import sys
 sys.path.insert(0, {tests!r})
 import numpy as np
-from laws import test_tree_under_every_strategy as laws
+from support.kernel_oracle import random_grids
+from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
-from unit.planner_service import test_kernels
 from swarm.config.scenario import PlannerConfig
-test_kernels.random_grids({count}, 5, 9)
+random_grids({count}, 5, 9)
 for strategy in ("full", "variable_range", "rotation", "multi_resolution"):
     pace = random_pace(np.random.default_rng(1), 9, 11, 6.0, 0.2)
-    play = laws.Play(pace, PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9))
+    play = Play(pace, PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9))
     first = (Move(1, 0), Job("begin"), Marks(3, 3), Move(0, 1), Job("end"))
     for event in (*first, Move(1, 1), Move(5, 5), Marks(4, 3)):
         play.happen(event)
@@ -167,7 +130,7 @@ print("fine")
 def test_kernels_do_the_same_uncompiled_and_never_leave_their_arrays(
     setting: str, count: int, tmp_path: Path
 ) -> None:
-    here = Path(__file__).parents[2]
+    here = Path(__file__).parents[1]
     environment = {**os.environ, setting: "1", "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(here.parent)}
     script = _SMALL.format(tests=str(here), count=count)
     done = subprocess.run(
