@@ -39,10 +39,9 @@ from vehicle_agent.driving.vehicle import (
     Vehicle,
     VehicleAction,
 )
-from vehicle_agent.placement import nearest_free
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.deadlock import Traffic
-from vehicle_agent.traffic.resumption import Resumption
+from vehicle_agent.traffic.resumption import Placement, Unplaced
 from vehicle_agent.traffic.right_of_way import RightOfWay
 from vehicle_agent.traffic.territory import SharedGround
 
@@ -96,7 +95,7 @@ class LocalMap:
 
 
 class Agent:
-    """The vehicles of one agent process. Call `placed_by` once, then in each tick `drive` until it returns None,
+    """The vehicles of one agent process. Call `place` once, then in each tick `drive` until it returns None,
     writing down what it found, and `decide`."""
 
     def __init__(
@@ -115,7 +114,6 @@ class Agent:
         self.targets = list(plan.group.targets) or scenario.target_ids
         self.rights = RightOfWay(plan.id, incarnation, spawns, shared_ground)
         self.blocked_ticks = 0
-        self._spawns = spawns[plan.id]
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = ground
@@ -125,7 +123,7 @@ class Agent:
         self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance, presence)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
-        self._homeless: dict[str, int] = {}
+        self._unplaced = Unplaced(ground.grid, self.rights, self._traffic.closed)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         self._cost_request: AskCosts | None = None
@@ -140,52 +138,24 @@ class Agent:
 
     # --- where everybody starts -----------------------------------------------------------------------------
 
-    def placed_by(self, known: Resumption) -> None:
-        """Put the vehicles where they last stood, as far as anybody knows, else where they start."""
-        for claims in known.others:
+    def place(self, placement: Placement) -> None:
+        """Put the vehicles where they stand, and take in what was learnt of everybody's claims."""
+        for claims in placement.claims:
             self.rights.heard(claims)
-        last = known.last_words
-        if last is not None:
-            self.rights.heard(last)
-        for id in self.plan.vehicle_ids:
-            cell, known_there = self._spawns[id], last is None
-            if last is not None and last.holds.get(id):
-                cell, known_there = last.holds[id][0], True
-            # Whoever spoke of itself without this vehicle had not found a place for it: others may be there.
-            if known_there and 0 <= cell < self._map.grid.cells and self.rights.holder(cell) is None:
-                self._place(id, cell)
-            else:
-                self._homeless[id] = min(cell, self._map.grid.cells - 1)
-
-    def _place(self, id: str, cell: int) -> None:
-        if not self.rights.holds(id):
+        for id, cell in placement.cells.items():
             self.rights.place(id, cell)
+            self._enter(id, cell)
+        self._unplaced.add(placement.unplaced)
+
+    def _enter(self, id: str, cell: int) -> None:
         self.vehicles[id] = Vehicle(id, self._map.grid, cell)
         self._look_from[cell] = None
 
-    def _house(self) -> None:
-        """Those whose last place somebody else may stand on take the nearest cell that they are granted."""
-        for id, wish in list(self._homeless.items()):
-            held = self.rights.holds(id)
-            if held:
-                del self._homeless[id]
-                self._place(id, held[0])
-                continue
-            wanted = self.rights.wants(id)
-            if wanted and self.rights.holder(wanted[0]) is None:
-                continue
-            free = nearest_free(self._map.grid, wish, self._is_free)
-            if free is not None:
-                self.rights.ask(id, [free])
-
-    def _is_free(self, cell: int) -> bool:
-        return not self._traffic.closed(cell) and self.rights.holder(cell) is None
-
     @property
     def places(self) -> list[int]:
-        """The cells on which we claim something or mean to: our ground has to cover them."""
+        """The cells that we hold, want, or mean to want: our territory has to cover them."""
         claimed = [cell for id in self.vehicles for cell in (*self.rights.holds(id), *self.rights.wants(id))]
-        return [*claimed, *self._homeless.values()]
+        return [*claimed, *self._unplaced.cells]
 
     # --- driving --------------------------------------------------------------------------------------------
 
@@ -252,7 +222,8 @@ class Agent:
 
     def decide(self, now_ns: int) -> list[AgentAction]:
         """What each vehicle does next: whom to ask, which cells to claim."""
-        self._house()
+        for id, cell in self._unplaced.settle():
+            self._enter(id, cell)
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0

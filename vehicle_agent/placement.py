@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,17 +42,6 @@ def spawn_cells(
         plan.id: dict(zip(plan.vehicle_ids, placed[plan.group.name][plan.first :], strict=False))
         for plan in plan_agents(scenario)
     }
-
-
-def nearest_free(grid: GridSpec, wish: int, is_free: Callable[[int], bool], reach: int = 8) -> int | None:
-    """The free cell next to `wish`, in rings around it; None if there is none within reach."""
-    for half in range(reach + 1):
-        near = grid.around(wish, half)
-        for row in range(near.row0, near.row1):
-            for cell in range(row * grid.cols + near.col0, row * grid.cols + near.col1):
-                if grid.distance_cells(wish, cell) == half and is_free(cell):
-                    return cell
-    return None
 
 
 def _along_a_curve(grid: GridSpec, cells: NDArray[np.int64]) -> NDArray[np.int64]:

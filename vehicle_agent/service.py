@@ -40,12 +40,7 @@ from vehicle_agent.traffic.territory import PLOT_CELLS, SharedGround
 
 log = logging.getLogger(__name__)
 
-_SETTLE_NS = NS_PER_S // 5
-"""So long a starting agent lets the others learn of it before it asks where everybody stands: from then on they
-wait for its word before they enter anything."""
 _RESUME_TIMEOUT_S = 2.0
-_ASK_AGAIN_NS = NS_PER_S // 10
-_ASK_AGAIN_AT_LAST_NS = NS_PER_S
 _MOURN_NS = NS_PER_S // 2
 """An agent whose token fell is waited for a little longer: if our own link is cut, word of that may come later."""
 _NEAR_CELLS = 4
@@ -53,10 +48,6 @@ _GROUND_LEAD_CELLS = 24
 """A plot is asked for so far ahead of its first claim: the answers are there before a vehicle is."""
 _GROUNDS_TIMEOUT_S = 1.0
 _CLAIMS_IDLE_NS = NS_PER_S // 2
-_FIRST_START_NS = 5 * NS_PER_S
-_ALONE_NS = 30 * NS_PER_S
-"""An agent that starts later in a run than the first and sees no other waits so long before it takes itself to be
-alone: more likely it is cut off, and its vehicles do not stand where they began."""
 
 
 class AgentService:
@@ -118,9 +109,9 @@ class AgentService:
         )
         self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation, self._presence, self._ground)
         self._fleet = FleetReport(grid, self._author, group)
-        self._resumption: Resumption | None = Resumption(plan.id)
-        self._resume_due_ns: int | None = None
-        self._resume_tries = 0
+        since_run_ns = setup.incarnation - setup.started_ns
+        self._resumption: Resumption | None = Resumption(plan.id, spawns, grid.cells, since_run_ns)
+        """None once the vehicles are placed."""
         self._roster = Roster()
         self._mourned_ns: dict[str, int] = {}
         self._link_up = True
@@ -128,9 +119,6 @@ class AgentService:
         self._lease_ns = lease_ns
         self._claims_due_ns = 0
         self._asked_ns: dict[str, int] = {}
-        restarted = setup.incarnation - setup.started_ns > _FIRST_START_NS
-        self._expects_others = restarted and len(plan_agents(scenario)) > 1
-        self._alone_ns = 0
 
     @property
     def agent(self) -> Agent:
@@ -149,8 +137,8 @@ class AgentService:
             for target in sorted(self._untracked):
                 self._bus.subscribe(SIGHTED, self._post, target=target)
         self._bus.subscribe(PUSHED_ROUTE, self._post, agent=self._setup.id)
-        self._resume_due_ns = now_ns + _SETTLE_NS
-        self._alone_ns = now_ns + _ALONE_NS
+        if self._resumption is not None:
+            self._resumption.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._feed.handle(event, now_ns):
@@ -199,9 +187,8 @@ class AgentService:
                 event.end()
             case Appeared(peer):
                 self._roster.appeared(peer)
-                if self._resume_due_ns is not None and self._resume_tries and peer.role == "agent":
-                    self._resume_tries = 0
-                    self._resume_due_ns = min(self._resume_due_ns, now_ns + _ASK_AGAIN_NS)
+                if self._resumption is not None and peer.role == "agent":
+                    self._resumption.agent_appeared(now_ns)
                 self._mourned_ns.pop(peer.id if peer.role == "agent" else "", None)
                 self._roster_changed(now_ns)
             case Disappeared(peer):
@@ -222,8 +209,7 @@ class AgentService:
         self._member.tick(now_ns)
         self._feed.tick(now_ns)
         if self._resumption is not None:
-            if self._resume_due_ns is not None and now_ns >= self._resume_due_ns:
-                self._resume_due_ns = None
+            if self._resumption.ask_now(now_ns):
                 tag = f"claims-{now_ns}"
                 self._bus.ask(CLAIMS, Nothing(), self._post, tag=tag, timeout_s=_RESUME_TIMEOUT_S)
             return
@@ -261,24 +247,20 @@ class AgentService:
     # --- where everybody starts -----------------------------------------------------------------------------
 
     def _place_if_known(self, now_ns: int) -> None:
-        """All have been asked where they stand: place the vehicles, or ask again if somebody has not answered."""
-        known = self._resumption
-        if known is None:
+        """The question where everybody stands has ended."""
+        if self._resumption is None:
             return
         agents = self._roster.alive("agent")
-        cut_off = not agents and self._expects_others and now_ns < self._alone_ns
-        if cut_off or not known.complete(agents):
-            # Where many agents start at once on a slow machine, each asks all the others again and again.
-            self._resume_due_ns = now_ns + min(_ASK_AGAIN_NS << self._resume_tries, _ASK_AGAIN_AT_LAST_NS)
-            self._resume_tries += 1
+        placement = self._resumption.question_ended(agents, now_ns)
+        if placement is None:
             return
         self._resumption = None
         self._ground.set_alive(agents)
         self._agent.rights.set_alive(agents)
-        self._agent.placed_by(known)
+        self._agent.place(placement)
         self._agent.set_planners(self._roster.alive("planner"), now_ns)
         count = len(self._agent.vehicles)
-        if known.last_words is None:
+        if not placement.resumed:
             log.info("%d vehicles start", count)
         else:
             log.info("%d vehicles go on where they last stood", count)

@@ -119,7 +119,7 @@ class RightOfWay:
         if claims.seq == 0:
             return
         known = self._others.get(claims.agent)
-        if known is not None and (claims.incarnation, claims.seq) <= _stamp(known.claims):
+        if known is not None and (claims.incarnation, claims.seq) <= stamp_of(known.claims):
             return
         if self._ground is not None and self._ground.is_far(claims.agent):
             return  # it was a neighbour when it said this
@@ -260,7 +260,7 @@ class RightOfWay:
                 for vehicle, mine in self._mine.items()
                 for want in mine.wants
             ],
-            seen={agent: _stamp(other.claims) for agent, other in self._others.items() if other.claims.seq},
+            seen={agent: stamp_of(other.claims) for agent, other in self._others.items() if other.claims.seq},
         )
 
     # --- what one may ask -----------------------------------------------------------------------------------
@@ -347,5 +347,6 @@ class RightOfWay:
         return False
 
 
-def _stamp(claims: Claims) -> tuple[int, int]:
+def stamp_of(claims: Claims) -> tuple[int, int]:
+    """Orders the claims of one agent: the larger is the newer."""
     return claims.incarnation, claims.seq

@@ -294,7 +294,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
     spawns = spawn_cells(scenario, grid, level, level)
     ground = LocalMap(grid, level, level, level, level, climb)
     agent = Agent(plan_agents(scenario)[0], scenario, ground, TruthSensor(grid, level, 20.0), spawns, 1)
-    agent.placed_by(Resumption("a0"))
+    agent.place(Resumption("a0", spawns, grid.cells).placement({}))
     agent.set_planners({"t": 1}, 0)
     x_m, y_m = grid.centre_m(target)
     agent.hear_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=target, x_m=x_m, y_m=y_m), 0)

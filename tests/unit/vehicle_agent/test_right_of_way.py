@@ -29,7 +29,7 @@ class Process:
         self.rights = RightOfWay(agent, incarnation, SPAWNS)
         self.incarnation = incarnation
         self.alive: dict[str, int] = {}
-        self.gathering: Resumption | None = Resumption(agent)
+        self.gathering: Resumption | None = Resumption(agent, SPAWNS, len(CELLS))
 
     def see(self, alive: dict[str, int]) -> None:
         self.alive = alive
@@ -94,14 +94,12 @@ class Swarm:
         if not gathered.complete(newcomer.alive):
             return  # somebody has not noticed yet that a third is dead, whose last words are missing: ask again
         newcomer.gathering = None
-        last = gathered.last_words
-        for claims in [*gathered.others, *([] if last is None else [last])]:
+        placement = gathered.placement(newcomer.alive)
+        for claims in placement.claims:
             newcomer.rights.heard(claims)
         del self.ghosts[agent]
-        for vehicle, spawn in SPAWNS[agent].items():
-            cell = spawn if last is None else last.holds.get(vehicle, [None])[0]
-            if cell is not None and newcomer.rights.holder(cell) is None:
-                newcomer.rights.place(vehicle, cell)
+        for vehicle, cell in placement.cells.items():
+            newcomer.rights.place(vehicle, cell)
 
     def notice_death(self, observer: str, agent: str) -> None:
         process = self.live.get(observer)
@@ -143,8 +141,6 @@ class Swarm:
         process = self.live.get(observer)
         if process is not None:
             process.rights.heard(claims)
-            if process.gathering is not None:
-                process.gathering.heard(claims)
 
     def deliver_all(self, observer: str) -> None:
         for claims in self.sent[-2 * len(AGENTS) :]:
@@ -457,7 +453,7 @@ def test_a_newcomer_waits_until_the_last_words_that_anybody_heard_have_come_thro
     a, b = pair()
     b.ask("v", [2])
     exchange(a, b)
-    gathered = Resumption("b")
+    gathered = Resumption("b", {"a": {"u": 0}, "b": {"v": 1}}, 14)
     own, *_ = [claims for claims in a.answers() if claims.agent == "a"]
     gathered.answered(own)
     assert not gathered.complete({"a": 1})
@@ -465,8 +461,9 @@ def test_a_newcomer_waits_until_the_last_words_that_anybody_heard_have_come_thro
     for claims in a.answers():
         gathered.answered(claims)
     assert gathered.complete({"a": 1})
-    assert gathered.last_words is not None
-    assert gathered.last_words.holds == {"v": [1]}
+    placement = gathered.placement({"a": 1})
+    assert placement.resumed
+    assert placement.cells == {"v": 1}
 
 
 def test_whoever_has_not_placed_its_vehicles_yet_takes_nothing_back() -> None:

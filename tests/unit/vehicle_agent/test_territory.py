@@ -34,7 +34,7 @@ class Process:
         self.near = Interest(GRID, 0, square_cells=PLOT_CELLS)
         self.rights = RightOfWay(agent, incarnation, SPAWNS, self.ground)
         self.alive: dict[str, int] = {}
-        self.gathering: Resumption | None = Resumption(agent)
+        self.gathering: Resumption | None = Resumption(agent, SPAWNS, GRID.cells)
 
     def see(self, alive: dict[str, int]) -> None:
         self.alive = dict(alive)
@@ -113,14 +113,12 @@ class Swarm:
         if not gathered.complete(newcomer.alive):
             return
         newcomer.gathering = None
-        last = gathered.last_words
-        for claims in [*gathered.others, *([] if last is None else [last])]:
+        placement = gathered.placement(newcomer.alive)
+        for claims in placement.claims:
             newcomer.rights.heard(claims)
         del self.ghosts[agent]
-        for vehicle, spawn in SPAWNS[agent].items():
-            cell = spawn if last is None else last.holds.get(vehicle, [None])[0]
-            if cell is not None and newcomer.rights.holder(cell) is None:
-                newcomer.rights.place(vehicle, cell)
+        for vehicle, cell in placement.cells.items():
+            newcomer.rights.place(vehicle, cell)
         newcomer.wish()
 
     def notice_death(self, observer: str, agent: str) -> None:
