@@ -18,27 +18,11 @@ from swarm.config.scenario import AgentPlan, Scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Claims, VehicleState
+from swarm.wire.messages.vehicles import Claims
 from swarm.wire.routes import Route, RouteStatus
-from vehicle_agent.assignment import choose
+from vehicle_agent.assignment import AskCosts, Assignment
 from vehicle_agent.driving.route_follower import route_cells
-from vehicle_agent.driving.vehicle import (
-    AskRoute,
-    Assigned,
-    Follow,
-    NoAnswer,
-    NoWay,
-    PlannerBack,
-    PlannerGone,
-    RouteCut,
-    RouteGiven,
-    RouteRefused,
-    TargetJumped,
-    TargetLeft,
-    TargetReached,
-    Vehicle,
-    VehicleAction,
-)
+from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.deadlock import Traffic
 from vehicle_agent.traffic.resumption import Placement, Unplaced
@@ -46,8 +30,6 @@ from vehicle_agent.traffic.right_of_way import RightOfWay
 from vehicle_agent.traffic.territory import SharedGround
 
 _LONGEST_STEP_S = 0.5
-_RETRY_NS = NS_PER_S // 2
-_STRANDED_RETRY_NS = 3 * NS_PER_S
 _STALE_CELLS = 8
 """A route that ends so far from where the target was last seen is of an older tree: ask again."""
 
@@ -64,16 +46,7 @@ class AskRoutes:
     reroutes: int
 
 
-@dataclass(frozen=True, slots=True)
-class AskCosts:
-    """One request to every planner: the cost-to-go of these cells."""
-
-    request: int
-    vehicles: tuple[str, ...]
-    cells: tuple[int, ...]
-
-
-AgentAction = AskRoutes | AskCosts | Follow
+AgentAction = AskRoutes | AskCosts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,12 +99,9 @@ class Agent:
         self._unplaced = Unplaced(ground.grid, self.rights, self._traffic.closed)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
-        self._cost_request: AskCosts | None = None
-        self._costs: dict[str, NDArray[np.float32]] = {}
-        # Agents ask one after the other, not all at once.
-        self._reassign_ns = int(self._config.reassign_s * NS_PER_S)
-        self._assign_due_ns = 0
-        self._stagger_ns = int(chance.random() * self._reassign_ns)
+        self._assignment = Assignment(
+            self.targets, self._config.reassign_s, self._config.hysteresis, chance.random()
+        )
         self._driven_ns: int | None = None
         self._left_s: dict[str, float] = {}
         self._look_from: dict[int, None] = {}
@@ -214,7 +184,7 @@ class Agent:
         for vehicle in self.vehicles.values():
             ahead = vehicle.route.ahead()
             if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._traffic.closed):
-                vehicle.handle(RouteCut(), now_ns)
+                vehicle.cut_route(now_ns)
             if look:
                 self._look_from[vehicle.cell] = None
 
@@ -228,10 +198,10 @@ class Agent:
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0
         for vehicle in self.vehicles.values():
-            self._check_reach(vehicle, now_ns)
-            for action in vehicle.tick(now_ns):
-                if isinstance(action, AskRoute):
-                    asks.setdefault((action.target, action.force), []).append(action)
+            self._check_reach(vehicle)
+            ask = vehicle.route_request(now_ns)
+            if ask is not None:
+                asks.setdefault((ask.target, ask.force), []).append(ask)
             in_reach = partial(self._in_reach, vehicle.target)
             self.blocked_ticks += self._traffic.steer(vehicle, in_reach, now_ns)
         for (target_id, force), batch in asks.items():
@@ -246,18 +216,10 @@ class Agent:
             )
             self._route_requests[request.request] = request
             actions.append(request)
-        if now_ns >= self._assign_due_ns and self._cost_request is None and self.vehicles:
-            actions.append(self._ask_costs(now_ns))
+        if self.vehicles and self._assignment.due(now_ns):
+            self._requests += 1
+            actions.append(self._assignment.ask(self._requests, self.vehicles, now_ns))
         return actions
-
-    def _ask_costs(self, now_ns: int) -> AskCosts:
-        self._requests += 1
-        self._costs = {}
-        cells = tuple(vehicle.cell for vehicle in self.vehicles.values())
-        self._cost_request = AskCosts(self._requests, tuple(self.vehicles), cells)
-        first = self._assign_due_ns == 0
-        self._assign_due_ns = now_ns + (self._stagger_ns if first else self._reassign_ns)
-        return self._cost_request
 
     def _in_reach(self, target: str | None, cell: int) -> bool:
         pose = self._poses.get(target) if target is not None else None
@@ -268,10 +230,10 @@ class Agent:
         cols = cell % grid.cols - pose.cell % grid.cols
         return math.hypot(rows, cols) * grid.resolution_m <= self._config.capture_range_m
 
-    def _check_reach(self, vehicle: Vehicle, now_ns: int) -> None:
+    def _check_reach(self, vehicle: Vehicle) -> None:
         near = self._in_reach(vehicle.target, vehicle.cell)
         if near != vehicle.in_reach:
-            vehicle.handle(TargetReached() if near else TargetLeft(), now_ns)
+            vehicle.set_in_reach(near)
 
     # --- what is heard --------------------------------------------------------------------------------------
 
@@ -288,9 +250,9 @@ class Agent:
         if known is not None and pose.jumps != known.jumps:
             for vehicle in self.vehicles.values():
                 if vehicle.target == pose.target:
-                    self._check_reach(vehicle, now_ns)
-                    vehicle.handle(TargetJumped(), now_ns)
-            self._assign_due_ns = min(self._assign_due_ns, now_ns + _RETRY_NS)
+                    self._check_reach(vehicle)
+                    vehicle.target_jumped(now_ns)
+            self._assignment.ask_soon(now_ns)
 
     def set_planners(self, alive: Mapping[str, int], now_ns: int) -> None:
         """Which planners are there now, and in which incarnation."""
@@ -300,17 +262,17 @@ class Agent:
             if target is None:
                 continue
             if target not in alive and not vehicle.planner_gone:
-                vehicle.handle(PlannerGone(), now_ns)
+                vehicle.lose_planner(now_ns)
             elif target in alive and (vehicle.planner_gone or before.get(target) != alive[target]):
-                vehicle.handle(PlannerBack(), now_ns)
+                vehicle.regain_planner(now_ns)
         if any(target not in before for target in alive):
-            self._assign_due_ns = min(self._assign_due_ns, now_ns + _RETRY_NS)
+            self._assignment.ask_soon(now_ns)
 
-    def routes_given(self, request: int, reply: RouteReply, now_ns: int) -> list[VehicleAction]:
+    def routes_given(self, request: int, reply: RouteReply, now_ns: int) -> list[Follow]:
         asked = self._route_requests.pop(request, None)
         if asked is None:
             return []
-        actions: list[VehicleAction] = []
+        begun: list[Follow] = []
         pose = self._poses.get(asked.target)
         stale = (
             pose is not None
@@ -321,63 +283,48 @@ class Agent:
         for index, id in enumerate(asked.vehicles):
             vehicle = self.vehicles[id]
             if index >= len(reply.routes) or stale:
-                vehicle.handle(NoAnswer(), now_ns)
+                vehicle.no_answer(now_ns)
             else:
-                actions += self._take(vehicle, asked.target, reply.routes[index], now_ns, pushed=False)
-        return actions
+                begun += self._take(vehicle, asked.target, reply.routes[index], now_ns, pushed=False)
+        return begun
 
     def routes_ended(self, request: int, now_ns: int) -> None:
         """Nobody will answer any more."""
         asked = self._route_requests.pop(request, None)
         for id in asked.vehicles if asked is not None else ():
-            self.vehicles[id].handle(NoAnswer(), now_ns)
+            self.vehicles[id].no_answer(now_ns)
 
-    def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[VehicleAction]:
+    def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[Follow]:
         vehicle = self.vehicles.get(pushed.vehicle)
         if vehicle is None:
             return []
         return self._take(vehicle, pushed.target, pushed.route, now_ns, pushed=True)
 
-    def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[VehicleAction]:
-        if route.status is not RouteStatus.OK:
-            return [] if pushed else vehicle.handle(RouteRefused(target, route.status), now_ns)
-        cells = route_cells(self._map.grid, route.start, route.directions)
+    def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Follow]:
+        cells = (
+            route_cells(self._map.grid, route.start, route.directions) if route.status is RouteStatus.OK else None
+        )
         if cells is None:
-            return [] if pushed else vehicle.handle(NoAnswer(), now_ns)
-        goes_on = route.remaining_s > 0.0
-        given = RouteGiven(target, cells, route.cost_s, route.lower_bound_s, goes_on, pushed)
-        actions = vehicle.handle(given, now_ns)
-        if actions and vehicle.route.cut(self._traffic.closed):
-            vehicle.handle(RouteCut(), now_ns)
-        return actions
+            if not pushed and route.status is RouteStatus.OK:
+                vehicle.no_answer(now_ns)
+            elif not pushed:
+                vehicle.refuse_route(target, route.status, now_ns)
+            return []
+        partial = route.remaining_s > 0.0
+        given = GivenRoute(target, cells, route.cost_s, route.lower_bound_s, partial, pushed)
+        begun = vehicle.give_route(given, now_ns)
+        if begun is None:
+            return []
+        if vehicle.route.cut(self._traffic.closed):
+            vehicle.cut_route(now_ns)
+        return [begun]
+
+    # --- which target ---------------------------------------------------------------------------------------
 
     def costs_given(self, request: int, target: str, costs_s: NDArray[np.float32]) -> None:
-        asked = self._cost_request
-        if asked is not None and asked.request == request and len(costs_s) == len(asked.cells):
-            self._costs[target] = costs_s
+        """One planner's answer to `AskCosts`: float32 seconds, one per vehicle asked for."""
+        self._assignment.costs_given(request, target, costs_s)
 
     def costs_ended(self, request: int, now_ns: int) -> None:
-        """All planners have answered that will: each vehicle takes the cheapest target."""
-        asked = self._cost_request
-        if asked is None or asked.request != request:
-            return
-        self._cost_request = None
-        stuck = not self._costs
-        for index, id in enumerate(asked.vehicles):
-            vehicle = self.vehicles[id]
-            costs = {target: float(column[index]) for target, column in self._costs.items()}
-            given_up = vehicle.planner_gone and not vehicle.route.left
-            given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
-            choice = choose(
-                costs, self.targets, self._planners, vehicle.target, self._config.hysteresis, not given_up
-            )
-            if choice.target is not None:
-                vehicle.handle(Assigned(choice.target), now_ns)
-                if vehicle.target not in self._planners and not vehicle.planner_gone:
-                    vehicle.handle(PlannerGone(), now_ns)
-            elif choice.settled:
-                vehicle.handle(NoWay(), now_ns)
-            stuck = stuck or vehicle.state in (VehicleState.IDLE, VehicleState.STRANDED)
-        if stuck:
-            retry_ns = _RETRY_NS if not self._costs else _STRANDED_RETRY_NS
-            self._assign_due_ns = min(self._assign_due_ns, now_ns + retry_ns)
+        """No more answers to `AskCosts` will come."""
+        self._assignment.costs_ended(request, self.vehicles, self._planners, now_ns)

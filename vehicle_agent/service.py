@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -29,8 +30,9 @@ from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, Ro
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Claims, Fleet, Followed, Grounds, VehicleState
 from swarm.wire.topics import CLAIMS, COST, FLEET, FOLLOWED, GROUNDS, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, TRUE_POSE
-from vehicle_agent.agent import Agent, AgentAction, AskCosts, AskRoutes, LocalMap
-from vehicle_agent.driving.vehicle import Follow, VehicleAction
+from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
+from vehicle_agent.assignment import AskCosts
+from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
@@ -359,21 +361,18 @@ class AgentService:
                 case AskCosts(request, _, cells):
                     costs = CostRequest(cells=list(cells))
                     self._bus.ask(COST, costs, self._post, tag=f"cost-{request}")
-                case Follow():
-                    self._publish_followed([action])
 
-    def _publish_followed(self, actions: list[VehicleAction]) -> None:
-        for action in actions:
-            if isinstance(action, Follow):
-                followed = Followed(
-                    vehicle=action.vehicle,
-                    target=action.target,
-                    start=action.cells[0],
-                    directions=directions_of(action.cells, self._cost_map.grid.cols),
-                    cost_s=action.cost_s,
-                    lower_bound_s=action.lower_bound_s,
-                )
-                self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=action.vehicle)
+    def _publish_followed(self, begun: Sequence[Follow]) -> None:
+        for route in begun:
+            followed = Followed(
+                vehicle=route.vehicle,
+                target=route.target,
+                start=route.cells[0],
+                directions=directions_of(route.cells, self._cost_map.grid.cols),
+                cost_s=route.cost_s,
+                lower_bound_s=route.lower_bound_s,
+            )
+            self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=route.vehicle)
 
     def _observe_query(self, tag: str, now_ns: int) -> None:
         asked_ns = self._asked_ns.pop(tag, None)

@@ -27,7 +27,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
-from vehicle_agent.driving.vehicle import MadeWay, MakesWay, StillBlocked, Vehicle
+from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.traffic.right_of_way import RightOfWay, Wanter
 
 _LONGEST_QUEUE = 40
@@ -199,14 +199,14 @@ class Traffic:
             note.aside = None
             note.wanted_since_ns = None
             note.patience_ns = self._patience(vehicle)
-            vehicle.handle(MadeWay(now_ns + 2 * note.patience_ns), now_ns)
+            vehicle.made_way(now_ns + 2 * note.patience_ns, now_ns)
             return False
         assert note.aside is not None
         given_up = now_ns - note.aside_since_ns > 4 * note.patience_ns or self.closed(note.aside)
         if given_up and self._rights.holds(vehicle.id)[1:2] != [note.aside]:
             note.aside = None
             note.patience_ns = self._patience(vehicle)
-            vehicle.handle(MadeWay(now_ns), now_ns)
+            vehicle.made_way(now_ns, now_ns)
             return False
         self._rights.ask(vehicle.id, [note.aside])
         return True
@@ -262,7 +262,7 @@ class Traffic:
         if waited_ns > 10 * note.patience_ns:
             note.blocked_since_ns = now_ns
             note.patience_ns = self._patience(vehicle)
-            vehicle.handle(StillBlocked(), now_ns)
+            vehicle.blocked_for_long(now_ns)
 
     def _step_aside(
         self,
@@ -293,7 +293,7 @@ class Traffic:
         note.aside = best[1]
         note.aside_since_ns = now_ns
         note.blocked_since_ns = None
-        vehicle.handle(MakesWay(), now_ns)
+        vehicle.make_way()
         self._rights.ask(vehicle.id, [note.aside])
         return True
 

@@ -21,7 +21,8 @@ from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
-from vehicle_agent.agent import Agent, AskCosts, AskRoutes, LocalMap
+from vehicle_agent.agent import Agent, AskRoutes, LocalMap
+from vehicle_agent.assignment import AskCosts
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.traffic.resumption import Resumption

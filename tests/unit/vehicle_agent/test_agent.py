@@ -18,8 +18,8 @@ from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Claims, VehicleState
 from swarm.wire.routes import RouteBatch
-from vehicle_agent.agent import Agent, AskCosts, AskRoutes, LocalMap
-from vehicle_agent.assignment import UNSETTLED, Choice, choose
+from vehicle_agent.agent import Agent, AskRoutes, LocalMap
+from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.fleet import FleetReport
 from vehicle_agent.placement import spawn_cells
