@@ -18,7 +18,6 @@ from swarm.config.scenario import AgentPlan, Scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Claims
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.assignment import AskCosts, Assignment
 from vehicle_agent.driving.route_follower import route_cells
@@ -236,9 +235,6 @@ class Agent:
             vehicle.set_in_reach(near)
 
     # --- what is heard --------------------------------------------------------------------------------------
-
-    def hear_claims(self, claims: Claims) -> None:
-        self.rights.heard(claims)
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         known = self._poses.get(pose.target)

@@ -5,14 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.cost_map import CostMap
 from shared_map.presence import Presence
 from shared_map.replication.filter import Reading, author_of, readable_groups
-from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapFeed
 from shared_map.sightings import Sightings, pose_of
@@ -21,7 +19,6 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, He
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import plan_agents
 from swarm.errors import ConfigError
-from swarm.liveness import Roster
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
@@ -37,19 +34,16 @@ from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.sensing.target_detector import Lookout
+from vehicle_agent.traffic.live_peers import LivePeers
+from vehicle_agent.traffic.neighbourhood import Neighbourhood
 from vehicle_agent.traffic.resumption import Resumption
-from vehicle_agent.traffic.territory import PLOT_CELLS, SharedGround
+from vehicle_agent.traffic.territory import SharedGround
 
 log = logging.getLogger(__name__)
 
 _RESUME_TIMEOUT_S = 2.0
-_MOURN_NS = NS_PER_S // 2
-"""An agent whose token fell is waited for a little longer: if our own link is cut, word of that may come later."""
 _NEAR_CELLS = 4
-_GROUND_LEAD_CELLS = 24
-"""A plot is asked for so far ahead of its first claim: the answers are there before a vehicle is."""
 _GROUNDS_TIMEOUT_S = 1.0
-_CLAIMS_IDLE_NS = NS_PER_S // 2
 
 
 class AgentService:
@@ -89,17 +83,9 @@ class AgentService:
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
         agents = [each.id for each in plan_agents(scenario)]
-        self._ground = SharedGround(plan.id, setup.incarnation, grid, agents)
-        lead_cells = scenario.vehicles.claim_cells + _GROUND_LEAD_CELLS
-        self._plots = Interest(grid, lead_cells, square_cells=PLOT_CELLS)
-        self._regions = Interest(grid, lead_cells)
-        # What is written must be in sight of what others say about the place.
-        reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
-        self._map_near = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
-        self._listens_to: frozenset[str] = frozenset()
+        territory = SharedGround(plan.id, setup.incarnation, grid, agents)
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
         self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.reading)
-        self._looks_at: frozenset[int] = frozenset()
         self._untracked = scenario.untracked
         self._sightings = Sightings(self._replica.reading)
         self._lookout = Lookout(
@@ -109,17 +95,13 @@ class AgentService:
             scenario.vehicles.sense_range_m,
             scenario.vehicles.sighting_lasts_s,
         )
-        self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation, self._presence, self._ground)
+        self._agent = Agent(plan, scenario, local, sensor, spawns, setup.incarnation, self._presence, territory)
+        self._neighbourhood = Neighbourhood(grid, scenario, self._agent.rights, territory)
+        self._peers = LivePeers(lease_ns)
         self._fleet = FleetReport(grid, self._author, group)
         since_run_ns = setup.incarnation - setup.started_ns
         self._resumption: Resumption | None = Resumption(plan.id, spawns, grid.cells, since_run_ns)
         """None once the vehicles are placed."""
-        self._roster = Roster()
-        self._mourned_ns: dict[str, int] = {}
-        self._link_up = True
-        self._trust_roster_ns = 0
-        self._lease_ns = lease_ns
-        self._claims_due_ns = 0
         self._asked_ns: dict[str, int] = {}
 
     @property
@@ -148,7 +130,7 @@ class AgentService:
         agent = self._agent
         match event:
             case Heard(message=Claims() as claims):
-                agent.hear_claims(claims)
+                agent.rights.heard(claims)
             case Heard(message=Fleet() as fleet):
                 self._presence.hear(fleet, now_ns)
             case Heard(topic=topic, message=TargetPose() as pose):
@@ -170,9 +152,7 @@ class AgentService:
                 if self._resumption is not None:
                     self._resumption.answered(claims)
             case Replied(tag=tag, message=Grounds() as grounds):
-                for claims in grounds.words:
-                    agent.hear_claims(claims)
-                self._ground.answered(grounds, _number(tag))
+                self._neighbourhood.answered(grounds, _number(tag))
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
                 self._asked_ns.pop(tag, None)
                 agent.routes_ended(_number(tag), now_ns)
@@ -183,27 +163,19 @@ class AgentService:
             case Asked(topic=topic) if topic is CLAIMS:
                 self._answer(event)
             case Asked(topic=topic, request=Grounds() as grounds) if topic is GROUNDS:
-                self._ground.told(grounds)
-                words = agent.rights.words_of(grounds.silent)
-                event.answer(msgspec.structs.replace(self._ground.answer(), words=words))
+                event.answer(self._neighbourhood.answer(grounds))
                 event.end()
             case Appeared(peer):
-                self._roster.appeared(peer)
+                self._peers.appeared(peer)
                 if self._resumption is not None and peer.role == "agent":
                     self._resumption.agent_appeared(now_ns)
-                self._mourned_ns.pop(peer.id if peer.role == "agent" else "", None)
-                self._roster_changed(now_ns)
+                self._peers_changed(now_ns)
             case Disappeared(peer):
-                self._roster.gone(peer)
-                if peer.role == "agent" and not self._roster.is_alive("agent", peer.id):
-                    self._mourned_ns[peer.id] = now_ns + _MOURN_NS
-                self._roster_changed(now_ns)
+                self._peers.disappeared(peer, now_ns)
+                self._peers_changed(now_ns)
             case LinkChanged(up=up, beyond=beyond):
-                # Cut off, we hear no wants: nobody enters anything new before the others are heard of again. That a
-                # router appeared may be read after our own link has gone, and does not bring it back.
-                self._link_up = self._link_up if beyond else up
-                self._trust_roster_ns = now_ns + self._lease_ns
-                self._ground.ask_anew()
+                self._peers.link_changed(up, beyond, now_ns)
+                self._neighbourhood.link_changed()
             case _:
                 pass
 
@@ -217,13 +189,11 @@ class AgentService:
             return
         agent = self._agent
         self._note_map(now_ns)
-        if any(due_ns <= now_ns for due_ns in self._mourned_ns.values()):
-            self._mourned_ns = {id: due_ns for id, due_ns in self._mourned_ns.items() if due_ns > now_ns}
-            self._roster_changed(now_ns)
-        self._come_to_terms(now_ns)
+        if self._peers.expire(now_ns):
+            self._peers_changed(now_ns)
+        self._follow(now_ns)
         self._presence.expire(now_ns)
-        may_enter = self._link_up and now_ns >= self._trust_roster_ns
-        if may_enter:
+        if self._peers.trusted(now_ns):
             agent.rights.grant()
         agent.begin_drive(now_ns)
         while (findings := agent.drive(now_ns)) is not None:
@@ -238,8 +208,7 @@ class AgentService:
         for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
             self._presence.hear(fleet, now_ns)
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
-        if agent.rights.restless or now_ns >= self._claims_due_ns:
-            self._claims_due_ns = now_ns + _CLAIMS_IDLE_NS
+        if agent.rights.speaks(now_ns):
             self._bus.publish(CLAIMS, agent.rights.speak(), agent=self._setup.id)
         self._gauge()
 
@@ -252,15 +221,14 @@ class AgentService:
         """The question where everybody stands has ended."""
         if self._resumption is None:
             return
-        agents = self._roster.alive("agent")
+        agents = self._peers.agents_up
         placement = self._resumption.question_ended(agents, now_ns)
         if placement is None:
             return
         self._resumption = None
-        self._ground.set_alive(agents)
-        self._agent.rights.set_alive(agents)
+        self._neighbourhood.set_alive(agents)
         self._agent.place(placement)
-        self._agent.set_planners(self._roster.alive("planner"), now_ns)
+        self._agent.set_planners(self._peers.planners, now_ns)
         count = len(self._agent.vehicles)
         if not placement.resumed:
             log.info("%d vehicles start", count)
@@ -269,58 +237,31 @@ class AgentService:
             text = f"agent {self._setup.id} is back: {count} vehicles go on where they last stood"
             self._member.note(now_ns, "resumed", text)
 
-    def _come_to_terms(self, now_ns: int) -> None:
-        """Tell everybody in which plots we claim cells, and listen to whom that concerns."""
-        ground = self._ground
-        places = self._agent.places
-        ground.wish(self._plots.update(places))
-        self._feed.look_at(self._map_near.update(places))
-        regions = self._regions.update(places)
-        for region in sorted(regions - self._looks_at):
+    def _follow(self, now_ns: int) -> None:
+        """Subscribe to what concerns our vehicles where they are now, and claim new territory."""
+        following = self._neighbourhood.follow(self._agent.places, now_ns)
+        self._feed.look_at(following.map_regions)
+        for region in following.presence.begin:
             self._bus.subscribe(FLEET, self._post, region=region)
-        for region in sorted(self._looks_at - regions):
+        for region in following.presence.end:
             self._bus.unsubscribe(FLEET, region=region)  # what was heard there ends with its lease
-        self._looks_at = regions
-        question = ground.question(now_ns)
-        if question is not None:
-            self._bus.ask(
-                GROUNDS, question, self._post, tag=f"grounds-{question.seq}", timeout_s=_GROUNDS_TIMEOUT_S
-            )
-        self._agent.rights.forget_the_far()
-        if ground.heard_from == self._listens_to:
-            return
-        for agent in sorted(ground.heard_from - self._listens_to):
+        if following.question is not None:
+            tag = f"grounds-{following.question.seq}"
+            self._bus.ask(GROUNDS, following.question, self._post, tag=tag, timeout_s=_GROUNDS_TIMEOUT_S)
+        for agent in following.claims.begin:
             self._bus.subscribe(CLAIMS, self._post, agent=agent)
-        for agent in sorted(self._listens_to - ground.heard_from):
+        for agent in following.claims.end:
             self._bus.unsubscribe(CLAIMS, agent=agent)
-        self._listens_to = ground.heard_from
 
     def _answer(self, asked: Asked) -> None:
-        if self._resumption is not None:
-            # Present, but nothing is placed yet: sequence 0 takes nobody's claims back.
-            present = Claims(
-                agent=self._setup.id,
-                incarnation=self._setup.incarnation,
-                seq=0,
-                clock=0,
-                holds={},
-                wants=[],
-                seen={},
-            )
-            answers = [present]
-        else:
-            answers = self._agent.rights.answers()
-        for claims in answers:
+        rights = self._agent.rights
+        for claims in rights.answers() if self._resumption is None else [rights.unplaced()]:
             asked.answer(claims, agent=claims.agent)
         asked.end()
 
-    def _roster_changed(self, now_ns: int) -> None:
-        agents = self._roster.alive("agent")
-        for id in self._mourned_ns:
-            agents.setdefault(id, 0)
-        self._ground.set_alive(agents)
-        self._agent.rights.set_alive(agents)
-        self._agent.set_planners(self._roster.alive("planner"), now_ns)
+    def _peers_changed(self, now_ns: int) -> None:
+        self._neighbourhood.set_alive(self._peers.agents)
+        self._agent.set_planners(self._peers.planners, now_ns)
 
     # --- targets in sight -----------------------------------------------------------------------------------
 

@@ -12,12 +12,12 @@ al., "Priority inheritance with backtracking", 2019), and the lots are drawn ane
 
 from __future__ import annotations
 
-import heapq
 import math
 import random
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +28,12 @@ from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.traffic.detour import HORIZON_CELLS, Detours
 from vehicle_agent.traffic.right_of_way import RightOfWay, Wanter
 
 _LONGEST_QUEUE = 40
 _LOTS_LAST = 15.0
 """Lots are drawn anew after so many times the patience."""
-_DETOUR_CELLS = 6
-_DETOUR_HORIZON = 40
 _LOOK_AHEAD_CELLS = 5
 _CROWD_WEIGHT = 0.2
 _POLITE_NS = NS_PER_S * 3 // 10
@@ -78,8 +77,7 @@ class Traffic:
         self._cell_scale = grid.resolution_m / scenario.time_scale
         flat_s = self._cell_scale / scenario.cost.flat_speed_m_per_s
         self._lots_ns = max(1, int(_LOTS_LAST * (self._patience_s + 2 * flat_s) * NS_PER_S))
-        self._neighbours = scenario.planner.neighbours
-        self._corner_cutting = scenario.planner.corner_cutting
+        self._detours = Detours(grid, pace, scenario.planner.neighbours, scenario.planner.corner_cutting)
         self._chance = chance
         self._notes: dict[str, _Standing] = {}
 
@@ -94,7 +92,7 @@ class Traffic:
         return ahead[0] if ahead else None
 
     def closed(self, cell: int) -> bool:
-        return not math.isfinite(self._pace[cell])
+        return self._detours.closed(cell)
 
     def steer(self, vehicle: Vehicle, in_reach: Callable[[int], bool], now_ns: int) -> bool:
         """Claim what the vehicle needs next. True if somebody is in its way."""
@@ -275,7 +273,7 @@ class Traffic:
         """Head for the neighbour that is best out of the way. An occupied one is wanted, too: so it gets pushed."""
         here = vehicle.cell
         best: tuple[float, int] | None = None
-        for cell, _ in self._steps(here):
+        for cell, _ in self._detours.steps(here):
             if cell == wanter.stands_on or (in_reach is not None and not in_reach(cell)):
                 continue
             score = self._chance.random() + self._in_path(wanter.stands_on, here, cell)
@@ -315,26 +313,8 @@ class Traffic:
 
     # --- driving around -------------------------------------------------------------------------------------
 
-    def _steps(self, cell: int) -> list[tuple[int, float]]:
-        """Where one may go from a cell in one step, and how long the step is in cells."""
-        around: list[int | None] = [None] * 8
-        for direction, neighbour in self._grid.neighbours(cell):
-            if not self.closed(neighbour):
-                around[direction] = neighbour
-        steps: list[tuple[int, float]] = []
-        for direction, found in enumerate(around):
-            if found is None:
-                continue
-            if direction % 2 == 0:
-                steps.append((found, 1.0))
-            elif self._neighbours == 8:
-                sides = around[direction - 1] is not None and around[(direction + 1) % 8] is not None
-                if sides or self._corner_cutting:
-                    steps.append((found, math.sqrt(2.0)))
-        return steps
-
     def _look_ahead(self, vehicle: Vehicle, note: _Standing, in_reach: Callable[[int], bool], now_ns: int) -> None:
-        """Drive around whoever is parked on the route, before standing behind it."""
+        """Drive around a vehicle that is parked on the route, before standing behind it."""
         if now_ns < note.detour_due_ns or note.aside is not None or vehicle.state is not VehicleState.FOLLOWING:
             return
         entering = vehicle.motion.entering
@@ -350,46 +330,16 @@ class Traffic:
     def _detour(
         self, vehicle: Vehicle, in_reach: Callable[[int], bool], start: int | None = None, blocked: int = 0
     ) -> bool:
-        """Put a way around who stands ahead into the route, if there is one nearby over free cells.
+        """Put a detour over free cells into the route; False if there is none.
 
-        start    leave the route from this cell on, the one that is entered, instead of from the vehicle's own
-        blocked  which of the cells ahead is taken: come back to the route behind it
+        start    leave the route from this cell, which is being entered, instead of from the vehicle's own
+        blocked  which of the cells ahead is occupied
         """
         here = vehicle.cell if start is None else start
-        route = vehicle.route.ahead(_DETOUR_HORIZON)
-        rest_s: dict[int, float] = {}
-        total_s = 0.0
-        for index in range(len(route) - 1, blocked, -1):
-            rest_s[route[index]] = total_s
-            total_s += float(self._pace[route[index]])
-        reached: dict[int, float] = {here: 0.0}
-        came_from: dict[int, int] = {}
-        frontier = [(0.0, here)]
-        best: tuple[float, int] | None = None
-        while frontier:
-            cost_s, cell = heapq.heappop(frontier)
-            if cost_s > reached[cell] or (best is not None and cost_s >= best[0]):
-                continue
-            if cell != here:
-                whole_s = cost_s if in_reach(cell) else cost_s + rest_s.get(cell, math.inf)
-                if math.isfinite(whole_s) and (best is None or whole_s < best[0]):
-                    best = (whole_s, cell)
-            for neighbour, length in self._steps(cell):
-                if self._grid.distance_cells(here, neighbour) > _DETOUR_CELLS:
-                    continue
-                if self._in_the_way(vehicle.id, neighbour):
-                    continue
-                through_s = cost_s + length * float(self._pace[neighbour])
-                if through_s < reached.get(neighbour, math.inf):
-                    reached[neighbour] = through_s
-                    came_from[neighbour] = cell
-                    heapq.heappush(frontier, (through_s, neighbour))
-        if best is None:
+        occupied = partial(self._in_the_way, vehicle.id)
+        detour = self._detours.find(here, vehicle.route.ahead(HORIZON_CELLS), blocked, in_reach, occupied)
+        if detour is None:
             return False
-        detour = [best[1]]
-        while came_from[detour[-1]] != here:
-            detour.append(came_from[detour[-1]])
         if here != vehicle.cell:
-            detour.append(here)
-        detour.reverse()
+            detour.insert(0, here)
         return vehicle.route.splice(detour) or vehicle.route.begin([vehicle.cell, *detour], vehicle.cell)

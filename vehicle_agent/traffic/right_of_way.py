@@ -21,10 +21,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
+from swarm.clock import NS_PER_S
 from swarm.wire.messages.vehicles import Claims, Want
 from vehicle_agent.traffic.territory import SharedGround
 
 _CLOCK_LIMIT = 1 << 61
+_IDLE_NS = NS_PER_S // 2
 _NOBODY: Mapping[str, _Other] = MappingProxyType({})
 
 Rank = tuple[int, str, str]
@@ -102,6 +104,8 @@ class RightOfWay:
         self._by_cell: dict[int, dict[str, _Other]] = {}  # who of the others holds or wants a cell
         self._alive: dict[str, int] = {}
         self._changed = True
+        """Whether we hold, want or have heard anything that our last published claims do not tell."""
+        self._idle_until_ns = 0
         for other, vehicles in spawns.items():
             if other != agent:
                 holds = {vehicle: [cell] for vehicle, cell in vehicles.items()}
@@ -245,6 +249,14 @@ class RightOfWay:
                 any_granted = self._changed = True
         return any_granted
 
+    def speaks(self, now_ns: int) -> bool:
+        """Whether to publish our claims now: they changed, another agent waits for our echo, a want of ours is
+        open, or nothing was published for half a second."""
+        due = now_ns >= self._idle_until_ns or self._changed or any(mine.wants for mine in self._mine.values())
+        if due:
+            self._idle_until_ns = now_ns + _IDLE_NS
+        return due
+
     def speak(self) -> Claims:
         """Our whole state, under the next sequence number. Publish it: a want counts from here on."""
         self._seq += 1
@@ -264,11 +276,6 @@ class RightOfWay:
         )
 
     # --- what one may ask -----------------------------------------------------------------------------------
-
-    @property
-    def restless(self) -> bool:
-        """Whether somebody waits to hear from us: our state changed, or wants stand open on either side."""
-        return self._changed or any(mine.wants for mine in self._mine.values())
 
     def holds(self, vehicle: str) -> list[int]:
         """The cells of a vehicle, the one that it stands on first; empty of one that stands nowhere yet."""
@@ -308,6 +315,10 @@ class RightOfWay:
                     stands = other.claims.holds.get(vehicle)
                     found.append(Wanter(vehicle, stands[0] if stands else None))
         return found
+
+    def unplaced(self) -> Claims:
+        """What a starting agent is told while our own vehicles are not placed: seq 0 replaces nobody's claims."""
+        return Claims(agent=self.agent, incarnation=self.incarnation, seq=0, clock=0, holds={}, wants=[], seen={})
 
     def answers(self) -> list[Claims]:
         """What a starting agent is told: where we are now, and the last words of all who cannot tell it."""

@@ -86,9 +86,8 @@ class Swarm:
         for other, process in self.live.items():
             if other == agent:
                 continue
-            stamp = process.incarnation
-            present = Claims(agent=other, incarnation=stamp, seq=0, clock=0, holds={}, wants=[], seen={})
-            for claims in process.rights.answers() if process.gathering is None else [present]:
+            rights = process.rights
+            for claims in rights.answers() if process.gathering is None else [rights.unplaced()]:
                 gathered.answered(claims)
         newcomer.see({other: process.incarnation for other, process in self.live.items()})
         if not gathered.complete(newcomer.alive):

@@ -103,10 +103,8 @@ class Swarm:
             return
         gathered = newcomer.gathering
         for other, process in self.live.items():
-            present = Claims(
-                agent=other, incarnation=process.incarnation, seq=0, clock=0, holds={}, wants=[], seen={}
-            )
-            for claims in process.rights.answers() if process.gathering is None else [present]:
+            rights = process.rights
+            for claims in rights.answers() if process.gathering is None else [rights.unplaced()]:
                 if other != agent:
                     gathered.answered(claims)
         newcomer.see({other: process.incarnation for other, process in self.live.items()})
