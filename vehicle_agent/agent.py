@@ -1,4 +1,4 @@
-"""Many vehicles behind one session: who drives where, who asks whom. Events in, actions out."""
+"""The core of an agent: drives its vehicles, and decides what to ask of planners."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.deadlock import Traffic
 from vehicle_agent.traffic.resumption import Placement, Unplaced
 from vehicle_agent.traffic.right_of_way import RightOfWay
-from vehicle_agent.traffic.territory import SharedGround
+from vehicle_agent.traffic.territory import Territory
 
 _LONGEST_STEP_S = 0.5
 _STALE_CELLS = 8
-"""A route that ends so far from where the target was last seen is of an older tree: ask again."""
+"""A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,12 +50,13 @@ AgentAction = AskRoutes | AskCosts
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalMap:
-    """What an agent looks at; all float32 (rows, cols) in s/m and changed in place by their owners.
+    """The map of an agent: float32 (rows, cols) in s/m, inf is lethal. Their owners change them in place.
 
-    pace    what may be driven, with marks and inflation
-    ground  the same without inflation; prior is the ground without marks
-    physics the pace at which the ground is really driven
-    climb   what a step costs for what it climbs; None if it costs the same both ways
+    pace     cost of a cell, with marks and inflation
+    ground   as pace, before inflation
+    prior    as ground, without marks
+    physics  the pace at which vehicles really drive
+    climb    factor of a step's cost by its slope; None if steps cost the same both ways
     """
 
     grid: GridSpec
@@ -67,8 +68,17 @@ class LocalMap:
 
 
 class Agent:
-    """The vehicles of one agent process. Call `place` once, then in each tick `drive` until it returns None,
-    writing down what it found, and `decide`."""
+    """The vehicles of one agent process.
+
+    Call `place` once. Then in each tick call `begin_drive`, `drive` until it returns None, writing what it found
+    into the map each time, and `decide`.
+
+    plan       which vehicles, of which group
+    ground     the agent's map
+    spawns     agent -> vehicle -> cell where the vehicles of the run first start
+    presence   where all vehicles are; None to know of none but our own
+    territory  which agents share plots with us; None if all do
+    """
 
     def __init__(
         self,
@@ -79,12 +89,12 @@ class Agent:
         spawns: Mapping[str, Mapping[str, int]],
         incarnation: int,
         presence: Presence | None = None,
-        shared_ground: SharedGround | None = None,
+        territory: Territory | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
         self.targets = list(plan.group.targets) or scenario.target_ids
-        self.rights = RightOfWay(plan.id, incarnation, spawns, shared_ground)
+        self.rights = RightOfWay(plan.id, incarnation, spawns, territory)
         self.blocked_ticks = 0
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
@@ -105,12 +115,12 @@ class Agent:
         self._left_s: dict[str, float] = {}
         self._look_from: dict[int, None] = {}
 
-    # --- where everybody starts -----------------------------------------------------------------------------
+    # --- where vehicles start -------------------------------------------------------------------------------
 
     def place(self, placement: Placement) -> None:
-        """Put the vehicles where they stand, and take in what was learnt of everybody's claims."""
-        for claims in placement.claims:
-            self.rights.heard(claims)
+        """Put the vehicles where they stand, and take in the reservations of all agents."""
+        for reservations in placement.reservations:
+            self.rights.hear(reservations)
         for id, cell in placement.cells.items():
             self.rights.place(id, cell)
             self._enter(id, cell)
@@ -122,9 +132,9 @@ class Agent:
 
     @property
     def places(self) -> list[int]:
-        """The cells that we hold, want, or mean to want: our territory has to cover them."""
-        claimed = [cell for id in self.vehicles for cell in (*self.rights.holds(id), *self.rights.wants(id))]
-        return [*claimed, *self._unplaced.cells]
+        """The cells that our vehicles hold, request, or will request: the territory has to cover them."""
+        reserved = [cell for id in self.vehicles for cell in (*self.rights.held(id), *self.rights.requested(id))]
+        return [*reserved, *self._unplaced.cells]
 
     # --- driving --------------------------------------------------------------------------------------------
 
@@ -136,8 +146,8 @@ class Agent:
         self._left_s = dict.fromkeys(self.vehicles, seconds)
 
     def drive(self, now_ns: int) -> Findings | None:
-        """Let vehicles drive until they come to another cell; returns what they find there, to be written down
-        before they drive on. None when the time is over."""
+        """Let vehicles drive until they come to another cell; returns what they find there, to be written into
+        the map before they drive on. None when their time is over."""
         for id in list(self._left_s):
             vehicle = self.vehicles[id]
             left_s = self._drive(vehicle, self._left_s[id], now_ns)
@@ -152,13 +162,13 @@ class Agent:
         return compare(sight, self._map.ground, self._map.prior)
 
     def _drive(self, vehicle: Vehicle, left_s: float, now_ns: int) -> float:
-        """One vehicle up to its next cell. Returns the seconds it has left then."""
+        """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
         motion = vehicle.motion
         physics = self._map.physics.reshape(-1)
         while left_s > 0.0:
             if motion.at_rest:
                 cell = self._traffic.next_cell(vehicle, now_ns)
-                if cell is None or self.rights.holds(vehicle.id)[1:2] != [cell] or self._traffic.closed(cell):
+                if cell is None or self.rights.held(vehicle.id)[1:2] != [cell] or self._traffic.closed(cell):
                     return 0.0
                 motion.set_out(cell)
             before = vehicle.cell
@@ -175,9 +185,9 @@ class Agent:
         return 0.0
 
     def map_changed(self, now_ns: int, *, look: bool = False) -> None:
-        """The map is another: end routes before what is closed now.
+        """End routes before cells that are lethal now.
 
-        look  somebody else changed it, so what is in sight may need another look
+        look  another agent changed the map: compare what is in sight with it again
         """
         pace = self._map.pace.reshape(-1)
         for vehicle in self.vehicles.values():
@@ -190,7 +200,7 @@ class Agent:
     # --- deciding -------------------------------------------------------------------------------------------
 
     def decide(self, now_ns: int) -> list[AgentAction]:
-        """What each vehicle does next: whom to ask, which cells to claim."""
+        """Reserve what each vehicle needs next; returns the requests to planners."""
         for id, cell in self._unplaced.settle():
             self._enter(id, cell)
         actions: list[AgentAction] = []
@@ -237,6 +247,7 @@ class Agent:
     # --- what is heard --------------------------------------------------------------------------------------
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
+        """Where a target is. Of each target the newest pose counts; one outside the grid is ignored."""
         known = self._poses.get(pose.target)
         if known is not None and (pose.incarnation, pose.seq) <= (known.incarnation, known.seq):
             return
@@ -251,7 +262,7 @@ class Agent:
             self._assignment.ask_soon(now_ns)
 
     def set_planners(self, alive: Mapping[str, int], now_ns: int) -> None:
-        """Which planners are there now, and in which incarnation."""
+        """Which planners live: target -> incarnation."""
         before, self._planners = self._planners, dict(alive)
         for vehicle in self.vehicles.values():
             target = vehicle.target
@@ -265,6 +276,7 @@ class Agent:
             self._assignment.ask_soon(now_ns)
 
     def routes_given(self, request: int, reply: RouteReply, now_ns: int) -> list[Follow]:
+        """A planner's answer to `AskRoutes`; returns the routes that vehicles have begun."""
         asked = self._route_requests.pop(request, None)
         if asked is None:
             return []
@@ -285,12 +297,13 @@ class Agent:
         return begun
 
     def routes_ended(self, request: int, now_ns: int) -> None:
-        """Nobody will answer any more."""
+        """No more answers to `AskRoutes` will come."""
         asked = self._route_requests.pop(request, None)
         for id in asked.vehicles if asked is not None else ():
             self.vehicles[id].no_answer(now_ns)
 
     def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[Follow]:
+        """A newer route from a planner, unasked; returns it if the vehicle has begun it."""
         vehicle = self.vehicles.get(pushed.vehicle)
         if vehicle is None:
             return []

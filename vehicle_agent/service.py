@@ -1,4 +1,4 @@
-"""The agent's shell: its vehicles on the bus."""
+"""The shell of an agent: messages to calls of its cores, and what they return to the bus."""
 
 from __future__ import annotations
 
@@ -33,21 +33,24 @@ from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.sensing.target_detector import Lookout
+from vehicle_agent.sensing.target_detector import TargetDetector
 from vehicle_agent.traffic.live_peers import LivePeers
 from vehicle_agent.traffic.neighbourhood import Neighbourhood
 from vehicle_agent.traffic.resumption import Resumption
-from vehicle_agent.traffic.territory import SharedGround
+from vehicle_agent.traffic.territory import Territory
 
 log = logging.getLogger(__name__)
 
 _RESUME_TIMEOUT_S = 2.0
 _NEAR_CELLS = 4
-_GROUNDS_TIMEOUT_S = 1.0
+_TERRITORY_TIMEOUT_S = 1.0
 
 
 class AgentService:
-    """Drives the vehicles of one agent plan, marks what they find, and tells where they are."""
+    """Drives the vehicles of one agent, marks what they find, and publishes where they are.
+
+    Raises ConfigError if the scenario has no such agent or no room for its vehicles.
+    """
 
     def __init__(
         self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
@@ -83,12 +86,12 @@ class AgentService:
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
         agents = [each.id for each in plan_agents(scenario)]
-        territory = SharedGround(plan.id, setup.incarnation, grid, agents)
+        territory = Territory(plan.id, setup.incarnation, grid, agents)
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
         self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.reading)
         self._untracked = scenario.untracked
         self._sightings = Sightings(self._replica.reading)
-        self._lookout = Lookout(
+        self._detector = TargetDetector(
             grid,
             self._author,
             group,
@@ -129,12 +132,12 @@ class AgentService:
             return
         agent = self._agent
         match event:
-            case Heard(message=Claims() as claims):
-                agent.rights.heard(claims)
+            case Heard(message=Claims() as reservations):
+                agent.rights.hear(reservations)
             case Heard(message=Fleet() as fleet):
                 self._presence.hear(fleet, now_ns)
             case Heard(topic=topic, message=TargetPose() as pose):
-                self._lookout.truth(pose)
+                self._detector.set_truth(pose)
                 if topic is POSE and pose.target not in self._untracked:
                     agent.hear_pose(pose, now_ns)
             case Heard(message=Sighted() as sighted):
@@ -148,11 +151,11 @@ class AgentService:
                 self._publish_followed(agent.routes_given(_number(tag), reply, now_ns))
             case Replied(tag=tag, message=CostReply() as reply) if reply.target_cell is not None:
                 agent.costs_given(_number(tag), reply.target, column(reply.cost_to_go_s, "<f4"))
-            case Replied(message=Claims() as claims):
+            case Replied(message=Claims() as reservations):
                 if self._resumption is not None:
-                    self._resumption.answered(claims)
-            case Replied(tag=tag, message=Grounds() as grounds):
-                self._neighbourhood.answered(grounds, _number(tag))
+                    self._resumption.answered(reservations)
+            case Replied(tag=tag, message=Grounds() as answer):
+                self._neighbourhood.answered(answer, _number(tag))
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
                 self._asked_ns.pop(tag, None)
                 agent.routes_ended(_number(tag), now_ns)
@@ -162,8 +165,8 @@ class AgentService:
                 self._place_if_known(now_ns)
             case Asked(topic=topic) if topic is CLAIMS:
                 self._answer(event)
-            case Asked(topic=topic, request=Grounds() as grounds) if topic is GROUNDS:
-                event.answer(self._neighbourhood.answer(grounds))
+            case Asked(topic=topic, request=Grounds() as question) if topic is GROUNDS:
+                event.answer(self._neighbourhood.answer(question))
                 event.end()
             case Appeared(peer):
                 self._peers.appeared(peer)
@@ -208,17 +211,17 @@ class AgentService:
         for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
             self._presence.hear(fleet, now_ns)
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
-        if agent.rights.speaks(now_ns):
-            self._bus.publish(CLAIMS, agent.rights.speak(), agent=self._setup.id)
+        if agent.rights.message_due(now_ns):
+            self._bus.publish(CLAIMS, agent.rights.next_message(), agent=self._setup.id)
         self._gauge()
 
     def stop(self, now_ns: int) -> None:
         self._member.publish_stats(now_ns)
 
-    # --- where everybody starts -----------------------------------------------------------------------------
+    # --- which agents and where -------------------------------------------------------------------------------
 
     def _place_if_known(self, now_ns: int) -> None:
-        """The question where everybody stands has ended."""
+        """The question for reservations has ended: place the vehicles if enough is known."""
         if self._resumption is None:
             return
         agents = self._peers.agents_up
@@ -238,7 +241,7 @@ class AgentService:
             self._member.note(now_ns, "resumed", text)
 
     def _follow(self, now_ns: int) -> None:
-        """Subscribe to what concerns our vehicles where they are now, and claim new territory."""
+        """Subscribe to what concerns our vehicles where they are now, and ask about new territory."""
         following = self._neighbourhood.follow(self._agent.places, now_ns)
         self._feed.look_at(following.map_regions)
         for region in following.presence.begin:
@@ -247,16 +250,16 @@ class AgentService:
             self._bus.unsubscribe(FLEET, region=region)  # what was heard there ends with its lease
         if following.question is not None:
             tag = f"grounds-{following.question.seq}"
-            self._bus.ask(GROUNDS, following.question, self._post, tag=tag, timeout_s=_GROUNDS_TIMEOUT_S)
-        for agent in following.claims.begin:
+            self._bus.ask(GROUNDS, following.question, self._post, tag=tag, timeout_s=_TERRITORY_TIMEOUT_S)
+        for agent in following.reservations.begin:
             self._bus.subscribe(CLAIMS, self._post, agent=agent)
-        for agent in following.claims.end:
+        for agent in following.reservations.end:
             self._bus.unsubscribe(CLAIMS, agent=agent)
 
     def _answer(self, asked: Asked) -> None:
         rights = self._agent.rights
-        for claims in rights.answers() if self._resumption is None else [rights.unplaced()]:
-            asked.answer(claims, agent=claims.agent)
+        for reservations in rights.answers() if self._resumption is None else [rights.unplaced()]:
+            asked.answer(reservations, agent=reservations.agent)
         asked.end()
 
     def _peers_changed(self, now_ns: int) -> None:
@@ -267,7 +270,7 @@ class AgentService:
 
     def _tell_sighted(self, now_ns: int) -> None:
         self._sightings.expire(now_ns)
-        for sighted in self._lookout.look(self._agent.vehicles.values(), now_ns):
+        for sighted in self._detector.look(self._agent.vehicles.values(), now_ns):
             self.counters.count("targets_sighted")
             self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
             self._hear_sighted(sighted, now_ns)

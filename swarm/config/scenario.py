@@ -155,7 +155,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     sighting_lasts_s  what they tell of a target that they saw ends by itself after so long
     capture_range_m   a target this near is captured
     route_cells       steps of a route asked for at a time; 0 is the whole route
-    claim_cells       cells ahead that a vehicle claims
+    reserve_cells     cells ahead that a vehicle reserves
     patience_s        after so long without a step, it looks for a way around
     reassign_s        how often it asks which target is the cheapest
     hysteresis        another target must be cheaper by this share to be worth a change
@@ -167,7 +167,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     sighting_lasts_s: Positive = 30.0
     capture_range_m: Positive = 150.0
     route_cells: Annotated[int, Meta(ge=0)] = 0
-    claim_cells: Annotated[int, Meta(ge=1, le=16)] = 3
+    reserve_cells: Annotated[int, Meta(ge=1, le=16)] = 3
     patience_s: Positive = 1.0
     reassign_s: Positive = 5.0
     hysteresis: NotNegative = 0.15

@@ -16,7 +16,7 @@ _RANGE_SHARE = 0.02
 """The simulated sensor is off by this share of the distance, besides half a cell."""
 
 
-class Lookout:
+class TargetDetector:
     """The simulated sensor for targets: it knows where they truly are, and tells only of those within its range."""
 
     def __init__(self, grid: GridSpec, author: str, group: str, range_m: float, lasts_s: float) -> None:
@@ -29,7 +29,7 @@ class Lookout:
         self._told_ns: dict[str, int] = {}
         self._seq = 0
 
-    def truth(self, pose: TargetPose) -> None:
+    def set_truth(self, pose: TargetPose) -> None:
         """Where a target is: the ground that the sensor looks at."""
         known = self._true.get(pose.target)
         if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):

@@ -1,11 +1,12 @@
 """How an agent starts: it learns where everybody stands, and only then places its vehicles.
 
-An agent that starts may continue the life of one that died. The vehicles of the dead one stand where it left them,
-and all others keep these cells closed. So the newcomer asks all agents for their claims and for the newest claims
-they have of every agent that is silent, its own earlier incarnation among them, until each live agent has answered.
+An agent that starts may continue the life of one that died. The vehicles of the dead one stand where it left
+them, and all others keep these cells closed. So the newcomer asks all agents for their reservations and for the
+newest that they have heard of every agent that is silent, its own earlier incarnation among them, until each live
+agent has answered.
 
-An answer is recognised by its author and incarnation, so claims of a live agent that another relays count as its
-answer, too. Claims of live agents are relayed only where two agents disagree about who is alive.
+An answer is recognised by its author and incarnation, so reservations of a live agent that another relays count
+as its answer, too. Reservations of live agents are relayed only where two agents disagree about who is alive.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ its vehicles may not stand where they first started. It waits so long for others
 class Placement:
     """Where the vehicles of an agent stand when it starts to drive them.
 
-    cells      vehicle -> its cell, on which no other vehicle can be
-    unplaced   vehicle -> the cell near which it should stand; it takes the nearest free cell (`Unplaced`)
-    claims     the newest claims known of every agent, those of our earlier incarnation last
-    resumed    whether an earlier incarnation of ours is known
+    cells         vehicle -> its cell, on which no other vehicle can be
+    unplaced      vehicle -> the cell near which it should stand; it takes the nearest free cell (`Unplaced`)
+    reservations  the newest known of every agent, those of our earlier incarnation last
+    resumed       whether an earlier incarnation of ours is known
     """
 
     cells: Mapping[str, int]
     unplaced: Mapping[str, int]
-    claims: tuple[Claims, ...]
+    reservations: tuple[Claims, ...]
     resumed: bool
 
 
@@ -67,9 +68,9 @@ class Resumption:
         """When to ask; None while a question is open."""
         self._tries = 0
         self._newest: dict[str, Claims] = {}
-        """The newest claims of each agent, whoever told them; never those with seq 0, which tell nothing."""
+        """The newest reservations of each agent, whoever told them; never those with seq 0, which tell nothing."""
         self._answered: dict[str, Claims] = {}
-        """The newest claims of each agent that came as its own answer or in the answer of another."""
+        """The newest reservations of each agent that came as its own answer or in the answer of another."""
 
     # --- when to ask ----------------------------------------------------------------------------------------
 
@@ -104,25 +105,25 @@ class Resumption:
 
     # --- what is known --------------------------------------------------------------------------------------
 
-    def answered(self, claims: Claims) -> None:
+    def answered(self, reservations: Claims) -> None:
         """Take in one reply. Replies may come late, repeated and in any order: the newest of each agent count."""
-        known = self._newest.get(claims.agent)
-        if claims.seq and (known is None or stamp_of(claims) > stamp_of(known)):
-            self._newest[claims.agent] = claims
-        answered = self._answered.get(claims.agent)
-        if answered is None or stamp_of(claims) >= stamp_of(answered):
-            self._answered[claims.agent] = claims
+        known = self._newest.get(reservations.agent)
+        if reservations.seq and (known is None or stamp_of(reservations) > stamp_of(known)):
+            self._newest[reservations.agent] = reservations
+        answered = self._answered.get(reservations.agent)
+        if answered is None or stamp_of(reservations) >= stamp_of(answered):
+            self._answered[reservations.agent] = reservations
 
     def complete(self, alive: Mapping[str, int]) -> bool:
-        """Whether every live agent has answered in its present incarnation, and the claims which any of them has
-        seen of an agent that cannot answer for itself have reached us."""
+        """Whether every live agent has answered in its present incarnation, and the reservations which any of
+        them has seen of an agent that cannot answer for itself have reached us."""
         for agent, incarnation in alive.items():
             if agent == self._agent:
                 continue
-            claims = self._answered.get(agent)
-            if claims is None or claims.incarnation != incarnation:
+            answer = self._answered.get(agent)
+            if answer is None or answer.incarnation != incarnation:
                 return False
-            for other, seen in claims.seen.items():
+            for other, seen in answer.seen.items():
                 silent = other == self._agent or alive.get(other) != seen[0]
                 if silent and (other not in self._newest or stamp_of(self._newest[other]) < tuple(seen)):
                     return False
@@ -144,22 +145,22 @@ class Resumption:
                 taken.add(cell)
             else:
                 unplaced[vehicle] = min(cell, self._cells - 1)
-        others = [claims for agent, claims in self._newest.items() if agent != self._agent]
+        others = [each for agent, each in self._newest.items() if agent != self._agent]
         known = (*others, last) if last is not None else tuple(others)
         return Placement(cells, unplaced, known, resumed=last is not None)
 
     def _taken(self, alive: Mapping[str, int]) -> set[int]:
-        """Cells on which a vehicle of another agent may be: held, wanted by an agent that died since, or the spawn
-        cell of one that nobody has heard of."""
+        """Cells on which a vehicle of another agent may be: held, requested by an agent that died since, or the
+        spawn cell of one that nobody has heard of."""
         taken: set[int] = set()
         for agent, spawns in self._spawns.items():
             if agent != self._agent and agent not in self._newest:
                 taken.update(spawns.values())
-        for agent, claims in self._newest.items():
+        for agent, reservations in self._newest.items():
             if agent != self._agent:
-                taken.update(cell for held in claims.holds.values() for cell in held)
-                if alive.get(agent) != claims.incarnation:
-                    taken.update(want.cell for want in claims.wants)
+                taken.update(cell for held in reservations.holds.values() for cell in held)
+                if alive.get(agent) != reservations.incarnation:
+                    taken.update(request.cell for request in reservations.wants)
         return taken
 
 
@@ -187,17 +188,17 @@ class Unplaced:
         """(vehicle, cell) of those that hold a cell now; the others request one."""
         settled: list[tuple[str, int]] = []
         for vehicle, near in list(self._near.items()):
-            held = self._rights.holds(vehicle)
+            held = self._rights.held(vehicle)
             if held:
                 del self._near[vehicle]
                 settled.append((vehicle, held[0]))
                 continue
-            wanted = self._rights.wants(vehicle)
-            if wanted and self._rights.holder(wanted[0]) is None:
+            requested = self._rights.requested(vehicle)
+            if requested and self._rights.holder(requested[0]) is None:
                 continue
             free = nearest_free(self._grid, near, self._is_free)
             if free is not None:
-                self._rights.ask(vehicle, [free])
+                self._rights.request(vehicle, [free])
         return settled
 
     def _is_free(self, cell: int) -> bool:

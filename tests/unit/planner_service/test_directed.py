@@ -312,7 +312,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
         if set_out_s is not None and motion.at_rest and motion.cell == target:
             return tick * 0.05 - set_out_s, tree.routes(level, [start])[0].cost_s
         asks = agent.decide(now_ns)
-        agent.rights.speak()
+        agent.rights.next_message()
         for asked in asks:
             if isinstance(asked, AskCosts):
                 agent.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))

@@ -160,7 +160,7 @@ def test_vehicles_go_on_where_they_last_stood_and_not_where_somebody_else_is() -
     # The other one asks for a free cell nearby, and stands there once it is granted.
     agent.rights.set_alive({})
     agent.decide(0)
-    agent.rights.speak()
+    agent.rights.next_message()
     agent.rights.grant()
     agent.decide(S)
     assert GRID.distance_cells(agent.vehicles["a0-01"].cell, 40) == 1

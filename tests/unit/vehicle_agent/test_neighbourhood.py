@@ -9,7 +9,7 @@ from swarm.wire.messages.vehicles import Claims, Grounds
 from vehicle_agent.traffic.live_peers import LivePeers
 from vehicle_agent.traffic.neighbourhood import Change, Neighbourhood
 from vehicle_agent.traffic.right_of_way import RightOfWay
-from vehicle_agent.traffic.territory import SharedGround
+from vehicle_agent.traffic.territory import Territory
 
 S = 1_000_000_000
 GRID = GridSpec(256, 2048, 10.0)
@@ -67,7 +67,7 @@ def test_tokens_are_trusted_a_lease_after_our_own_link_is_up() -> None:
 
 
 def neighbourhood(agent: str) -> Neighbourhood:
-    territory = SharedGround(agent, 1, GRID, [])
+    territory = Territory(agent, 1, GRID, [])
     rights = RightOfWay(agent, 1, {"a": {"u": 0}, "b": {"v": 1}}, territory)
     found = Neighbourhood(GRID, SCENARIO, rights, territory)
     found.set_alive({"a": 1, "b": 1})
@@ -85,22 +85,22 @@ def test_each_change_of_place_says_once_what_to_begin_and_what_to_end() -> None:
 
 def test_a_neighbour_is_listened_to_from_the_answer_on_in_which_it_names_a_common_plot() -> None:
     a, b = neighbourhood("a"), neighbourhood("b")
-    assert a.follow([GRID.cell(10, 10)], 0).claims.begin == ["b"]  # of whom nothing is known yet
+    assert a.follow([GRID.cell(10, 10)], 0).reservations.begin == ["b"]  # of whom nothing is known yet
     question = b.follow([GRID.cell(10, 1500)], 0).question
     assert question is not None
     a.answer(question)
-    assert a.follow([GRID.cell(10, 10)], S).claims == Change([], ["b"])
+    assert a.follow([GRID.cell(10, 10)], S).reservations == Change([], ["b"])
     moved = b.follow([GRID.cell(10, 20)], 2 * S).question
     assert moved is not None
     b.answered(a.answer(moved), moved.seq)
-    assert a.follow([GRID.cell(10, 10)], 3 * S).claims == Change(["b"], [])
+    assert a.follow([GRID.cell(10, 10)], 3 * S).reservations == Change(["b"], [])
 
 
 def test_who_asks_about_a_dead_agent_is_told_the_newest_that_was_heard_of_it() -> None:
-    territory = SharedGround("a", 1, GRID, [])
+    territory = Territory("a", 1, GRID, [])
     rights = RightOfWay("a", 1, {"a": {"u": 0}, "b": {"v": 1}}, territory)
     a = Neighbourhood(GRID, SCENARIO, rights, territory)
     last = Claims(agent="b", incarnation=1, seq=9, clock=3, holds={"v": [5]}, wants=[], seen={})
-    rights.heard(last)
+    rights.hear(last)
     assert a.answer(Grounds(agent="c", incarnation=1, seq=1, plots=[0], silent=["b"])).words == [last]
     assert a.answer(Grounds(agent="c", incarnation=1, seq=2, plots=[0])).words == []

@@ -132,8 +132,8 @@ def test_the_order_and_repetition_of_answers_do_not_matter(
     (complete, one), (also_complete, other) = outcome(heard), outcome(shuffled)
     assert complete == also_complete
     assert (one.cells, one.unplaced, one.resumed) == (other.cells, other.unplaced, other.resumed)
-    assert sorted(c.agent for c in one.claims) == sorted(c.agent for c in other.claims)
-    assert {c.agent: c for c in one.claims} == {c.agent: c for c in other.claims}
+    assert sorted(c.agent for c in one.reservations) == sorted(c.agent for c in other.reservations)
+    assert {c.agent: c for c in one.reservations} == {c.agent: c for c in other.reservations}
 
 
 # --- when it asks -------------------------------------------------------------------------------------------
