@@ -25,8 +25,26 @@ from swarm.wire.fields import column
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Claims, Fleet, Followed, Grounds, VehicleState
-from swarm.wire.topics import CLAIMS, COST, FLEET, FOLLOWED, GROUNDS, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, TRUE_POSE
+from swarm.wire.messages.vehicles import (
+    Fleet,
+    Followed,
+    Reservations,
+    TerritoryReply,
+    TerritoryRequest,
+    VehicleState,
+)
+from swarm.wire.topics import (
+    COST,
+    FLEET,
+    FOLLOWED,
+    POSE,
+    PUSHED_ROUTE,
+    RESERVATIONS,
+    ROUTE,
+    SIGHTED,
+    TERRITORY,
+    TRUE_POSE,
+)
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
 from vehicle_agent.driving.vehicle import Follow
@@ -112,8 +130,8 @@ class AgentService:
         return self._agent
 
     def start(self, now_ns: int) -> None:
-        self._bus.serve(CLAIMS, self._post)
-        self._bus.serve(GROUNDS, self._post, agent=self._setup.id)
+        self._bus.serve(RESERVATIONS, self._post)
+        self._bus.serve(TERRITORY, self._post, agent=self._setup.id)
         self._bus.watch_alive(self._post, role="agent")
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
@@ -132,7 +150,7 @@ class AgentService:
             return
         agent = self._agent
         match event:
-            case Heard(message=Claims() as reservations):
+            case Heard(message=Reservations() as reservations):
                 agent.rights.hear(reservations)
             case Heard(message=Fleet() as fleet):
                 self._presence.hear(fleet, now_ns)
@@ -151,21 +169,21 @@ class AgentService:
                 self._publish_followed(agent.routes_given(_number(tag), reply, now_ns))
             case Replied(tag=tag, message=CostReply() as reply) if reply.target_cell is not None:
                 agent.costs_given(_number(tag), reply.target, column(reply.cost_to_go_s, "<f4"))
-            case Replied(message=Claims() as reservations):
+            case Replied(message=Reservations() as reservations):
                 if self._resumption is not None:
                     self._resumption.answered(reservations)
-            case Replied(tag=tag, message=Grounds() as answer):
+            case Replied(tag=tag, message=TerritoryReply() as answer):
                 self._neighbourhood.answered(answer, _number(tag))
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
                 self._asked_ns.pop(tag, None)
                 agent.routes_ended(_number(tag), now_ns)
             case AskEnded(tag=tag, topic=topic) if topic is COST:
                 agent.costs_ended(_number(tag), now_ns)
-            case AskEnded(topic=topic) if topic is CLAIMS:
+            case AskEnded(topic=topic) if topic is RESERVATIONS:
                 self._place_if_known(now_ns)
-            case Asked(topic=topic) if topic is CLAIMS:
+            case Asked(topic=topic) if topic is RESERVATIONS:
                 self._answer(event)
-            case Asked(topic=topic, request=Grounds() as question) if topic is GROUNDS:
+            case Asked(topic=topic, request=TerritoryRequest() as question) if topic is TERRITORY:
                 event.answer(self._neighbourhood.answer(question))
                 event.end()
             case Appeared(peer):
@@ -187,8 +205,8 @@ class AgentService:
         self._feed.tick(now_ns)
         if self._resumption is not None:
             if self._resumption.ask_now(now_ns):
-                tag = f"claims-{now_ns}"
-                self._bus.ask(CLAIMS, Nothing(), self._post, tag=tag, timeout_s=_RESUME_TIMEOUT_S)
+                tag = f"reservations-{now_ns}"
+                self._bus.ask(RESERVATIONS, Nothing(), self._post, tag=tag, timeout_s=_RESUME_TIMEOUT_S)
             return
         agent = self._agent
         self._note_map(now_ns)
@@ -212,7 +230,7 @@ class AgentService:
             self._presence.hear(fleet, now_ns)
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
         if agent.rights.message_due(now_ns):
-            self._bus.publish(CLAIMS, agent.rights.next_message(), agent=self._setup.id)
+            self._bus.publish(RESERVATIONS, agent.rights.next_message(), agent=self._setup.id)
         self._gauge()
 
     def stop(self, now_ns: int) -> None:
@@ -249,12 +267,12 @@ class AgentService:
         for region in following.presence.end:
             self._bus.unsubscribe(FLEET, region=region)  # what was heard there ends with its lease
         if following.question is not None:
-            tag = f"grounds-{following.question.seq}"
-            self._bus.ask(GROUNDS, following.question, self._post, tag=tag, timeout_s=_TERRITORY_TIMEOUT_S)
+            tag = f"territory-{following.question.seq}"
+            self._bus.ask(TERRITORY, following.question, self._post, tag=tag, timeout_s=_TERRITORY_TIMEOUT_S)
         for agent in following.reservations.begin:
-            self._bus.subscribe(CLAIMS, self._post, agent=agent)
+            self._bus.subscribe(RESERVATIONS, self._post, agent=agent)
         for agent in following.reservations.end:
-            self._bus.unsubscribe(CLAIMS, agent=agent)
+            self._bus.unsubscribe(RESERVATIONS, agent=agent)
 
     def _answer(self, asked: Asked) -> None:
         rights = self._agent.rights

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 from shared_map.replication.interest import Interest
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import Grounds
+from swarm.wire.messages.vehicles import TerritoryReply, TerritoryRequest
 from vehicle_agent.traffic.right_of_way import RightOfWay
 from vehicle_agent.traffic.territory import PLOT_CELLS, Territory
 
@@ -40,7 +40,7 @@ class Following:
     map_regions: frozenset[int]
     presence: Change[int]
     reservations: Change[str]
-    question: Grounds | None
+    question: TerritoryRequest | None
 
 
 class Neighbourhood:
@@ -83,13 +83,13 @@ class Neighbourhood:
     def link_changed(self) -> None:
         self._territory.ask_anew()
 
-    def answer(self, question: Grounds) -> Grounds:
+    def answer(self, question: TerritoryRequest) -> TerritoryReply:
         """Our reply to another agent's question about its territory."""
         self._territory.hear(question)
         return self._territory.answer(self._rights.heard_of(question.silent))
 
-    def answered(self, reply: Grounds, seq: int) -> None:
+    def answered(self, reply: TerritoryReply, seq: int) -> None:
         """Another agent's reply to our question number `seq`."""
-        for reservations in reply.words:
+        for reservations in reply.reservations:
             self._rights.hear(reservations)
         self._territory.answered(reply, seq)

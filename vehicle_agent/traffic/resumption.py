@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import Claims
+from swarm.wire.messages.vehicles import Reservations
 from vehicle_agent.traffic.right_of_way import RightOfWay, stamp_of
 
 _SETTLE_NS = NS_PER_S // 5
@@ -43,7 +43,7 @@ class Placement:
 
     cells: Mapping[str, int]
     unplaced: Mapping[str, int]
-    reservations: tuple[Claims, ...]
+    reservations: tuple[Reservations, ...]
     resumed: bool
 
 
@@ -67,9 +67,9 @@ class Resumption:
         self._ask_due_ns: int | None = None
         """When to ask; None while a question is open."""
         self._tries = 0
-        self._newest: dict[str, Claims] = {}
+        self._newest: dict[str, Reservations] = {}
         """The newest reservations of each agent, whoever told them; never those with seq 0, which tell nothing."""
-        self._answered: dict[str, Claims] = {}
+        self._answered: dict[str, Reservations] = {}
         """The newest reservations of each agent that came as its own answer or in the answer of another."""
 
     # --- when to ask ----------------------------------------------------------------------------------------
@@ -105,7 +105,7 @@ class Resumption:
 
     # --- what is known --------------------------------------------------------------------------------------
 
-    def answered(self, reservations: Claims) -> None:
+    def answered(self, reservations: Reservations) -> None:
         """Take in one reply. Replies may come late, repeated and in any order: the newest of each agent count."""
         known = self._newest.get(reservations.agent)
         if reservations.seq and (known is None or stamp_of(reservations) > stamp_of(known)):
@@ -137,8 +137,8 @@ class Resumption:
         unplaced: dict[str, int] = {}
         for vehicle, spawn in self._spawns[self._agent].items():
             cell, certain = spawn, last is None
-            if last is not None and last.holds.get(vehicle):
-                cell, certain = last.holds[vehicle][0], True
+            if last is not None and last.held.get(vehicle):
+                cell, certain = last.held[vehicle][0], True
             # An earlier incarnation that did not hold a cell for this vehicle had found none: others may be there.
             if certain and 0 <= cell < self._cells and cell not in taken:
                 cells[vehicle] = cell
@@ -158,9 +158,9 @@ class Resumption:
                 taken.update(spawns.values())
         for agent, reservations in self._newest.items():
             if agent != self._agent:
-                taken.update(cell for held in reservations.holds.values() for cell in held)
+                taken.update(cell for held in reservations.held.values() for cell in held)
                 if alive.get(agent) != reservations.incarnation:
-                    taken.update(request.cell for request in reservations.wants)
+                    taken.update(request.cell for request in reservations.requested)
         return taken
 
 

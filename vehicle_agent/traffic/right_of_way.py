@@ -29,7 +29,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.vehicles import Claims, Want
+from swarm.wire.messages.vehicles import RequestedCell, Reservations
 from vehicle_agent.traffic.territory import Territory
 
 _CLOCK_LIMIT = 1 << 61
@@ -68,15 +68,15 @@ class _Other:
     heard       False if these are spawn cells, of which the agent has said nothing
     """
 
-    def __init__(self, reservations: Claims) -> None:
+    def __init__(self, reservations: Reservations) -> None:
         self.reservations = reservations
         self.held: dict[int, str] = {}
-        for vehicle, cells in reservations.holds.items():
+        for vehicle, cells in reservations.held.items():
             for cell in cells:
                 self.held[cell] = vehicle
         self.rank: dict[int, Rank] = {}
         self.requesting: dict[int, list[str]] = {}
-        for request in reservations.wants:
+        for request in reservations.requested:
             self.requesting.setdefault(request.cell, []).append(request.vehicle)
             rank = (request.ticket, reservations.agent, request.vehicle)
             if request.cell not in self.rank or rank < self.rank[request.cell]:
@@ -130,12 +130,14 @@ class RightOfWay:
         for other, vehicles in spawns.items():
             if other != agent:
                 holds = {vehicle: [cell] for vehicle, cell in vehicles.items()}
-                unheard = Claims(agent=other, incarnation=0, seq=0, clock=0, holds=holds, wants=[], seen={})
+                unheard = Reservations(
+                    agent=other, incarnation=0, seq=0, clock=0, held=holds, requested=[], seen={}
+                )
                 self._replace(other, _Other(unheard))
 
     # --- what other agents publish --------------------------------------------------------------------------
 
-    def hear(self, reservations: Claims) -> None:
+    def hear(self, reservations: Reservations) -> None:
         """Take in an agent's reservations, if they are the newest of that agent. Those with seq 0 tell nothing: the
         agent has not placed its vehicles."""
         agent, clock = reservations.agent, reservations.clock
@@ -153,7 +155,7 @@ class RightOfWay:
         self._replace(agent, _Other(reservations))
         if clock < _CLOCK_LIMIT:
             self._clock = max(self._clock, clock)
-        self._changed = self._changed or bool(reservations.wants)
+        self._changed = self._changed or bool(reservations.requested)
 
     def set_alive(self, agents: Mapping[str, int]) -> None:
         """Which agents live: agent -> incarnation. A dead agent is not waited for; its reservations stand."""
@@ -305,25 +307,25 @@ class RightOfWay:
             self._idle_until_ns = now_ns + _IDLE_NS
         return due
 
-    def next_message(self) -> Claims:
+    def next_message(self) -> Reservations:
         """Our reservations under the next number. Publish them: a request counts from here on."""
         self._seq += 1
         self._changed = False
-        return Claims(
+        return Reservations(
             agent=self.agent,
             incarnation=self.incarnation,
             seq=self._seq,
             clock=self._clock,
-            holds={vehicle: list(mine.held) for vehicle, mine in self._mine.items() if mine.held},
-            wants=[
-                Want(vehicle=vehicle, cell=request.cell, ticket=request.ticket)
+            held={vehicle: list(mine.held) for vehicle, mine in self._mine.items() if mine.held},
+            requested=[
+                RequestedCell(vehicle=vehicle, cell=request.cell, ticket=request.ticket)
                 for vehicle, mine in self._mine.items()
                 for request in mine.requests
             ],
             seen={agent: stamp_of(other.reservations) for agent, other in self._others.items() if other.heard},
         )
 
-    def answers(self) -> list[Claims]:
+    def answers(self) -> list[Reservations]:
         """What a starting agent is told: the newest reservations of the dead, and ours."""
         of_the_dead = [
             other.reservations
@@ -335,11 +337,13 @@ class RightOfWay:
         self._changed = changed  # the other agents have not heard it
         return [*of_the_dead, mine]
 
-    def unplaced(self) -> Claims:
+    def unplaced(self) -> Reservations:
         """What a starting agent is told while our vehicles are not placed: seq 0 replaces no reservations."""
-        return Claims(agent=self.agent, incarnation=self.incarnation, seq=0, clock=0, holds={}, wants=[], seen={})
+        return Reservations(
+            agent=self.agent, incarnation=self.incarnation, seq=0, clock=0, held={}, requested=[], seen={}
+        )
 
-    def heard_of(self, agents: Sequence[str]) -> list[Claims]:
+    def heard_of(self, agents: Sequence[str]) -> list[Reservations]:
         """The newest reservations that we have heard of these agents."""
         others = (self._others.get(agent) for agent in agents)
         return [other.reservations for other in others if other is not None and other.heard]
@@ -382,7 +386,7 @@ class RightOfWay:
         for agent, other in self._by_cell.get(cell, _NO_AGENTS).items():
             if cell in other.requesting and not self._is_dead(agent, other):
                 for vehicle in other.requesting[cell]:
-                    stands = other.reservations.holds.get(vehicle)
+                    stands = other.reservations.held.get(vehicle)
                     found.append(Requester(vehicle, stands[0] if stands else None))
         return found
 
@@ -390,6 +394,6 @@ class RightOfWay:
         return self._alive.get(agent) != other.reservations.incarnation
 
 
-def stamp_of(reservations: Claims) -> tuple[int, int]:
+def stamp_of(reservations: Reservations) -> tuple[int, int]:
     """Orders the reservations of one agent: the larger is the newer."""
     return reservations.incarnation, reservations.seq

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import Claims, Grounds
+from swarm.wire.messages.vehicles import Reservations, TerritoryReply, TerritoryRequest
 
 PLOT_CELLS = 64
 """Side of a plot. In smaller plots an agent has fewer neighbours, and it enters them more often."""
@@ -108,7 +108,7 @@ class Territory:
         self._asked_ns = None
         self._update()
 
-    def hear(self, told: Grounds) -> None:
+    def hear(self, told: TerritoryRequest | TerritoryReply) -> None:
         """Take in another agent's territory, from its question or its answer, if it is the newest of that agent."""
         if told.agent == self.agent or told.seq == 0:
             return
@@ -119,7 +119,7 @@ class Territory:
         self._find_dead()
         self._update()
 
-    def answered(self, reply: Grounds, seq: int) -> None:
+    def answered(self, reply: TerritoryReply, seq: int) -> None:
         """Take in an agent's answer to our question number `seq`."""
         if reply.agent == self.agent or seq > self._seq:
             return
@@ -199,7 +199,7 @@ class Territory:
         """Whether a live agent has told its territory, and its reservations are none of our concern."""
         return self._is_placed(agent) and agent not in self.heard_from
 
-    def question(self, now_ns: int) -> Grounds | None:
+    def question(self, now_ns: int) -> TerritoryRequest | None:
         """What to ask all agents now; None if all have answered, or were asked a moment ago."""
         if all(self._answered_seq(id, incarnation) >= self._seq for id, incarnation in self._alive.items()):
             return None
@@ -207,16 +207,16 @@ class Territory:
             return None
         self._asked_ns = now_ns
         silent = [id for id in sorted(self._dead) if self._others[id].plots & self.plots]
-        return Grounds(
+        return TerritoryRequest(
             agent=self.agent, incarnation=self.incarnation, seq=self._seq, plots=sorted(self.plots), silent=silent
         )
 
-    def answer(self, words: Sequence[Claims] = ()) -> Grounds:
+    def answer(self, of_the_dead: Sequence[Reservations] = ()) -> TerritoryReply:
         """Our territory, with the newest reservations that we have heard of the agents asked for."""
-        return Grounds(
+        return TerritoryReply(
             agent=self.agent,
             incarnation=self.incarnation,
             seq=self._seq,
             plots=sorted(self.plots),
-            words=list(words),
+            reservations=list(of_the_dead),
         )

@@ -14,7 +14,7 @@ from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
 from swarm.wire.statements import TILE_AREA as TILE_AREA
 from swarm.wire.statements import MarkKind as MarkKind
 
-WIRE_VERSION = 2
+WIRE_VERSION = 3
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema"):

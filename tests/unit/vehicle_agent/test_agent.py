@@ -16,7 +16,7 @@ from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Claims, VehicleState
+from swarm.wire.messages.vehicles import Reservations, VehicleState
 from swarm.wire.routes import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes, LocalMap
 from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
@@ -143,18 +143,18 @@ def test_vehicles_go_on_where_they_last_stood_and_not_where_somebody_else_is() -
     scenario = parse_scenario(TEXT)
     agent = agent_of(scenario)
     known = resumption_of(scenario)
-    last = Claims(
+    last = Reservations(
         agent="a0",
         incarnation=0,
         seq=9,
         clock=3,
-        holds={"a0-00": [17, 18], "a0-01": [40]},
-        wants=[],
+        held={"a0-00": [17, 18], "a0-01": [40]},
+        requested=[],
         seen={},
     )
-    other = Claims(agent="a1", incarnation=1, seq=4, clock=8, holds={"a1-00": [40]}, wants=[], seen={})
-    for claims in (last, other):
-        known.answered(claims)
+    other = Reservations(agent="a1", incarnation=1, seq=4, clock=8, held={"a1-00": [40]}, requested=[], seen={})
+    for reservations in (last, other):
+        known.answered(reservations)
     agent.place(known.placement({"a1": 1}))
     assert {id: vehicle.cell for id, vehicle in agent.vehicles.items()} == {"a0-00": 17}
     # The other one asks for a free cell nearby, and stands there once it is granted.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.wire.messages.vehicles import Claims, Grounds
+from swarm.wire.messages.vehicles import Reservations, TerritoryRequest
 from vehicle_agent.traffic.live_peers import LivePeers
 from vehicle_agent.traffic.neighbourhood import Change, Neighbourhood
 from vehicle_agent.traffic.right_of_way import RightOfWay
@@ -100,7 +100,9 @@ def test_who_asks_about_a_dead_agent_is_told_the_newest_that_was_heard_of_it() -
     territory = Territory("a", 1, GRID, [])
     rights = RightOfWay("a", 1, {"a": {"u": 0}, "b": {"v": 1}}, territory)
     a = Neighbourhood(GRID, SCENARIO, rights, territory)
-    last = Claims(agent="b", incarnation=1, seq=9, clock=3, holds={"v": [5]}, wants=[], seen={})
+    last = Reservations(agent="b", incarnation=1, seq=9, clock=3, held={"v": [5]}, requested=[], seen={})
     rights.hear(last)
-    assert a.answer(Grounds(agent="c", incarnation=1, seq=1, plots=[0], silent=["b"])).words == [last]
-    assert a.answer(Grounds(agent="c", incarnation=1, seq=2, plots=[0])).words == []
+    assert a.answer(TerritoryRequest(agent="c", incarnation=1, seq=1, plots=[0], silent=["b"])).reservations == [
+        last
+    ]
+    assert a.answer(TerritoryRequest(agent="c", incarnation=1, seq=2, plots=[0])).reservations == []

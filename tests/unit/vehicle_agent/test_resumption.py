@@ -8,7 +8,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.wire.messages.vehicles import Claims, Want
+from swarm.wire.messages.vehicles import RequestedCell, Reservations
 from vehicle_agent.traffic.resumption import Placement, Resumption
 
 S = 1_000_000_000
@@ -23,18 +23,18 @@ cells = st.integers(0, CELLS + 2)
 
 
 @st.composite
-def claims_of(draw: st.DrawFn, agent: str) -> Claims:
+def claims_of(draw: st.DrawFn, agent: str) -> Reservations:
     incarnation, seq = draw(st.tuples(incarnations, st.integers(0, 4)))
     # What an agent says under one stamp is always the same.
     chance = random.Random(f"{agent}/{incarnation}/{seq}")
     vehicles = [vehicle for vehicle in SPAWNS[agent] if seq and chance.random() < 0.8]
-    return Claims(
+    return Reservations(
         agent=agent,
         incarnation=incarnation,
         seq=seq,
         clock=0,
-        holds={vehicle: chance.sample(range(CELLS + 2), chance.randint(1, 2)) for vehicle in vehicles},
-        wants=[Want(vehicle=vehicle, cell=chance.randrange(CELLS), ticket=1) for vehicle in vehicles],
+        held={vehicle: chance.sample(range(CELLS + 2), chance.randint(1, 2)) for vehicle in vehicles},
+        requested=[RequestedCell(vehicle=vehicle, cell=chance.randrange(CELLS), ticket=1) for vehicle in vehicles],
         seen={other: (chance.randint(1, 3), chance.randint(1, 4)) for other in SPAWNS if chance.random() < 0.3},
     )
 
@@ -47,13 +47,15 @@ def resumption() -> Resumption:
     return Resumption("a", SPAWNS, CELLS)
 
 
-def newest(heard: list[Claims], agent: str) -> Claims | None:
-    of_agent = [claims for claims in heard if claims.agent == agent and claims.seq]
-    return max(of_agent, key=lambda claims: (claims.incarnation, claims.seq), default=None)
+def newest(heard: list[Reservations], agent: str) -> Reservations | None:
+    of_agent = [reservations for reservations in heard if reservations.agent == agent and reservations.seq]
+    return max(of_agent, key=lambda reservations: (reservations.incarnation, reservations.seq), default=None)
 
 
 @given(answers, alive_agents)
-def test_nothing_is_placed_before_every_live_agent_has_answered(heard: list[Claims], alive: dict[str, int]) -> None:
+def test_nothing_is_placed_before_every_live_agent_has_answered(
+    heard: list[Reservations], alive: dict[str, int]
+) -> None:
     starting = resumption()
     for count in range(len(heard) + 1):
         silent = [id for id in alive if (id, alive[id]) not in {(c.agent, c.incarnation) for c in heard[:count]}]
@@ -65,11 +67,11 @@ def test_nothing_is_placed_before_every_live_agent_has_answered(heard: list[Clai
 
 @given(answers, alive_agents)
 def test_nothing_is_placed_while_claims_that_a_live_agent_has_seen_of_a_silent_one_are_missing(
-    heard: list[Claims], alive: dict[str, int]
+    heard: list[Reservations], alive: dict[str, int]
 ) -> None:
     starting = resumption()
-    for claims in heard:
-        starting.answered(claims)
+    for reservations in heard:
+        starting.answered(reservations)
     if starting.question_ended(alive, S) is None:
         return
     for agent, incarnation in alive.items():
@@ -83,10 +85,10 @@ def test_nothing_is_placed_while_claims_that_a_live_agent_has_seen_of_a_silent_o
 
 
 @given(answers, alive_agents)
-def test_a_vehicle_is_placed_only_where_no_other_may_be(heard: list[Claims], alive: dict[str, int]) -> None:
+def test_a_vehicle_is_placed_only_where_no_other_may_be(heard: list[Reservations], alive: dict[str, int]) -> None:
     starting = resumption()
-    for claims in heard:
-        starting.answered(claims)
+    for reservations in heard:
+        starting.answered(reservations)
     placement = starting.placement(alive)
     assert sorted([*placement.cells, *placement.unplaced]) == ["a-0", "a-1"]
     placed = list(placement.cells.values())
@@ -97,36 +99,36 @@ def test_a_vehicle_is_placed_only_where_no_other_may_be(heard: list[Claims], ali
         if known is None:
             assert not set(placed) & set(SPAWNS[other].values())
             continue
-        assert not set(placed) & {cell for held in known.holds.values() for cell in held}
+        assert not set(placed) & {cell for held in known.held.values() for cell in held}
         if alive.get(other) != known.incarnation:
-            assert not set(placed) & {want.cell for want in known.wants}
+            assert not set(placed) & {want.cell for want in known.requested}
 
 
 @given(answers, alive_agents)
 def test_a_vehicle_of_an_earlier_incarnation_stands_where_it_last_stood_or_nowhere(
-    heard: list[Claims], alive: dict[str, int]
+    heard: list[Reservations], alive: dict[str, int]
 ) -> None:
     starting = resumption()
-    for claims in heard:
-        starting.answered(claims)
+    for reservations in heard:
+        starting.answered(reservations)
     placement = starting.placement(alive)
     last = newest(heard, "a")
     assert placement.resumed == (last is not None)
     for vehicle, cell in placement.cells.items():
-        assert cell == (SPAWNS["a"][vehicle] if last is None else last.holds[vehicle][0])
+        assert cell == (SPAWNS["a"][vehicle] if last is None else last.held[vehicle][0])
 
 
 @given(answers, alive_agents, st.randoms(use_true_random=False))
 def test_the_order_and_repetition_of_answers_do_not_matter(
-    heard: list[Claims], alive: dict[str, int], chance: random.Random
+    heard: list[Reservations], alive: dict[str, int], chance: random.Random
 ) -> None:
     shuffled = heard + chance.choices(heard, k=3) if heard else []
     chance.shuffle(shuffled)
 
-    def outcome(messages: list[Claims]) -> tuple[bool, Placement]:
+    def outcome(messages: list[Reservations]) -> tuple[bool, Placement]:
         starting = resumption()
-        for claims in messages:
-            starting.answered(claims)
+        for reservations in messages:
+            starting.answered(reservations)
         return starting.complete(alive), starting.placement(alive)
 
     (complete, one), (also_complete, other) = outcome(heard), outcome(shuffled)

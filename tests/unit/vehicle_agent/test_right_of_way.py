@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from swarm.wire.messages.vehicles import Claims
+from swarm.wire.messages.vehicles import Reservations
 from vehicle_agent.traffic.resumption import Resumption
 from vehicle_agent.traffic.right_of_way import RightOfWay
 
@@ -23,7 +23,7 @@ some_cells = st.lists(st.sampled_from(CELLS), min_size=1, max_size=3, unique=Tru
 
 
 class Process:
-    """One incarnation of an agent: its claims, whom it takes for alive, and what it gathers before it starts."""
+    """One incarnation of an agent: its reservations, which agents it takes to be alive, and how it starts."""
 
     def __init__(self, agent: str, incarnation: int) -> None:
         self.rights = RightOfWay(agent, incarnation, SPAWNS)
@@ -49,7 +49,7 @@ class Swarm:
         self.live: dict[str, Process] = {}
         # Where the vehicles of those who are not there stand.
         self.ghosts: dict[str, dict[str, int]] = {agent: dict(spawns) for agent, spawns in SPAWNS.items()}
-        self.sent: list[Claims] = []
+        self.sent: list[Reservations] = []
         self.moves = 0
         for agent in AGENTS:
             self.restart(agent)
@@ -87,15 +87,15 @@ class Swarm:
             if other == agent:
                 continue
             rights = process.rights
-            for claims in rights.answers() if process.gathering is None else [rights.unplaced()]:
-                gathered.answered(claims)
+            for reservations in rights.answers() if process.gathering is None else [rights.unplaced()]:
+                gathered.answered(reservations)
         newcomer.see({other: process.incarnation for other, process in self.live.items()})
         if not gathered.complete(newcomer.alive):
             return  # somebody has not noticed yet that a third is dead, whose last words are missing: ask again
         newcomer.gathering = None
         placement = gathered.placement(newcomer.alive)
-        for claims in placement.reservations:
-            newcomer.rights.hear(claims)
+        for reservations in placement.reservations:
+            newcomer.rights.hear(reservations)
         del self.ghosts[agent]
         for vehicle, cell in placement.cells.items():
             newcomer.rights.place(vehicle, cell)
@@ -136,14 +136,14 @@ class Swarm:
         if rights is not None:
             self.sent.append(rights.next_message())
 
-    def deliver(self, observer: str, claims: Claims) -> None:
+    def deliver(self, observer: str, reservations: Reservations) -> None:
         process = self.live.get(observer)
         if process is not None:
-            process.rights.hear(claims)
+            process.rights.hear(reservations)
 
     def deliver_all(self, observer: str) -> None:
-        for claims in self.sent[-2 * len(AGENTS) :]:
-            self.deliver(observer, claims)
+        for reservations in self.sent[-2 * len(AGENTS) :]:
+            self.deliver(observer, reservations)
 
     def good_moment(self) -> None:
         """Everybody speaks and hears everybody, twice."""
@@ -310,9 +310,9 @@ def pair() -> tuple[RightOfWay, RightOfWay]:
 
 def exchange(*everybody: RightOfWay) -> None:
     """Each speaks once, and all the others hear it."""
-    for claims in [rights.next_message() for rights in everybody]:
+    for reservations in [rights.next_message() for rights in everybody]:
         for rights in everybody:
-            rights.hear(claims)
+            rights.hear(reservations)
 
 
 def test_nothing_is_entered_before_the_other_has_seen_the_want() -> None:
@@ -431,7 +431,7 @@ def test_old_and_repeated_claims_change_nothing() -> None:
     a.hear(early)
     a.hear(late)
     again = a.next_message()
-    assert (said.holds, said.wants, said.seen) == (again.holds, again.wants, again.seen)
+    assert (said.held, said.requested, said.seen) == (again.held, again.requested, again.seen)
 
 
 def test_two_vehicles_of_one_agent_keep_apart_without_asking_anybody() -> None:
@@ -453,12 +453,12 @@ def test_a_newcomer_waits_until_the_last_words_that_anybody_heard_have_come_thro
     b.request("v", [2])
     exchange(a, b)
     gathered = Resumption("b", {"a": {"u": 0}, "b": {"v": 1}}, 14)
-    own, *_ = [claims for claims in a.answers() if claims.agent == "a"]
+    own, *_ = [reservations for reservations in a.answers() if reservations.agent == "a"]
     gathered.answered(own)
     assert not gathered.complete({"a": 1})
     a.set_alive({"b": 2})
-    for claims in a.answers():
-        gathered.answered(claims)
+    for reservations in a.answers():
+        gathered.answered(reservations)
     assert gathered.complete({"a": 1})
     placement = gathered.placement({"a": 1})
     assert placement.resumed
@@ -467,6 +467,6 @@ def test_a_newcomer_waits_until_the_last_words_that_anybody_heard_have_come_thro
 
 def test_whoever_has_not_placed_its_vehicles_yet_takes_nothing_back() -> None:
     a, _ = pair()
-    present = Claims(agent="b", incarnation=2, seq=0, clock=0, holds={}, wants=[], seen={})
+    present = Reservations(agent="b", incarnation=2, seq=0, clock=0, held={}, requested=[], seen={})
     a.hear(present)
     assert a.holder(1) == "v"

@@ -10,7 +10,7 @@ import pytest
 from shared_map.replication.interest import Interest
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import Claims, Grounds
+from swarm.wire.messages.vehicles import Reservations, TerritoryReply, TerritoryRequest
 from vehicle_agent.traffic.resumption import Resumption
 from vehicle_agent.traffic.right_of_way import RightOfWay
 from vehicle_agent.traffic.territory import PLOT_CELLS, Territory
@@ -49,18 +49,18 @@ class Process:
         self.territory.set_plots(self.near.update([*claimed, *besides]))
         self.rights.forget_far()
 
-    def asked(self, question: Grounds) -> Grounds:
+    def asked(self, question: TerritoryRequest) -> TerritoryReply:
         self.territory.hear(question)
         return self.territory.answer(self.rights.heard_of(question.silent))
 
-    def answered(self, answer: Grounds, seq: int) -> None:
-        for claims in answer.words:
-            self.rights.hear(claims)
+    def answered(self, answer: TerritoryReply, seq: int) -> None:
+        for reservations in answer.reservations:
+            self.rights.hear(reservations)
         self.territory.answered(answer, seq)
 
 
 class Swarm:
-    """Agents over a network that loses, repeats, delays and reorders claims, questions and answers.
+    """Agents over a network that loses, repeats, delays and reorders reservations, questions and answers.
 
     Of those who know where the dead stand somebody always lives: one agent is down at a time.
     """
@@ -71,9 +71,9 @@ class Swarm:
         self.starts = 0
         self.live: dict[str, Process] = {}
         self.ghosts = {agent: dict(spawns) for agent, spawns in SPAWNS.items()}
-        self.claims: list[Claims] = []
-        self.questions: list[tuple[str, Grounds]] = []  # (to, question)
-        self.answers: list[tuple[str, int, Grounds, int]] = []  # (to, its incarnation, answer, number asked)
+        self.reservations: list[Reservations] = []
+        self.questions: list[tuple[str, TerritoryRequest]] = []  # (to, question)
+        self.answers: list[tuple[str, int, TerritoryReply, int]] = []  # (to, its incarnation, answer, number asked)
         self.moves = 0
         for agent in AGENTS:
             self.restart(agent)
@@ -103,16 +103,16 @@ class Swarm:
         gathered = newcomer.gathering
         for other, process in self.live.items():
             rights = process.rights
-            for claims in rights.answers() if process.gathering is None else [rights.unplaced()]:
+            for reservations in rights.answers() if process.gathering is None else [rights.unplaced()]:
                 if other != agent:
-                    gathered.answered(claims)
+                    gathered.answered(reservations)
         newcomer.see({other: process.incarnation for other, process in self.live.items()})
         if not gathered.complete(newcomer.alive):
             return
         newcomer.gathering = None
         placement = gathered.placement(newcomer.alive)
-        for claims in placement.reservations:
-            newcomer.rights.hear(claims)
+        for reservations in placement.reservations:
+            newcomer.rights.hear(reservations)
         del self.ghosts[agent]
         for vehicle, cell in placement.cells.items():
             newcomer.rights.place(vehicle, cell)
@@ -150,29 +150,29 @@ class Swarm:
         if question is not None:
             self.questions += [(other, question) for other in self.live if other != process.agent]
 
-    def hear_question(self, to: str, question: Grounds) -> None:
+    def hear_question(self, to: str, question: TerritoryRequest) -> None:
         process, asker = self.live.get(to), self.live.get(question.agent)
         if process is not None and asker is not None:
             answer = process.asked(question)
             self.answers.append((question.agent, question.incarnation, answer, question.seq))
 
-    def hear_answer(self, to: str, incarnation: int, answer: Grounds, seq: int) -> None:
+    def hear_answer(self, to: str, incarnation: int, answer: TerritoryReply, seq: int) -> None:
         process = self.live.get(to)
         if process is not None and process.incarnation == incarnation:
             process.answered(answer, seq)
 
-    def hear_claims(self, observer: str, claims: Claims) -> None:
+    def hear_claims(self, observer: str, reservations: Reservations) -> None:
         process = self.placed(observer)
-        if process is not None and claims.agent in process.territory.heard_from:
-            process.rights.hear(claims)
+        if process is not None and reservations.agent in process.territory.heard_from:
+            process.rights.hear(reservations)
 
     def speak(self, process: Process, loss: float) -> None:
         """Say what we claim; who hears it hears it at once, others perhaps later, or never."""
-        claims = process.rights.next_message()
-        self.claims.append(claims)
+        reservations = process.rights.next_message()
+        self.reservations.append(reservations)
         for observer in AGENTS:
             if self.chance.random() >= loss:
-                self.hear_claims(observer, claims)
+                self.hear_claims(observer, reservations)
 
     def agree(self, process: Process, loss: float) -> None:
         """Ask everybody about our territory; questions and answers are lost alike."""
@@ -226,8 +226,8 @@ class Swarm:
                         self.agree(each, deaf)
                         if each.gathering is None:
                             self.speak(each, loss)
-                case 9 if self.claims:
-                    self.hear_claims(agent, chance.choice(self.claims[-30:]))
+                case 9 if self.reservations:
+                    self.hear_claims(agent, chance.choice(self.reservations[-30:]))
                 case 10 if self.questions:
                     self.hear_question(*chance.choice(self.questions[-30:]))
                 case _ if self.answers:
@@ -239,7 +239,7 @@ class Swarm:
 def test_no_two_vehicles_meet_though_only_neighbours_are_heard(
     seed: int, dying: float, loss: float, deaf: float
 ) -> None:
-    """dying: how often an agent crashes; loss, deaf: share of claims and of questions and answers that are lost"""
+    """dying: how often an agent crashes; loss: share of reservations lost; deaf: of questions and answers"""
     swarm = Swarm(random.Random(seed), witnesses=1 if dying else 0)
     for _ in range(40):
         swarm.step(0.0, 0.0, 0.0)
@@ -377,7 +377,7 @@ def test_where_somebody_died_of_whom_nobody_heard_anything_the_plot_stays_closed
     assert a.agreed(0)
     rights.request("u", [63])
     assert rights.requested("u") == []
-    words = Claims(agent="b", incarnation=1, seq=9, clock=3, holds={"v": [30]}, wants=[], seen={})
+    words = Reservations(agent="b", incarnation=1, seq=9, clock=3, held={"v": [30]}, requested=[], seen={})
     rights.hear(words)
     rights.request("u", [63])
     assert rights.requested("u") == [63]
