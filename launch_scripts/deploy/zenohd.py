@@ -8,7 +8,18 @@ from typing import Any
 from swarm.bus.zenoh_config import tls_settings
 from swarm.config.scenario import NetworkConfig
 from swarm.wire.codec import MAX_PAYLOAD_BYTES
-from swarm.wire.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, SIGHTED, STATS
+from swarm.wire.topics import (
+    ALIVE_KEY,
+    DIGEST,
+    FLEET,
+    FOLLOWED,
+    MARKS,
+    NOTE,
+    RESERVATIONS,
+    SIGHTED,
+    STATS,
+    TERRITORY,
+)
 
 ANSWERS = ("declare_queryable", "reply")
 PUTS = ("put", "delete", *ANSWERS, "liveliness_token")
@@ -63,7 +74,7 @@ def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]
     """Access control rules, by the common name of the certificate at the other end of a link.
 
     An agent hears everything and writes under its own name only: authors are called `GROUP.ID.INCARNATION`. It
-    answers for others, too, where it is asked for the last claims of those that are gone.
+    answers for others, too, where it is asked for the newest reservations of those that are gone.
     """
     whole = [f"{namespace}/**"]
     rules = [_rule("all", (*PUTS, *READS), whole), _rule("hear", READS, whole)]
@@ -71,13 +82,13 @@ def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]
     rules.append(_rule("told", PUTS, whole, flows=["egress"]))
     rules.append(_rule("asked", READS, whole, flows=["egress"]))
     # Only those which heard a dead agent last know where its vehicles stand.
-    rules.append(_rule("words", ANSWERS, [CLAIMS.expression(namespace)]))
+    rules.append(_rule("relayed", ANSWERS, [RESERVATIONS.expression(namespace)]))
     policies = [{"rules": ["all"], "subjects": ["trusted"]}] if trusted else []
     subjects = [{"id": "trusted", "cert_common_names": list(trusted)}] if trusted else []
     for agent in agents:
         rules.append(_rule(f"own-{agent}", PUTS, [f"{namespace}/{key}" for key in own_keys(agent)]))
         subjects.append({"id": agent, "cert_common_names": [agent]})
-        policies.append({"rules": ["hear", "told", "asked", "words", f"own-{agent}"], "subjects": [agent]})
+        policies.append({"rules": ["hear", "told", "asked", "relayed", f"own-{agent}"], "subjects": [agent]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -95,8 +106,8 @@ def own_keys(name: str) -> list[str]:
         DIGEST.key.format(author=author),
         FLEET.key.format(region="*", author=author),
         SIGHTED.key.format(target="*", author=author),
-        CLAIMS.key.format(agent=agent),
-        GROUNDS.key.format(agent=agent),
+        RESERVATIONS.key.format(agent=agent),
+        TERRITORY.key.format(agent=agent),
         FOLLOWED.key.format(agent=agent, vehicle="*"),
         STATS.key.format(role="agent", id=agent),
         NOTE.key.format(role="agent", id=agent),

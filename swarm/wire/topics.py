@@ -23,7 +23,7 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Claims, Fleet, Followed, Grounds
+from swarm.wire.messages.vehicles import Fleet, Followed, Reservations, TerritoryReply, TerritoryRequest
 
 
 class Priority(Enum):
@@ -154,15 +154,15 @@ BASE_TILES = Topic(
 FLEET = Topic(
     "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
 )  # fmt: skip
-CLAIMS = Topic(
-    "claims", "claims/{agent}", Claims,
-    "which cells vehicles hold and want, for neighbours and witnesses; who heard an agent answers with its last",
+RESERVATIONS = Topic(
+    "reservations", "reservations/{agent}", Reservations,
+    "which cells vehicles hold and request; an agent answers with its own and the newest of those that died",
     "every tick, on change", request=Nothing, priority=Priority.INTERACTIVE,
 )  # fmt: skip
-GROUNDS = Topic(
-    "grounds", "grounds/{agent}", Grounds,
-    "in which plots agents claim cells: asked of all before one is entered", "on change", request=Grounds,
-    published=False, priority=Priority.INTERACTIVE,
+TERRITORY = Topic(
+    "territory", "territory/{agent}", TerritoryReply,
+    "in which plots agents reserve cells: asked of all before one is entered", "on change",
+    request=TerritoryRequest, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
@@ -202,7 +202,7 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CLAIMS, GROUNDS, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, RESERVATIONS, TERRITORY, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED,
     TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
 )  # fmt: skip
 

@@ -22,7 +22,7 @@ from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Claims
+from swarm.wire.messages.vehicles import Reservations
 from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.routes import Route, RouteStatus
 from swarm.wire.topics import TOPICS
@@ -176,8 +176,8 @@ def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(j
         (TargetPose, {"x_m": math.nan}, "x_m"),
         (TargetPose, {"y_m": 1e10}, "y_m"),
         (TargetPose, {"target": "*"}, "target"),
-        (Claims, {"holds": {"v": []}}, "at least the cell"),
-        (Claims, {"clock": (1 << 64) - 1}, "clock"),
+        (Reservations, {"held": {"v": []}}, "at least the cell"),
+        (Reservations, {"clock": (1 << 64) - 1}, "clock"),
         (RouteRequest, {"cells": [1 << 40]}, "cells"),
         (RouteRequest, {"cells": [1], "vehicles": ["a", "b"]}, "2 vehicles for 1 cells"),
         (RouteRequest, {"row": 3, "col": None}, "both row and col"),

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from swarm.wire.messages.vehicles import Claims
+from swarm.wire.messages.vehicles import Reservations
 from vehicle_agent.traffic.resumption import Resumption
 from vehicle_agent.traffic.right_of_way import RightOfWay
 
@@ -23,13 +23,13 @@ some_cells = st.lists(st.sampled_from(CELLS), min_size=1, max_size=3, unique=Tru
 
 
 class Process:
-    """One incarnation of an agent: its claims, whom it takes for alive, and what it gathers before it starts."""
+    """One incarnation of an agent: its reservations, which agents it takes to be alive, and how it starts."""
 
     def __init__(self, agent: str, incarnation: int) -> None:
         self.rights = RightOfWay(agent, incarnation, SPAWNS)
         self.incarnation = incarnation
         self.alive: dict[str, int] = {}
-        self.gathering: Resumption | None = Resumption(agent)
+        self.gathering: Resumption | None = Resumption(agent, SPAWNS, len(CELLS))
 
     def see(self, alive: dict[str, int]) -> None:
         self.alive = alive
@@ -49,7 +49,7 @@ class Swarm:
         self.live: dict[str, Process] = {}
         # Where the vehicles of those who are not there stand.
         self.ghosts: dict[str, dict[str, int]] = {agent: dict(spawns) for agent, spawns in SPAWNS.items()}
-        self.sent: list[Claims] = []
+        self.sent: list[Reservations] = []
         self.moves = 0
         for agent in AGENTS:
             self.restart(agent)
@@ -64,7 +64,7 @@ class Swarm:
             return
         del self.live[agent]
         if process.gathering is None:
-            stands = {vehicle: process.rights.holds(vehicle)[:1] for vehicle in SPAWNS[agent]}
+            stands = {vehicle: process.rights.held(vehicle)[:1] for vehicle in SPAWNS[agent]}
             self.ghosts[agent] = {vehicle: cells[0] for vehicle, cells in stands.items() if cells}
 
     def restart(self, agent: str) -> None:
@@ -86,22 +86,19 @@ class Swarm:
         for other, process in self.live.items():
             if other == agent:
                 continue
-            stamp = process.incarnation
-            present = Claims(agent=other, incarnation=stamp, seq=0, clock=0, holds={}, wants=[], seen={})
-            for claims in process.rights.answers() if process.gathering is None else [present]:
-                gathered.answered(claims)
+            rights = process.rights
+            for reservations in rights.answers() if process.gathering is None else [rights.unplaced()]:
+                gathered.answered(reservations)
         newcomer.see({other: process.incarnation for other, process in self.live.items()})
         if not gathered.complete(newcomer.alive):
             return  # somebody has not noticed yet that a third is dead, whose last words are missing: ask again
         newcomer.gathering = None
-        last = gathered.last_words
-        for claims in [*gathered.others, *([] if last is None else [last])]:
-            newcomer.rights.heard(claims)
+        placement = gathered.placement(newcomer.alive)
+        for reservations in placement.reservations:
+            newcomer.rights.hear(reservations)
         del self.ghosts[agent]
-        for vehicle, spawn in SPAWNS[agent].items():
-            cell = spawn if last is None else last.holds.get(vehicle, [None])[0]
-            if cell is not None and newcomer.rights.holder(cell) is None:
-                newcomer.rights.place(vehicle, cell)
+        for vehicle, cell in placement.cells.items():
+            newcomer.rights.place(vehicle, cell)
 
     def notice_death(self, observer: str, agent: str) -> None:
         process = self.live.get(observer)
@@ -118,7 +115,7 @@ class Swarm:
         rights = self.placed(agent)
         if rights is not None:
             vehicle = list(SPAWNS[agent])[index % len(SPAWNS[agent])]
-            rights.ask(vehicle, [cell for cell in cells if cell not in rights.holds(vehicle)[:1]])
+            rights.request(vehicle, [cell for cell in cells if cell not in rights.held(vehicle)[:1]])
 
     def grant(self, agent: str) -> None:
         rights = self.placed(agent)
@@ -128,8 +125,8 @@ class Swarm:
     def move(self, agent: str) -> None:
         rights = self.placed(agent)
         for vehicle in SPAWNS[agent] if rights is not None else ():
-            if rights is not None and len(rights.holds(vehicle)) > 1:
-                rights.moved(vehicle, rights.holds(vehicle)[1])
+            if rights is not None and len(rights.held(vehicle)) > 1:
+                rights.moved(vehicle, rights.held(vehicle)[1])
                 self.moves += 1
 
     # --- the network ----------------------------------------------------------------------------------------
@@ -137,18 +134,16 @@ class Swarm:
     def speak(self, agent: str) -> None:
         rights = self.placed(agent)
         if rights is not None:
-            self.sent.append(rights.speak())
+            self.sent.append(rights.next_message())
 
-    def deliver(self, observer: str, claims: Claims) -> None:
+    def deliver(self, observer: str, reservations: Reservations) -> None:
         process = self.live.get(observer)
         if process is not None:
-            process.rights.heard(claims)
-            if process.gathering is not None:
-                process.gathering.heard(claims)
+            process.rights.hear(reservations)
 
     def deliver_all(self, observer: str) -> None:
-        for claims in self.sent[-2 * len(AGENTS) :]:
-            self.deliver(observer, claims)
+        for reservations in self.sent[-2 * len(AGENTS) :]:
+            self.deliver(observer, reservations)
 
     def good_moment(self) -> None:
         """Everybody speaks and hears everybody, twice."""
@@ -165,14 +160,14 @@ class Swarm:
         for agent in self.live:
             rights = self.placed(agent)
             if rights is not None:
-                held += [(vehicle, cell) for vehicle in SPAWNS[agent] for cell in rights.holds(vehicle)]
+                held += [(vehicle, cell) for vehicle in SPAWNS[agent] for cell in rights.held(vehicle)]
         assert_distinct(held)
         standing = [(vehicle, cell) for stands in self.ghosts.values() for vehicle, cell in stands.items()]
         for agent in self.live:
             rights = self.placed(agent)
             for vehicle in SPAWNS[agent] if rights is not None else ():
                 if rights is not None:
-                    standing += [(vehicle, cell) for cell in rights.holds(vehicle)[:1]]
+                    standing += [(vehicle, cell) for cell in rights.held(vehicle)[:1]]
         assert_distinct(standing)
 
 
@@ -256,7 +251,7 @@ def wander(swarm: Swarm, agent: str, chance: random.Random) -> None:
     """Who wants nothing wants something new; now and then somebody changes its mind."""
     rights = swarm.placed(agent)
     for index, vehicle in enumerate(SPAWNS[agent]):
-        if rights is not None and (not rights.wants(vehicle) or chance.random() < 0.5):
+        if rights is not None and (not rights.requested(vehicle) or chance.random() < 0.5):
             swarm.ask(agent, index, chance.sample(CELLS, chance.choice((0, 1, 2))))
 
 
@@ -315,50 +310,50 @@ def pair() -> tuple[RightOfWay, RightOfWay]:
 
 def exchange(*everybody: RightOfWay) -> None:
     """Each speaks once, and all the others hear it."""
-    for claims in [rights.speak() for rights in everybody]:
+    for reservations in [rights.next_message() for rights in everybody]:
         for rights in everybody:
-            rights.heard(claims)
+            rights.hear(reservations)
 
 
 def test_nothing_is_entered_before_the_other_has_seen_the_want() -> None:
     a, b = pair()
-    a.ask("u", [2])
+    a.request("u", [2])
     assert not a.grant()
-    b.heard(a.speak())
+    b.hear(a.next_message())
     assert not a.grant()
-    a.heard(b.speak())
+    a.hear(b.next_message())
     assert a.grant()
-    assert a.holds("u") == [0, 2]
+    assert a.held("u") == [0, 2]
 
 
 def test_of_two_who_want_one_cell_the_earlier_ticket_goes_first_and_then_the_other() -> None:
     a, b = pair()
-    b.ask("v", [2])
+    b.request("v", [2])
     exchange(a, b)
-    a.ask("u", [2])
+    a.request("u", [2])
     for _ in range(3):
         exchange(a, b)
         a.grant()
         b.grant()
-    assert b.holds("v") == [1, 2]
-    assert a.holds("u") == [0]
+    assert b.held("v") == [1, 2]
+    assert a.held("u") == [0]
     b.moved("v", 2)
-    b.ask("v", [3])
+    b.request("v", [3])
     for _ in range(3):
         exchange(a, b)
         a.grant()
         b.grant()
-    assert b.holds("v") == [2, 3]
+    assert b.held("v") == [2, 3]
     b.moved("v", 3)
     exchange(a, b)
     assert a.grant()
-    assert a.holds("u") == [0, 2]
+    assert a.held("u") == [0, 2]
 
 
 def test_a_tie_goes_to_the_lower_agent_and_vehicle() -> None:
     a, b = pair()
-    a.ask("u", [2])
-    b.ask("v", [2])
+    a.request("u", [2])
+    b.request("v", [2])
     exchange(a, b)
     exchange(a, b)
     assert not b.grant()
@@ -367,28 +362,28 @@ def test_a_tie_goes_to_the_lower_agent_and_vehicle() -> None:
 
 def test_cells_are_granted_in_the_order_in_which_they_will_be_entered() -> None:
     a, b = pair()
-    a.ask("u", [1, 2])
+    a.request("u", [1, 2])
     exchange(a, b)
     exchange(a, b)
     assert not a.grant()
-    b.ask("v", [3])
+    b.request("v", [3])
     exchange(a, b)
     exchange(a, b)
     assert b.grant()
     b.moved("v", 3)
     exchange(a, b)
     assert a.grant()
-    assert a.holds("u") == [0, 1, 2]
+    assert a.held("u") == [0, 1, 2]
 
 
 def test_what_the_dead_held_or_wanted_stays_closed_until_they_are_back() -> None:
     a, b = pair()
-    b.ask("v", [2])
+    b.request("v", [2])
     exchange(a, b)
     a.set_alive({})
     for cell in (1, 2):
-        a.ask("u", [cell])
-        a.speak()
+        a.request("u", [cell])
+        a.next_message()
         assert not a.grant()
     back = RightOfWay("b", 2, {"a": {"u": 0}, "b": {"v": 1}})
     back.place("v", 1)
@@ -397,29 +392,29 @@ def test_what_the_dead_held_or_wanted_stays_closed_until_they_are_back() -> None
     for _ in range(2):
         exchange(a, back)
     assert a.grant()
-    assert a.holds("u") == [0, 2]
+    assert a.held("u") == [0, 2]
 
 
 def test_those_who_have_not_started_are_where_they_will_start() -> None:
     alone = RightOfWay("a", 1, {"a": {"u": 0}, "b": {"v": 1}})
     alone.place("u", 0)
-    alone.ask("u", [1])
-    alone.speak()
+    alone.request("u", [1])
+    alone.next_message()
     assert not alone.grant()
     assert alone.holder(1) == "v"
 
 
 def test_giving_up_a_cell_frees_it_at_once_and_wanting_it_again_queues_anew() -> None:
     a, b = pair()
-    a.ask("u", [2, 3])
+    a.request("u", [2, 3])
     exchange(a, b)
     exchange(a, b)
     a.grant()
-    b.ask("v", [2])
+    b.request("v", [2])
     exchange(a, b)
-    a.ask("u", [])
-    assert a.holds("u") == [0]
-    a.ask("u", [2])
+    a.request("u", [])
+    assert a.held("u") == [0]
+    a.request("u", [2])
     for _ in range(3):
         exchange(a, b)
     assert not a.grant()
@@ -428,49 +423,50 @@ def test_giving_up_a_cell_frees_it_at_once_and_wanting_it_again_queues_anew() ->
 
 def test_old_and_repeated_claims_change_nothing() -> None:
     a, b = pair()
-    early = b.speak()
-    b.ask("v", [5])
-    late = b.speak()
-    a.heard(late)
-    said = a.speak()
-    a.heard(early)
-    a.heard(late)
-    again = a.speak()
-    assert (said.holds, said.wants, said.seen) == (again.holds, again.wants, again.seen)
+    early = b.next_message()
+    b.request("v", [5])
+    late = b.next_message()
+    a.hear(late)
+    said = a.next_message()
+    a.hear(early)
+    a.hear(late)
+    again = a.next_message()
+    assert (said.held, said.requested, said.seen) == (again.held, again.requested, again.seen)
 
 
 def test_two_vehicles_of_one_agent_keep_apart_without_asking_anybody() -> None:
     a = RightOfWay("a", 1, {"a": {"u": 0, "v": 1}})
     a.place("u", 0)
     a.place("v", 1)
-    a.ask("u", [2])
-    a.ask("v", [2])
-    a.speak()
+    a.request("u", [2])
+    a.request("v", [2])
+    a.next_message()
     a.grant()
-    assert a.holds("u") == [0, 2]
-    assert a.holds("v") == [1]
+    assert a.held("u") == [0, 2]
+    assert a.held("v") == [1]
     with pytest.raises(ValueError, match="both placed"):
         a.place("w", 1)
 
 
 def test_a_newcomer_waits_until_the_last_words_that_anybody_heard_have_come_through() -> None:
     a, b = pair()
-    b.ask("v", [2])
+    b.request("v", [2])
     exchange(a, b)
-    gathered = Resumption("b")
-    own, *_ = [claims for claims in a.answers() if claims.agent == "a"]
+    gathered = Resumption("b", {"a": {"u": 0}, "b": {"v": 1}}, 14)
+    own, *_ = [reservations for reservations in a.answers() if reservations.agent == "a"]
     gathered.answered(own)
     assert not gathered.complete({"a": 1})
     a.set_alive({"b": 2})
-    for claims in a.answers():
-        gathered.answered(claims)
+    for reservations in a.answers():
+        gathered.answered(reservations)
     assert gathered.complete({"a": 1})
-    assert gathered.last_words is not None
-    assert gathered.last_words.holds == {"v": [1]}
+    placement = gathered.placement({"a": 1})
+    assert placement.resumed
+    assert placement.cells == {"v": 1}
 
 
 def test_whoever_has_not_placed_its_vehicles_yet_takes_nothing_back() -> None:
     a, _ = pair()
-    present = Claims(agent="b", incarnation=2, seq=0, clock=0, holds={}, wants=[], seen={})
-    a.heard(present)
+    present = Reservations(agent="b", incarnation=2, seq=0, clock=0, held={}, requested=[], seen={})
+    a.hear(present)
     assert a.holder(1) == "v"

@@ -32,9 +32,9 @@ from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import FOLDS, Digest
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.vehicles import Claims
+from swarm.wire.messages.vehicles import Reservations
 from swarm.wire.statements import MarkKind
-from swarm.wire.topics import CLAIMS, DIGEST, MARKS, STATS
+from swarm.wire.topics import DIGEST, MARKS, RESERVATIONS, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.zenohd]
 
@@ -219,27 +219,29 @@ def test_with_certificates_an_agent_that_starts_again_is_told_where_its_vehicles
         tls = TlsConfig(**dict(zip(("ca", "certificate", "key"), files, strict=True)))
         return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=tls)
 
-    def claims(agent: str) -> Claims:
-        return Claims(agent=agent, incarnation=1, seq=3, clock=0, holds={f"{agent}-00": [7]}, wants=[], seen={})
+    def reservations(agent: str) -> Reservations:
+        return Reservations(
+            agent=agent, incarnation=1, seq=3, clock=0, held={f"{agent}-00": [7]}, requested=[], seen={}
+        )
 
     def answer(event: Event) -> None:
         assert isinstance(event, Asked)
         for agent in ("a0", "a1"):
-            event.answer(claims(agent), agent=agent)
+            event.answer(reservations(agent), agent=agent)
         event.end()
 
     router = Router(tmp_path, network("router"), trusted=["router"], agents=["all.a0", "all.a1"])
     try:
         with open_bus(network("all.a0")) as neighbour, open_bus(network("all.a1")) as starting:
-            neighbour.serve(CLAIMS, answer)
+            neighbour.serve(RESERVATIONS, answer)
             heard: list[Event] = []
 
-            def told() -> list[Claims]:
-                starting.ask(CLAIMS, Nothing(), heard.append, tag="claims", timeout_s=1.0)
+            def told() -> list[Reservations]:
+                starting.ask(RESERVATIONS, Nothing(), heard.append, tag="reservations", timeout_s=1.0)
                 time.sleep(0.3)
                 return [event.message for event in heard if isinstance(event, Replied)]
 
-            eventually(lambda: claims("a1") in told(), 5, "the last words of the agent that starts again")
+            eventually(lambda: reservations("a1") in told(), 5, "the last words of the agent that starts again")
     finally:
         router.stop()
 

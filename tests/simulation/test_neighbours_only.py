@@ -54,7 +54,7 @@ def test_agents_listen_to_their_neighbours_only_and_keep_every_law():
     simulation = Simulation(seeded(1, WIDE))
     laws = Laws(simulation)
     simulation.run_until(6)
-    heard = [len(service._listens_to) for service in agents_of(simulation)]
+    heard = [len(service._neighbourhood.listens_to) for service in agents_of(simulation)]
     assert len(heard) == 8
     assert sum(each < 7 for each in heard) >= 4  # of the seven others
     simulation.run_until(SECONDS)

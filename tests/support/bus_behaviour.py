@@ -15,8 +15,8 @@ from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import MarkSet, MarksRequest
 from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Claims
-from swarm.wire.topics import CLAIMS, MARKS, NOTE, POSE, RUN, Topic
+from swarm.wire.messages.vehicles import Reservations
+from swarm.wire.topics import MARKS, NOTE, POSE, RESERVATIONS, RUN, Topic
 
 
 class World(Protocol):
@@ -295,9 +295,9 @@ def test_a_refusal_reaches_who_asked(world: World):
         event.refuse("not today")
         event.end()
 
-    b.serve(CLAIMS, refuse, agent="a0")
+    b.serve(RESERVATIONS, refuse, agent="a0")
     world.settle()
-    assert asked(world, a, CLAIMS, Nothing(), agent="a0") == [AskEnded("q", CLAIMS, 0, "not today")]
+    assert asked(world, a, RESERVATIONS, Nothing(), agent="a0") == [AskEnded("q", RESERVATIONS, 0, "not today")]
 
 
 def test_a_query_that_is_never_ended_times_out_with_what_came(world: World):
@@ -342,13 +342,15 @@ def test_an_answer_after_the_end_is_a_bug_that_raises(world: World):
 
 def test_one_that_hears_a_topic_may_serve_it_too(world: World):
     a, b, heard = world.bus("a"), world.bus("b"), Box()
-    claims = Claims(agent="a0", incarnation=1, seq=1, clock=1, holds={"v": [3]}, wants=[], seen={})
-    b.subscribe(CLAIMS, heard)
-    b.serve(CLAIMS, answering((claims, {"agent": "a0"})))
+    reservations = Reservations(agent="a0", incarnation=1, seq=1, clock=1, held={"v": [3]}, requested=[], seen={})
+    b.subscribe(RESERVATIONS, heard)
+    b.serve(RESERVATIONS, answering((reservations, {"agent": "a0"})))
     world.settle()
-    a.publish(CLAIMS, claims, agent="a0")
+    a.publish(RESERVATIONS, reservations, agent="a0")
     world.until(lambda: heard)
-    assert [event.message for event in asked(world, a, CLAIMS, Nothing(), agent="a0").of(Replied)] == [claims]
+    assert [event.message for event in asked(world, a, RESERVATIONS, Nothing(), agent="a0").of(Replied)] == [
+        reservations
+    ]
 
 
 # --- tokens and links ---------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Which targets an agent's vehicles see, and what they tell of it."""
+"""Which targets an agent's vehicles see, and what it publishes of them."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ from swarm.wire.messages.targets import Sighted, TargetPose
 from vehicle_agent.driving.vehicle import Vehicle
 
 _TELL_NS = NS_PER_S // 2
-"""A target that stays in sight is told of so often."""
+"""Period of the sightings of a target that stays in sight."""
 _RANGE_SHARE = 0.02
-"""The simulated sensor is off by this share of the distance, besides half a cell."""
+"""The uncertainty of a sighting is half a cell and this share of the distance."""
 SIGHTING_LASTS_S = 30.0
 """A sighting expires after this many seconds: by then a target may be anywhere within some hundred metres."""
 
 
-class Lookout:
-    """The simulated sensor for targets: it knows where they truly are, and tells only of those within its range."""
+class TargetDetector:
+    """The simulated sensor for targets: knows where all are, and reports those within its range.
+
+    range_m  of the sensor
+    lasts_s  a sighting expires after so long
+    """
 
     def __init__(
         self, grid: GridSpec, author: str, group: str, range_m: float, lasts_s: float = SIGHTING_LASTS_S
@@ -33,14 +37,14 @@ class Lookout:
         self._told_ns: dict[str, int] = {}
         self._seq = 0
 
-    def truth(self, pose: TargetPose) -> None:
-        """Where a target is: the ground that the sensor looks at."""
+    def set_truth(self, pose: TargetPose) -> None:
+        """Where a target truly is. Of each target the newest pose counts."""
         known = self._true.get(pose.target)
         if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):
             self._true[pose.target] = pose
 
     def look(self, vehicles: Iterable[Vehicle], now_ns: int) -> list[Sighted]:
-        """What there is to tell of targets in sight, each by the vehicle that is nearest."""
+        """The sightings to publish now: of each target in sight one, by the nearest vehicle."""
         due = [id for id in self._true if now_ns - self._told_ns.get(id, -_TELL_NS) >= _TELL_NS]
         if not due:
             return []

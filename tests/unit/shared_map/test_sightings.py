@@ -16,7 +16,7 @@ from swarm.grid import GridSpec
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.topics import POSE, SIGHTED
 from vehicle_agent.driving.vehicle import Vehicle
-from vehicle_agent.sensing.target_detector import Lookout
+from vehicle_agent.sensing.target_detector import TargetDetector
 
 GRID = GridSpec(40, 40, 10.0, west_m=1000.0, north_m=5000.0)
 
@@ -75,15 +75,15 @@ def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
 
 
 def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
-    lookout = Lookout(GRID, "red.a0.1", "red", range_m=100.0, lasts_s=2.0)
+    detector = TargetDetector(GRID, "red.a0.1", "red", range_m=100.0, lasts_s=2.0)
     x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
-    lookout.truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m))
+    detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m))
     far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
-    assert lookout.look([far], 0) == []
-    (told,) = lookout.look([far, near], 0)
+    assert detector.look([far], 0) == []
+    (told,) = detector.look([far, near], 0)
     assert (told.cell, told.until_ns, told.uncertainty_m) == (410, 2_000_000_000, 5.0 + 0.02 * 50.0)
-    assert lookout.look([near], 400_000_000) == []  # not so often
-    assert len(lookout.look([near], 500_000_000)) == 1
+    assert detector.look([near], 400_000_000) == []  # not so often
+    assert len(detector.look([near], 500_000_000)) == 1
 
 
 def test_the_store_keeps_where_each_target_was_seen_last() -> None:
