@@ -16,8 +16,8 @@ Scratch is allocated for the worst case; of what is not written, the system keep
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from planner_service.kernels.compile import njit
 from planner_service.kernels.layout import (
     HUGE,
     INF,
@@ -40,14 +40,14 @@ _AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _open_costs(weight, cost):
     """Before a flood: inf on passable cells, WALL on the others."""
     for i in range(weight.size):
         cost[i] = INF if weight[i] < INF else WALL
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _close_costs(cost):
     """After a flood: inf on lethal cells too."""
     for i in range(cost.size):
@@ -55,7 +55,7 @@ def _close_costs(cost):
         cost[i] = c if c >= _ZERO32 else INF
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _make_queue(buckets, items):
     """A queue of cells in `buckets`, for at most `items` at once, in chunks of 2**_CHUNK_BITS cells.
 
@@ -80,7 +80,7 @@ def _make_queue(buckets, items):
     return pool, link, spare, counts, head, tail, np.uint64(shift)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _choose(weight, cost, length, inverse, least, cells, count, buckets):
     """buckets := which one each cell's exit key falls into, `least` at least."""
     for i in range(count):
@@ -88,7 +88,7 @@ def _choose(weight, cost, length, inverse, least, cells, count, buckets):
         buckets[i] = max(np.int32((cost[v] + weight[v] * length) * inverse), least)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _put(queue, cells, count, buckets, ring, first):
     """Put cells into the queue, each into its bucket modulo `ring`, of the ring that begins at bucket `first`."""
     pool, link, spare, counts, _, tail, shift = queue
@@ -111,7 +111,7 @@ def _put(queue, cells, count, buckets, ring, first):
         tail[b] = t
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _take(queue, b, batch):
     """Move all cells of a bucket to `batch`. Returns how many."""
     pool, link, spare, counts, head, tail, shift = queue
@@ -134,7 +134,7 @@ def _take(queue, b, batch):
     return n + (end - position)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _ask_for(weight, cost, s, u):
     prefetch(weight, u)
     prefetch(cost, u - s)
@@ -142,7 +142,7 @@ def _ask_for(weight, cost, s, u):
     prefetch(cost, u + s)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _offer_straight(weight, cost, s, batch, n, touched):
     """Offer their exit keys to four neighbours. Writes the cells that had no cost yet to `touched`; returns how
     many."""
@@ -159,7 +159,7 @@ def _offer_straight(weight, cost, s, batch, n, touched):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _offer_diagonal(weight, cost, s, corners, batch, n, touched, count):
     """As `_offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
     for p in range(n):
@@ -190,7 +190,7 @@ def _offer_diagonal(weight, cost, s, corners, batch, n, touched, count):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _offer_around(weight, cost, s, corners, batch, n, touched):
     """As `_offer_straight`, to eight neighbours, all a step of length 1 away."""
     count = _ZERO
@@ -225,7 +225,7 @@ def _offer_around(weight, cost, s, corners, batch, n, touched):
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit
 def flood(weight, cost, stride, root, rule, corners, width, ring):
     """First-touch flood. `cost` is written whole.
 
@@ -286,7 +286,7 @@ def flood(weight, cost, stride, root, rule, corners, width, ring):
             count = _offer_diagonal(weight, cost, s, corners, batch, n, touched, count)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def point_to_parents(weight, cost, stride, rule, corners, root, box, parent):
     """Parent of each cell of a window: the neighbour with the smallest exit key; of equals the first of north,
     east, south, west, then of the diagonals clockwise. Costs grow strictly along such parents, backwards, so that
@@ -304,7 +304,7 @@ def point_to_parents(weight, cost, stride, rule, corners, root, box, parent):
     parent[root] = NONE
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _parents_of_four(weight, cost, s, first, last, parent):
     for i in range(first, last):
         best = cost[i - s] + weight[i - s]
@@ -321,7 +321,7 @@ def _parents_of_four(weight, cost, s, first, last, parent):
         parent[i] = code if max(cost[i], best) < INF else NONE
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _parents_of_eight(weight, cost, s, first, last, step, limit, parent):
     """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
     vectorises."""
@@ -357,7 +357,7 @@ def _parents_of_eight(weight, cost, s, first, last, step, limit, parent):
         parent[i] = code if max(cost[i], best) < INF else NONE
 
 
-@njit(cache=True, nogil=True)
+@njit
 def breadth_first(weight, cost, stride, root):
     """Steps from every cell to the root, whatever they cost: the floor under every growth of a tree."""
     offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))

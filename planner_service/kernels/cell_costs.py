@@ -7,14 +7,15 @@ least of integers is found by vectors, the least of floats one by one, in 4 time
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from planner_service.kernels.compile import njit
 
 INF = np.float32(np.inf)
 _INF_BITS = np.int32(0x7F800000)
 _ONE = np.uint64(1)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def pad_weights(pace, resolution, extra, stride, weight):
     """weight := pace * resolution + extra, everywhere. Returns cells whose pace is NaN, zero or negative."""
     bad = 0
@@ -28,7 +29,7 @@ def pad_weights(pace, resolution, extra, stride, weight):
     return bad
 
 
-@njit(cache=True, nogil=True)
+@njit
 def changed_cells(pace, resolution, extra, box, stride, weight, cells, before):
     """The padded cells of a window whose weight differs from their pace, and their weight before; updates weight.
 
@@ -59,7 +60,7 @@ def changed_cells(pace, resolution, extra, box, stride, weight, cells, before):
     return count, bad, low, high
 
 
-@njit(cache=True, nogil=True)
+@njit
 def weight_range(weight):
     """(smallest, largest finite) weight; (inf, 0) if all cells are lethal."""
     bits = weight.view(np.int32)
@@ -73,7 +74,7 @@ def weight_range(weight):
     return found[0], found[1]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def cut_window(weight, stride, box, part):
     """The weights of a window as a padded grid of its own. Returns their range, as `weight_range` does."""
     row0, col0, row1, col1 = box
@@ -98,7 +99,7 @@ def cut_window(weight, stride, box, part):
     return found[0], found[1]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def merge_window(part, box, offset, old_root, cost, stride):
     """Costs of a window grown around a new root improve a tree whose costs are stored less `offset`.
 
@@ -117,7 +118,7 @@ def merge_window(part, box, offset, old_root, cost, stride):
     cost[old_root] = part[(row - row0 + 1) * width + col - col0 + 1] - offset
 
 
-@njit(cache=True, nogil=True)
+@njit
 def find_rim(part, box, rows, stride, rim, rim_cost):
     """The cells with a cost from which a step leads out of a window, padded in the whole grid of `rows` rows, and
     their costs. rim, rim_cost have room for all of the window's border. Returns how many there are."""

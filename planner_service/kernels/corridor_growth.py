@@ -6,12 +6,12 @@ Arrays are laid out as `rules` says.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from planner_service.kernels.compile import njit
 from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _longer(array, count, size):
     """Room for `size` elements, the first `count` copied. By a loop: assigning to a slice would bring along what
     numba needs for the text of its error, which takes longer to compile than any kernel here."""
@@ -21,7 +21,7 @@ def _longer(array, count, size):
     return longer
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _sink(keys, items, size):
     """Restore a binary heap after its last element, keys[size], was taken from the end to replace the top."""
     key = keys[size]
@@ -42,7 +42,7 @@ def _sink(keys, items, size):
     items[hole] = item
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _rise(keys, items, size, key, item):
     hole = size
     while hole > 0:
@@ -56,13 +56,13 @@ def _rise(keys, items, size, key, item):
     items[hole] = item
 
 
-@njit(cache=True, nogil=True)
+@njit
 def step_offsets(stride):
     """What each direction code 0..7 adds to a padded cell index."""
     return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def mark_levels(parent, stride, least, level):
     """Raise `level` (uint8) to 1 where the ways of `least` cells pass in a tree given by its parents, to 2 where
     those of 4 * least do, and so on. What drains an area four times as large is twice as far from its like."""
@@ -90,7 +90,7 @@ def mark_levels(parent, stride, least, level):
             v = u
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _tighten(weight, cost, parent, stamp, now, offsets, rule, v, trail):
     """As `tighten`, for one cell. Returns (cells visited, the trail, which may have grown)."""
     many = 0
@@ -112,7 +112,7 @@ def _tighten(weight, cost, parent, stamp, now, offsets, rule, v, trail):
     return many, trail
 
 
-@njit(cache=True, nogil=True)
+@njit
 def tighten(weight, cost, parent, stamp, now, stride, rule, root, cells):
     """cost := what is driven along the parents, less the tree's offset, on the ways from `cells` to the root.
 
@@ -129,7 +129,7 @@ def tighten(weight, cost, parent, stamp, now, stride, rule, root, cells):
     return visited
 
 
-@njit(cache=True, nogil=True)
+@njit
 def spread(weight, cost, parent, stamp, now, level, stride, rule, corners, root, box, inner):
     """Let the costs on the rim of a window around the root spread outward over the cells that carry the traffic.
 

@@ -12,8 +12,8 @@ hold. Here a cell waits in one bucket, by its cost, and moves to an earlier one 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from planner_service.kernels.compile import njit
 from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
 
 _NOBODY = np.int32(-1)
@@ -21,7 +21,7 @@ _OUT = np.int32(-2)
 """Of a cell that waits in no bucket."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def flood_directed(weight, height, factors, scale, cost, parent, stride, root, rule, corners, width, ring):
     """The tree of cheapest ways to the root. `cost` and `parent` are written whole; returns the largest cost.
 

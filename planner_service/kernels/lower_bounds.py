@@ -6,22 +6,22 @@ Arrays are laid out as `rules` says; `bound` is float64, s, one a start.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from planner_service.kernels.compile import njit
 from planner_service.kernels.layout import INF
 
 _ROUNDING = 2.0**-23
 """Relative error of one float32 step, doubled for the sum over a route's steps."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _rounding(cost, low, most):
     """How far float32 may have put this cost off, relatively: no optimal route has more steps than its cost has
     smallest weights, or than there are cells (`most`)."""
     return min((min(cost / low, most) + 4.0) * _ROUNDING, 1.0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def by_exact(cost, starts, low, most, bound):
     """bound := what an exact tree says."""
     for i in range(starts.size):
@@ -29,7 +29,7 @@ def by_exact(cost, starts, low, most, bound):
         bound[i] = own * (1.0 - _rounding(own, low, most))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def by_potential(potential, root, part, box, stride, rim, rim_cost, starts, low, most, bound):
     """bound := the larger of itself and what a potential and the window around the root prove.
 

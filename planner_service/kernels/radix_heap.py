@@ -10,8 +10,8 @@ times, whatever the ratio, and no width is too fine: float32 keys are served in 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from planner_service.kernels.compile import njit
 from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, WALL
 
 _ONE = np.uint64(1)
@@ -22,7 +22,7 @@ _LEVELS = np.uint64(6)
 """Digits of 6 bits that 32 bits take."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _enter(heads, links, waiting, item, key, served):
     """Put an item into the list of the first digit in which its key differs from `served`; of equal ones, the last.
 
@@ -38,7 +38,7 @@ def _enter(heads, links, waiting, item, key, served):
     waiting[level] += _ONE
 
 
-@njit(cache=True, nogil=True)
+@njit
 def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
     """First-touch flood for weights of any ratio. `cost` and `parent` are written whole: where one weight drowns in
     the rounding of another, costs do not tell the parents.

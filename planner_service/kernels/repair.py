@@ -6,8 +6,8 @@ first, last  int64  of each row, the cells between which something has changed; 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from planner_service.kernels.compile import njit
 from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
 
 _NOBODY = np.int32(-1)
@@ -15,7 +15,7 @@ _ONE = np.uint64(1)
 _FINE = np.uint64(44)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _longer(array, count, size):
     """Room for `size` elements, the first `count` copied. By a loop: assigning to a slice would bring along what
     numba needs for the text of its error, which takes longer to compile than any kernel here."""
@@ -25,14 +25,14 @@ def _longer(array, count, size):
     return longer
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _rows_of(weight, stride):
     """`first` and `last` of nothing."""
     rows = weight.size // stride
     return np.full(rows, weight.size, np.int64), np.full(rows, -1, np.int64)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _note(first, last, stride, cells, count):
     for i in range(count):
         row = cells[i] // stride
@@ -40,7 +40,7 @@ def _note(first, last, stride, cells, count):
         last[row] = max(last[row], cells[i])
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _offers(weight, cost, s, begin, end, diagonal, corners, best, code):
     """The smallest exit key among the neighbours of each cell, and the direction to it; of equals the first of
     north, east, south, west, then of the diagonals clockwise.
@@ -83,14 +83,14 @@ def _offers(weight, cost, s, begin, end, diagonal, corners, best, code):
         code[i - begin] = k
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _diagonal(rule):
     if rule == RULE_FOUR:
         return INF
     return SQRT2 if rule == RULE_OCTILE else np.float32(1.0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _span(first, last, stride, row):
     """The cells of a row that something has changed about, or next to whom, in it and in the rows beside it:
     begin <= cell < end, empty if there are none."""
@@ -103,7 +103,7 @@ def _span(first, last, stride, row):
     return row * stride + max(begin - 1, 1), row * stride + min(end + 2, stride - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _sweep(weight, cost, stride, rule, corners, first, last, floor, lowered, count):
     """Lower the cells that something changed about, and those next to them, to what they are offered, where they
     cost `floor` or more and are offered less. Returns lowered (uint32), which it appends them to, and how many."""
@@ -128,7 +128,7 @@ def _sweep(weight, cost, stride, rule, corners, first, last, floor, lowered, cou
     return lowered, count
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _spread(weight, cost, stride, rule, corners, width, ring, touched, count, first, last, limit):
     """Let costs that have fallen spread, until no cell is offered less than it costs.
 
@@ -243,7 +243,7 @@ def _spread(weight, cost, stride, rule, corners, width, ring, touched, count, fi
             return -1, highest
 
 
-@njit(cache=True, nogil=True)
+@njit
 def lower(weight, cost, stride, rule, corners, changed, before, width, ring, limit):
     """After weights fell, let costs fall: no cell costs more than what any neighbour offers, where so before.
 
@@ -261,7 +261,7 @@ def lower(weight, cost, stride, rule, corners, changed, before, width, ring, lim
     return taken
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _detach(weight, cost, parent, stride, corners, changed, before, limit):
     """Take cost and parent from the cells whose way leads over a cell that got dearer.
 
@@ -309,7 +309,7 @@ def _detach(weight, cost, parent, stride, corners, changed, before, limit):
     return detached, count
 
 
-@njit(cache=True, nogil=True)
+@njit
 def repair(weight, cost, parent, stride, rule, corners, root, changed, before, width, ring, most):
     """Bring a tree up to date after the weights of `changed` cells became what they are now.
 
@@ -352,7 +352,7 @@ def repair(weight, cost, parent, stride, rule, corners, root, changed, before, w
     return taken + many, highest
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _point(weight, cost, parent, stride, rule, corners, first, last):
     """The best neighbour becomes the parent, of the cells that something changed about and those next to them."""
     best = np.empty(stride, np.float32)

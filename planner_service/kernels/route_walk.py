@@ -6,8 +6,8 @@ Arrays are laid out as `rules` says.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from planner_service.kernels.compile import njit
 from planner_service.kernels.layout import INF, NONE, RULE_OCTILE, SQRT2, SQRT2_EXACT
 
 OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
@@ -19,13 +19,13 @@ _STRETCH = 32
 """Steps between two looks at whether a lane's route has ended; a route that has stands still meanwhile."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def step_offsets(stride):
     """What each direction code 0..7 adds to a padded cell index."""
     return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def relabel(weight, parent, stride, rule, root, cost):
     """cost := what is really driven from each cell along its parents. `cost` is written whole."""
     offsets = step_offsets(stride)
@@ -48,7 +48,7 @@ def relabel(weight, parent, stride, rule, root, cost):
             cost[v] = cost[u] + (weight[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else weight[u])
 
 
-@njit(cache=True, nogil=True)
+@njit
 def path_lengths(parent, stride, straight, diagonal, root, length):
     """length (float32) := how long the way of each cell along its parents is; inf where there is none."""
     offsets = step_offsets(stride)
@@ -71,7 +71,7 @@ def path_lengths(parent, stride, straight, diagonal, root, length):
             length[v] = so_far
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _walk_on(weight, parent, offsets, lengths, cells, sums, trails, fill, steps):
     """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
     a, b, c, d = np.uint64(cells[0]), np.uint64(cells[1]), np.uint64(cells[2]), np.uint64(cells[3])
@@ -96,7 +96,7 @@ def _walk_on(weight, parent, offsets, lengths, cells, sums, trails, fill, steps)
     sums[0], sums[1], sums[2], sums[3] = sum_a, sum_b, sum_c, sum_d
 
 
-@njit(cache=True, nogil=True)
+@njit
 def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
     """The routes from `starts` (padded cells that have a way), at most `max_steps` long where that is positive.
 
@@ -189,7 +189,7 @@ def walk_routes(weight, parent, stride, rule, root, starts, max_steps, limit):
     return directions, ends, driven, diagonals, last
 
 
-@njit(cache=True, nogil=True)
+@njit
 def find_starts(weight, cost, stride, root, asked, starts, status):
     """Where routes from `asked` cells (int64, of the grid) start, padded, and whether there is one.
 
@@ -213,7 +213,7 @@ def find_starts(weight, cost, stride, root, asked, starts, status):
             starts[i] = v
 
 
-@njit(cache=True, nogil=True)
+@njit
 def price_routes(cost, offset, root, resolution, diagonal, length_weight, walks, status, prices):
     """What walked routes cost and how long they are.
 
