@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from planner_service.kernels.layout import NONE
 from planner_service.strategy import Auto
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.corridors import Skeleton, find_skeleton
-from planner_service.tree.cost_grid import Changes, Ground, check_pace
+from planner_service.tree.corridors import CorridorGraph, find_corridors
+from planner_service.tree.cost_grid import Changes, CostGrid, check_pace
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.directed_cost_grid import ground_of
+from planner_service.tree.directed_cost_grid import cost_grid_of
 from planner_service.tree.route_reading import read_routes
-from planner_service.tree.windows import AHEAD, Rungs, block_half
+from planner_service.tree.windows import AHEAD, WindowSchedule, block_half
 from shared_map.arrays import Floats
 from shared_map.terrain.climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -63,7 +63,7 @@ MODEL_NS_PER_CELL = 15
 INLINE_NS = 100_000_000
 """A forced range is grown at once where a full growth takes less."""
 WIDE_SHARE = 16
-"""A window over one cell in so many gives way to the rings, where there is a skeleton for it."""
+"""A window over one cell in so many gives way to the rings, where corridors are known."""
 FINE_SHARE = 16
 """How far the fine windows of `multi_resolution` reach, as a share of the map."""
 
@@ -73,20 +73,20 @@ class GrownTree:
     """An exact tree, grown by a worker on a snapshot.
 
     target_cell           the root, wherever the target was
-    cost, parent, weight  padded, as `kernels.rules` says
+    cost, parent, cell_cost  padded, as `kernels.layout` says
     reach                 s; no cost exceeds it. Negative where nothing was grown, as no tree can lead there
     offered               padded parents of the tree that was served when the snapshot was taken; None before any
-    skeleton              None unless it was wanted
+    corridors              None unless it was wanted
     """
 
     target_cell: int
     map_version: int
     cost: Floats
     parent: NDArray[np.uint8]
-    weight: Floats
+    cell_cost: Floats
     reach: float
     offered: NDArray[np.uint8] | None
-    skeleton: Skeleton | None = None
+    corridors: CorridorGraph | None = None
 
 
 class TargetTree:
@@ -107,15 +107,15 @@ class TargetTree:
         self._grid = grid
         self._config = config
         self._climb = climb
-        self._ground = ground_of(grid, config, climb)
+        self._ground = cost_grid_of(grid, config, climb)
         self._tree = CostToGoTree(self._ground)
         self._loaded = False
         self._stale = True
         self._moves = 0
         self._job_out = False
-        self._skeleton: Skeleton | None = None
+        self._corridors: CorridorGraph | None = None
         self._full_ns = self.measured_model_ns()
-        self._rungs = Rungs(grid, 4 << config.k_min)
+        self._schedule = WindowSchedule(grid, 4 << config.k_min)
         self._full_root = 0
         self._auto = Auto(config.cpu_budget * 1e9 / config.tick_hz)
         self._auto.observe(self._full_ns, self._widest)
@@ -156,19 +156,19 @@ class TargetTree:
         serves_it = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if serves_it else None
         self._job_out = True
-        wants_skeleton = self._coarse and self._skeleton is None
+        wants_corridors = self._coarse and self._corridors is None
 
         def job() -> GrownTree:
-            ground = ground_of(grid, config, climb)
+            ground = cost_grid_of(grid, config, climb)
             ground.load(pace_snapshot)
             cost = np.full(ground.size, np.inf, np.float32)
             parent = np.full(ground.size, NONE, np.uint8)
             reach = -1.0
-            skeleton = None
+            corridors = None
             if _can_stand(ground, target_cell):
                 reach = ground.grow(ground.pad(target_cell), cost, parent)
-                skeleton = find_skeleton(ground) if wants_skeleton else None
-            return GrownTree(target_cell, map_version, cost, parent, ground.weight, reach, offered, skeleton)
+                corridors = find_corridors(ground) if wants_corridors else None
+            return GrownTree(target_cell, map_version, cost, parent, ground.cell_cost, reach, offered, corridors)
 
         return job
 
@@ -193,7 +193,7 @@ class TargetTree:
             self._measure(grown, followed_cells)
         if not self._aim(target_cell, changes):
             return Update("none")
-        since = self._ground.difference(grown.weight, [self._grid.window] if fresh else dirty)
+        since = self._ground.difference(grown.cell_cost, [self._grid.window] if fresh else dirty)
         tree = self._tree
         if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
             return self._grow_full(target_cell)
@@ -202,7 +202,7 @@ class TargetTree:
         self._bounds.take(grown.cost.copy())
         self._bounds.learn(since)
         self._stale = False
-        self._renew_skeleton(grown.skeleton, since)
+        self._renew_corridors(grown.corridors, since)
         moved = target_cell != tree.root
         if moved and not self._windows:
             return self._grow_full(target_cell)
@@ -239,7 +239,7 @@ class TargetTree:
         return self._grow_full(target)
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """What a full growth really took, for `auto` to choose by; not one that found a skeleton too. A simulation
+        """What a full growth really took, for `auto` to choose by; not one that found a corridors too. A simulation
         does not call it."""
         self._full_ns = max(1, took_ns)
         self._auto.observe(self._full_ns, self._widest)
@@ -309,10 +309,10 @@ class TargetTree:
             self._loaded = True
             return None
         changes = self._ground.apply(pace, dirty)
-        if changes.cells.size and self._skeleton is not None and not self._skeleton.learn(self._ground, changes):
-            self._skeleton = None
+        if changes.cells.size and self._corridors is not None and not self._corridors.learn(self._ground, changes):
+            self._corridors = None
         if changes.any_lower:
-            self._tree.near = None
+            self._tree.window_bound = None
         self._bounds.learn(changes)
         return changes
 
@@ -336,7 +336,7 @@ class TargetTree:
         """The whole tree was grown around this cell."""
         self._moves = 0
         self._full_root = root
-        self._rungs.grown(root, max(self._grid.rows, self._grid.cols))
+        self._schedule.note_grown(root, max(self._grid.rows, self._grid.cols))
 
     def _mend(self, changes: Changes | None) -> Update | None:
         """Repair the tree; None if it must be grown instead."""
@@ -345,7 +345,7 @@ class TargetTree:
         if changes.cells.size == 0:
             return Update("none")
         tree = self._tree
-        if not tree.fine or not self._ground.weight[self._ground.pad(tree.root)] < np.inf:
+        if not tree.fine or not self._ground.cell_cost[self._ground.pad(tree.root)] < np.inf:
             return None
         visited = tree.repair(changes)
         if visited < 0 or not tree.fine:
@@ -368,19 +368,19 @@ class TargetTree:
             grown = tree.move(target_cell, window)
             cells += window.cells
             if grown and rings is not None:
-                self._rungs.grown(target_cell, max(self._grid.rows, self._grid.cols))
-                return Update("coarse", self._grid.window, cells + tree.grow_rings(window, rings))
+                self._schedule.note_grown(target_cell, max(self._grid.rows, self._grid.cols))
+                return Update("coarse", self._grid.window, cells + tree.grow_corridors(window, rings))
             if grown:
-                self._rungs.grown(target_cell, half)
+                self._schedule.note_grown(target_cell, half)
                 return Update("window", window, cells)
             half *= 2
             window = self._grid.around(target_cell, half)
         return self._grow_full(target_cell)
 
-    def _reach(self, target_cell: int) -> tuple[int, Skeleton | None]:
-        """How far to every side of the target the tree is grown now, and over which skeleton beyond; None for not
+    def _reach(self, target_cell: int) -> tuple[int, CorridorGraph | None]:
+        """How far to every side of the target the tree is grown now, and over which corridors beyond; None for not
         at all."""
-        rings = self._skeleton if self._coarse else None
+        rings = self._corridors if self._coarse else None
         old = self._tree.root
         least = 2 * self._grid.distance_cells(old, target_cell)
         if self._config.strategy.startswith("variable_range"):
@@ -389,13 +389,13 @@ class TargetTree:
                 return half, None
             return max(4 << self._config.k_min, least), rings
         widest = self._widest
-        if rings is not None and self._rungs.beyond(target_cell, widest):
+        if rings is not None and self._schedule.beyond(target_cell, widest):
             return max(widest, least), rings
-        return max(self._rungs.half(target_cell, widest), least), None
+        return max(self._schedule.half(target_cell, widest), least), None
 
     def _with_wish(self, update: Update) -> Update:
         """Ask for a full growth where one is due and none is under way."""
-        wants = self._coarse and self._skeleton is None
+        wants = self._coarse and self._corridors is None
         if self._config.strategy == "rotation":
             # On a small map a full growth is due as soon as windows have cost half as much.
             twice = 2 * (8 << self._config.k_min) ** 2
@@ -408,10 +408,10 @@ class TargetTree:
         wants = wants and update.kind != "full" and not self._job_out
         return Update(update.kind, update.window, update.cells, wants)
 
-    def _renew_skeleton(self, found: Skeleton | None, since: Changes) -> None:
+    def _renew_corridors(self, found: CorridorGraph | None, since: Changes) -> None:
         """Take what a worker found, and what changed since it looked."""
         if found is not None:
-            self._skeleton = found if not since.cells.size or found.learn(self._ground, since) else None
+            self._corridors = found if not since.cells.size or found.learn(self._ground, since) else None
 
     def _inside(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
         asked = cells.reshape(-1)
@@ -425,12 +425,12 @@ class TargetTree:
         offered = grown.offered
         assert offered is not None
         starts = starts[(grown.cost[starts] < np.inf) & (offered[starts] != NONE)]
-        walks = self._ground.walk(offered, root, starts, 0, grown.weight)
+        walks = self._ground.walk(offered, root, starts, 0, grown.cell_cost)
         whole = walks.ends >= 0
         optimum = grown.cost[starts[whole]].astype(np.float64)
         self.last_gaps = np.maximum(walks.driven[whole] / optimum, 1.0)
 
 
-def _can_stand(ground: Ground, cell: int) -> bool:
+def _can_stand(ground: CostGrid, cell: int) -> bool:
     """Whether a tree can lead to a cell: it is one of the grid, and not lethal."""
     return ground.grid.inside(*divmod(cell, ground.grid.cols)) and ground.passable(cell)

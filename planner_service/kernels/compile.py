@@ -1,6 +1,6 @@
 """`njit` of this folder: numba's, with a disk cache that watches all of the folder's sources.
 
-numba's own cache (`numba.njit(cache=True)`) compares a function's file with what it was when it was compiled. It does
+numba's own cache (`numba.njit(cache=True)`) compares a function's file with what it was when compiled. It does
 not see that a helper or a constant of another file has changed, although both are compiled into the function. The
 stamp here is a hash of every source of this package, so that kernels can share helpers and constants.
 """
