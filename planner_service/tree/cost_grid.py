@@ -212,17 +212,31 @@ class CostGrid:
                 yield row0, col0, row1, col1
 
     def grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
-        """The exact tree of a padded, passable root. Arrays are written whole; no cost exceeds what is returned,
-        s."""
+        """The exact tree of a padded root. Arrays are written whole; no cost exceeds what is returned, s.
+
+        Raises OutsideGridError unless the root is a padded cell, ValueError where it is lethal or an array has
+        another size than the map.
+        """
+        if not 0 <= root < self.size:
+            raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
+        if not self.cell_cost[root] < np.inf:
+            raise ValueError(f"padded root {root} is lethal: no tree can lead there")
+        if cost.size != self.size or parent.size != self.size:
+            raise ValueError(f"a tree of this map has {self.size} cells")
+        return self._grow(root, cost, parent)
+
+    def _grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
         return grow_tree(self.padded, self.lowest_cell_cost, self.highest_cell_cost, root, cost, parent)
 
     def walk(self, parent: NDArray[np.uint8], root: int, starts: Cells, most: int, cell_cost: Floats) -> Walks:
         """Routes from padded cells that have a way to a padded root, over the cell costs of this or an earlier map.
 
         most  steps of a route; 0 for all of it
-        Raises OutsideGridError where a start is no padded cell.
+        Raises OutsideGridError where a start or the root is no padded cell.
         """
         self.check_padded(starts)
+        if not 0 <= root < self.size:
+            raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
         padded = self.padded._replace(cell_cost=cell_cost)
         return Walks(*walk_routes(padded, parent, root, starts, most, self.grid.cells))
 

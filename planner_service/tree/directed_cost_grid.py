@@ -40,8 +40,7 @@ class DirectedCostGrid(CostGrid):
         height[1:-1, 1:-1] = climb.elevation_m
         self._climbs = Climbs(height.reshape(-1), factors, np.array(climb.per_metre, np.float32))
 
-    def grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
-        """As on any cost grid, by another search."""
+    def _grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
         dearest = self.highest_cell_cost * self.diagonal * self._highest
         width = max(self.lowest_cell_cost * _WIDTH, dearest / (_BUCKETS - 4))
         count = 1 << math.ceil(math.log2(dearest / width + 3))
