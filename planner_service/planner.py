@@ -166,7 +166,7 @@ class Planner:
         )
         self._told = news
         self._wants_full = False  # all that happened until now is in what `adopt` says
-        self._grown(took_ns, usual=grown.skeleton is None)
+        self._grown(took_ns, usual=grown.corridors is None)
         if grown.map_version == news[1] and grown.target_cell == news[0]:
             self._exact_ns = now_ns
         else:

@@ -86,12 +86,12 @@ def start(what: str, size: int, started_ns: int) -> dict[str, float]:
     if what == "tree":
         import numpy as np
 
-        from planner_service.tree.cost_grid import Ground
+        from planner_service.tree.cost_grid import CostGrid
         from planner_service.tree.cost_to_go import CostToGoTree
         from swarm.config.scenario import PlannerConfig
         from swarm.grid import GridSpec
 
-        ground = Ground(GridSpec(size, size, 1.0), PlannerConfig())
+        ground = CostGrid(GridSpec(size, size, 1.0), PlannerConfig())
         ground.load(np.ones((size, size), np.float32))
         CostToGoTree(ground).grow(size * size // 2)
     else:

@@ -14,9 +14,10 @@ from support import slow_twins as naive
 from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
 from support.planner_strategies import RULES, random_pace
 
-from planner_service.kernels.radix_heap import flood_wide
-from planner_service.tree.cost_grid import Ground
-from planner_service.tree.growth import MAX_RATIO, flood
+from planner_service.kernels.layout import Labels
+from planner_service.kernels.radix_heap import grow_by_radix_heap
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.growth import MAX_RATIO, grow_tree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
@@ -52,17 +53,15 @@ def test_ring_and_radix_heap_give_the_same_costs_to_the_last_bit(rules: dict) ->
     for ratio in (1.0, 50.0, 2000.0):
         pace = random_pace(rng, 260, 259, ratio, 0.2)
         target = int(np.flatnonzero(np.isfinite(pace))[0])
-        ground = Ground(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules))
+        ground = CostGrid(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules))
         ground.load(pace)
         root = ground.pad(target)
         by_ring, by_heap = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
         parent = np.empty(ground.size, np.uint8)
-        settings = (ground.stride, root, ground.rule, ground.corners)
-        longest = ground.high * ground.diagonal
-        assert longest <= MAX_RATIO * ground.low  # so that it is the ring that grows it
-        flood(ground.weight, ground.low, ground.high, *settings, by_ring, None)
-        low = np.float32(ground.low)
-        flood_wide(ground.weight, by_heap, *settings, low, parent)
+        longest = ground.highest_cell_cost * ground.diagonal
+        assert longest <= MAX_RATIO * ground.lowest_cell_cost  # so that it is the ring that grows it
+        grow_tree(ground.padded, ground.lowest_cell_cost, ground.highest_cell_cost, root, by_ring, None)
+        grow_by_radix_heap(ground.padded, Labels(by_heap, parent, root), np.float32(ground.lowest_cell_cost))
         np.testing.assert_array_equal(by_heap, by_ring)
 
 
@@ -101,7 +100,7 @@ def test_large_fields_of_every_kind_equal_dijkstra() -> None:
     ],
 )
 def test_a_pace_that_is_none_is_refused(pace: np.ndarray, complaint: str) -> None:
-    ground = Ground(GridSpec(3, 4, 1.0), PlannerConfig())
+    ground = CostGrid(GridSpec(3, 4, 1.0), PlannerConfig())
     with pytest.raises(ValueError, match=complaint):
         ground.load(pace)
 

@@ -7,7 +7,8 @@ import pytest
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels import repair as kernels
-from planner_service.tree.cost_grid import Changes, Ground
+from planner_service.kernels.layout import Buckets, Labels
+from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
@@ -24,7 +25,7 @@ class Patchwork:
         self.pace = pace
         self.grid = GridSpec(*pace.shape, 1.0)
         self.config = PlannerConfig(**rules)
-        self.ground = Ground(self.grid, self.config)
+        self.ground = CostGrid(self.grid, self.config)
         self.ground.load(pace)
         self.tree = CostToGoTree(self.ground)
         self.root = int(self.rng.choice(np.flatnonzero(np.isfinite(pace))))
@@ -53,7 +54,7 @@ class Patchwork:
             self.tree.grow(self.root)
 
     def check(self) -> None:
-        ground = Ground(self.grid, self.config)
+        ground = CostGrid(self.grid, self.config)
         ground.load(self.pace)
         fresh = CostToGoTree(ground)
         fresh.grow(self.root)
@@ -99,10 +100,9 @@ def test_a_repair_may_concern_the_whole_map(rules: dict) -> None:
         work.pace *= np.float32(factor)
         changes = work.ground.apply(work.pace, [work.grid.window])
         tree, ground = work.tree, work.ground
-        taken, highest = kernels.repair(
-            ground.weight, tree.cost, tree.parent, ground.stride, ground.rule, ground.corners,
-            ground.pad(work.root), changes.cells, changes.before, *ground.buckets, (10**9, 10**9, 10**9),
-        )  # fmt: skip
+        labels = Labels(tree.cost, tree.parent, ground.pad(work.root))
+        most = (10**9, 10**9, 10**9)
+        taken, highest = kernels.repair(ground.padded, labels, changes.cells, changes.before, ground.buckets, most)
         assert taken > 1000
         tree.reach = float(highest)
         work.check()
@@ -133,33 +133,29 @@ def test_a_repair_that_concerns_too_much_gives_way() -> None:
 
 @pytest.mark.parametrize("width", [0.01, 1.0, 40.0])
 def test_costs_do_not_depend_on_the_width_or_number_of_buckets(width: float) -> None:
-    for ring in (4, 512):
+    for count in (4, 512):
         rng = np.random.default_rng(5)
         work = Patchwork(random_pace(rng, 40, 45, 30.0, 0.2), RULES[0], 5)
         work.pace[10:30, 10:30] *= np.float32(3)
         work.pace[20:25, 20:40] *= np.float32(0.5)
         changes = work.ground.apply(work.pace, [Window(10, 10, 30, 40)])
         tree, ground = work.tree, work.ground
-        _, highest = kernels.repair(
-            ground.weight, tree.cost, tree.parent, ground.stride, ground.rule, ground.corners,
-            ground.pad(work.root), changes.cells, changes.before, np.float32(width), ring, (10**9, 10**9, 10**9),
-        )  # fmt: skip
+        labels = Labels(tree.cost, tree.parent, ground.pad(work.root))
+        buckets, most = Buckets(np.float32(width), count), (10**9, 10**9, 10**9)
+        _, highest = kernels.repair(ground.padded, labels, changes.cells, changes.before, buckets, most)
         tree.reach = max(tree.reach, float(highest))
         work.check()
 
 
 @pytest.mark.parametrize("rules", RULES)
-def test_a_lowered_potential_is_the_tree_of_a_map_that_got_cheaper(rules: dict) -> None:
+def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(rules: dict) -> None:
     rng = np.random.default_rng(6)
     for _ in range(20):
         work = Patchwork(random_pace(rng, 40, 45, 6.0, 0.2), rules, 6)
         windows = [work.change(factor, 6, False) for factor in (0.5, 0.25, 0.9)]
         changes: Changes = work.ground.apply(work.pace, windows)
-        ground, potential = work.ground, work.tree.cost.copy()
-        done = kernels.lower(
-            ground.weight, potential, ground.stride, ground.rule, ground.corners,
-            changes.cells, changes.before, *ground.buckets, 10**9,
-        )  # fmt: skip
+        ground, heuristic = work.ground, work.tree.cost.copy()
+        done = kernels.lower_costs(ground.padded, heuristic, changes.cells, changes.before, ground.buckets, 10**9)
         assert done > 0
         work.tree.grow(work.root)
-        np.testing.assert_array_equal(work.tree.inner(potential), work.tree.inner(work.tree.cost))
+        np.testing.assert_array_equal(work.tree.inner(heuristic), work.tree.inner(work.tree.cost))

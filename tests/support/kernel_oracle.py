@@ -6,7 +6,7 @@ import numpy as np
 from support import slow_twins as naive
 from support.planner_strategies import RULES, random_pace
 
-from planner_service.tree.cost_grid import Ground
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
@@ -16,7 +16,7 @@ WALLS = (0.0, 0.1, 0.25, 0.45)
 
 
 def grown(pace: np.ndarray, target: int, rules: dict) -> CostToGoTree:
-    ground = Ground(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig(**rules))
+    ground = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig(**rules))
     ground.load(pace)
     tree = CostToGoTree(ground)
     tree.grow(target)

@@ -309,7 +309,7 @@ class _Racer:
             return
         began_ns = time.thread_time_ns()
         grown = tree.full_job(self._pace, cell, 0)()
-        if grown.skeleton is None:
+        if grown.corridors is None:
             tree.observe_full_ns(time.thread_time_ns() - began_ns)
         tree.adopt(grown, self._pace, cell, [], 0, followed)
         if count:

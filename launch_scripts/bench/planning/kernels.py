@@ -15,7 +15,7 @@ from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, number, table, times
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.cost_grid import Ground
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.route_reading import read_routes
 from swarm.config.scenario import PlannerConfig
@@ -35,7 +35,7 @@ class _Bench:
         self.pace = pace
         self.field = Field(pace)
         self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
-        self.ground = Ground(self.grid, PlannerConfig())
+        self.ground = CostGrid(self.grid, PlannerConfig())
         self.ground.load(pace)
         self.tree = CostToGoTree(self.ground)
         self.bounds = LowerBounds(self.ground)
@@ -64,7 +64,7 @@ class _Bench:
             self.took.setdefault(f"route of {many}", []).append(took_us / many)
         padded = self.ground.pad_all(self.draw(100))
         root = self.ground.pad(self.root)
-        walk = partial(self.ground.walk, self.tree.parent, root, padded, 0, self.ground.weight)
+        walk = partial(self.ground.walk, self.tree.parent, root, padded, 0, self.ground.cell_cost)
         steps = int(walk().ends[-1])
         self.took.setdefault("walk", []).append(self.time("", walk) / max(steps, 1) * STEPS)
 

@@ -41,20 +41,22 @@ def floor(pace: Pace, edge: Edge) -> Tool:
     """A plain breadth-first search over the same arrays: a lower bound for any search that visits every cell."""
     from planner_service.kernels.bucket_queue import breadth_first
 
-    ground = _our_tree(pace, edge).ground
+    ground = _our_tree(pace, edge).cost_grid
     cost = np.empty(ground.size, np.float32)
-    return Tool(lambda root: breadth_first(ground.weight, cost, ground.stride, ground.pad(root)), lambda *_: None)
+    return Tool(
+        lambda root: breadth_first(ground.cell_cost, cost, ground.stride, ground.pad(root)), lambda *_: None
+    )
 
 
 def _our_tree(pace: Pace, edge: Edge) -> Any:
-    from planner_service.tree.cost_grid import Ground
+    from planner_service.tree.cost_grid import CostGrid
     from planner_service.tree.cost_to_go import CostToGoTree
     from swarm.config.scenario import PlannerConfig
     from swarm.grid import GridSpec
 
     # No other library forbids diagonals past lethal corners.
     config = PlannerConfig(edge=edge, corner_cutting=True)
-    ground = Ground(GridSpec(pace.shape[0], pace.shape[1], 1.0), config)
+    ground = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), config)
     ground.load(pace)
     return CostToGoTree(ground)
 
