@@ -64,8 +64,8 @@ def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
 class ZenohBus:
     """A `Bus` on one Zenoh session. Always `close` it: an open session can hang the interpreter's exit.
 
-    Its methods are called by the thread that owns the service. Reading threads touch the counters, the log and
-    `_closed` only, and end when what they read is undeclared.
+    Its methods are called by the thread that owns the service. The threads that read channels change the counters
+    and the log only; each ends when what it reads is undeclared.
     """
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
