@@ -66,14 +66,14 @@ class Chase:
 
     def trail(self, start: Place) -> Trail:
         """(n, 2) places of the route from a cell to the target."""
-        route = self.tree.routes(self.pace, [self.grid.cell(*start)])[0]
+        route = self.tree.routes([self.grid.cell(*start)])[0]
         steps = np.frombuffer(route.directions, np.uint8)
         moves = np.stack([np.array(STEP_ROW)[steps], np.array(STEP_COL)[steps]], axis=1)
         return np.concatenate([[start], np.array(start) + np.cumsum(moves, axis=0)])
 
     def costs(self) -> NDArray[np.float64]:
         """(rows, cols), s: what is driven along the route of each cell; inf where there is none."""
-        return self.tree.routes(self.pace, np.arange(self.grid.cells)).cost_s.reshape(self.pace.shape)
+        return self.tree.routes(np.arange(self.grid.cells)).cost_s.reshape(self.pace.shape)
 
 
 def tree() -> Figure:
@@ -256,7 +256,7 @@ def schedule() -> Figure:
             gap = (chase.costs() / exact - 1) * 100
         gap[np.isnan(gap)] = 0
         seen = gap[np.isfinite(pace)]
-        shown = axes.imshow(gap, cmap=_GAP, vmin=0, vmax=25)
+        shown = axes.imshow(gap, cmap=_GAP.resampled(10), vmin=0, vmax=25)
         axes.imshow(np.where(np.isfinite(pace), np.nan, 1.0), cmap=_WALL)
         axes.plot(way[:, 1], way[:, 0], color=INK, lw=1.0, ls=":")
         _target(axes, chase.target)

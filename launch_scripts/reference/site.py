@@ -5,6 +5,7 @@ MkDocs loads this file twice: as a hook, and as an extension of griffe, which re
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from launch_scripts.reference.docstrings import as_markdown
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("planner_service", "shared_map", "swarm", "vehicle_agent")
+_NUMPY = re.compile(r"^ *(Parameters|Returns|Raises)\n *-+$", re.MULTILINE)
+"""What the public API of a package looks like, for readers of NumPy's documentation."""
 _API, _DECISIONS = "Python API", "Decisions"
 
 
@@ -22,7 +25,12 @@ class Listings(griffe.Extension):
     """Makes Markdown lists of the rows `name  meaning`, which Markdown would run together."""
 
     def on_object(self, *, obj: Any, **_: Any) -> None:
-        if obj.docstring is not None:
+        if obj.docstring is None:
+            return
+        if _NUMPY.search(obj.docstring.value):
+            obj.docstring.parser = griffe.Parser.numpy
+            obj.docstring.parser_options = {"warnings": False}  # how a docstring is laid out breaks no build
+        else:
             obj.docstring.value = as_markdown(obj.docstring.value)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import json
 import re
 import tomllib
@@ -126,6 +127,12 @@ def test_every_file_and_folder_that_a_page_names_exists(page):
     text = page.read_text(encoding="utf-8")
     named = [name for name in (*_FILE.findall(text), *_FOLDER.findall(text)) if not name.startswith("runs/")]
     assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_the_python_of_the_tutorial_runs_as_it_says():
+    failed, tried = doctest.testfile(str(ROOT / "docs" / "tutorial" / "python.md"), module_relative=False)
+    assert tried > 8
+    assert failed == 0
 
 
 def test_file_names_in_commands_exist():
