@@ -135,6 +135,14 @@ def test_the_python_of_the_tutorial_runs_as_it_says():
     assert failed == 0
 
 
+@pytest.mark.parametrize("page", ["tutorial/scenario.md", "tutorial/terrain.md"])
+def test_every_scenario_of_the_tutorial_is_accepted(page):
+    blocks = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.M | re.S)
+    assert blocks
+    for block in blocks:
+        msgspec.convert(tomllib.loads(block), Scenario)
+
+
 def test_file_names_in_commands_exist():
     for page in _PAGES:
         for name in re.findall(r"(?:python|pytest) ((?:[\w-]+/)+[\w-]+\.py)", page.read_text(encoding="utf-8")):
