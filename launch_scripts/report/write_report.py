@@ -25,24 +25,15 @@ def write_report(
     terrain: Terrain,
     *,
     truth: NDArray[np.float32] | None = None,
-    run_id: str | None = None,
-    seconds: float | None = None,
-    processes: int | None = None,
-    restarts: int | None = None,
-    startup_s: float | None = None,
-    extra: dict[str, Any] | None = None,
+    **measured: Any,
 ) -> dict[str, Any]:
     """Writes both files and returns the numbers. Raises StoreError if the folder cannot be written.
 
-    truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
-    extra  further fields for report.json
+    truth     true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
+    measured  what the caller knows better than the recorder, as `Recorder.report` takes it
     """
-    report = recorder.report(
-        run_id=run_id, seconds=seconds, processes=processes, restarts=restarts, startup_s=startup_s
-    )
     report = {
-        **report,
-        **(extra or {}),
+        **recorder.report(**measured),
         "version": importlib.metadata.version("terrain-swarm"),
         "terrain": {
             "digest": terrain.digest,

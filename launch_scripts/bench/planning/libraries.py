@@ -213,7 +213,7 @@ def costs_along(pace: Pace, parents: NDArray[np.int64], root: int) -> Costs:
 
 
 def _from_outward(found: Costs, pace: Costs, root: int) -> Costs:
-    """Costs of the same paths towards the root, from those away from it: the root is entered, not the far end."""
+    """Costs of the same paths towards the root instead of away from it: the root is entered, the far end is not."""
     passable = np.isfinite(pace)
     costs = np.where(passable, found, np.inf).astype(np.float64)
     costs[passable] += pace.flat[root] - pace[passable]
