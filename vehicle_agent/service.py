@@ -246,12 +246,10 @@ class AgentService:
         self._agent.place(placement)
         self._agent.set_planners(self._peers.planners, now_ns)
         count = len(self._agent.vehicles)
-        if not placement.resumed:
-            log.info("%d vehicles start", count)
-        else:
-            log.info("%d vehicles go on where they last stood", count)
-            text = f"agent {self._setup.id} is back: {count} vehicles go on where they last stood"
-            self._member.note(now_ns, "resumed", text)
+        how = "go on where they last stood" if placement.resumed else "start"
+        log.info("%d vehicles %s", count, how)
+        if placement.resumed:
+            self._member.note(now_ns, "resumed", f"agent {self._setup.id} is back: {count} vehicles {how}")
 
     def _follow(self, now_ns: int) -> None:
         """Subscribe to what concerns our vehicles where they are now, and ask about new territory."""
