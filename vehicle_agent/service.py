@@ -100,8 +100,7 @@ class AgentService:
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
-        agents = [each.id for each in plan_agents(scenario)]
-        territory = Territory(plan.id, setup.incarnation, grid, agents)
+        territory = Territory(plan.id, setup.incarnation, grid, list(spawns))
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
         self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.reading)
         self._untracked = UntrackedTargets(scenario.untracked, self._replica.reading)
