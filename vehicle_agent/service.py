@@ -13,11 +13,10 @@ from shared_map.presence import Presence
 from shared_map.replication.filter import Reading, author_of, readable_groups
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapFeed
-from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import plan_agents
+from swarm.config.scenario import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
@@ -51,7 +50,7 @@ from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.sensing.target_detector import TargetDetector
+from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
 from vehicle_agent.traffic.live_peers import LivePeers
 from vehicle_agent.traffic.neighbourhood import Neighbourhood
 from vehicle_agent.traffic.resumption import Resumption
@@ -61,6 +60,7 @@ log = logging.getLogger(__name__)
 
 _RESUME_TIMEOUT_S = 2.0
 _NEAR_CELLS = 4
+"""Bucket of the presence index: about the radius in which traffic looks for other vehicles."""
 _TERRITORY_TIMEOUT_S = 1.0
 
 
@@ -74,10 +74,7 @@ class AgentService:
         self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
     ) -> None:
         scenario = setup.scenario
-        plan = next((plan for plan in plan_agents(scenario) if plan.id == setup.id), None)
-        if plan is None:
-            ids = ", ".join(plan.id for plan in plan_agents(scenario)[:20])
-            raise ConfigError(f"scenario {scenario.name} has no agent {setup.id}; it has {ids}")
+        plan = _plan_of(setup)
         grid = terrain.grid
         spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth)
         self._member = Member(setup.info(grid, terrain.digest), bus, post)
@@ -102,12 +99,10 @@ class AgentService:
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
-        agents = [each.id for each in plan_agents(scenario)]
-        territory = Territory(plan.id, setup.incarnation, grid, agents)
+        territory = Territory(plan.id, setup.incarnation, grid, list(spawns))
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
         self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.reading)
-        self._untracked = scenario.untracked
-        self._sightings = Sightings(self._replica.reading)
+        self._untracked = UntrackedTargets(scenario.untracked, self._replica.reading)
         self._detector = TargetDetector(
             grid,
             self._author,
@@ -122,6 +117,7 @@ class AgentService:
         self._resumption: Resumption | None = Resumption(plan.id, spawns, grid.cells, since_run_ns)
         """None once the vehicles are placed."""
         self._asked_ns: dict[str, int] = {}
+        """Tag of each open route request -> when it was sent."""
 
     @property
     def agent(self) -> Agent:
@@ -135,9 +131,9 @@ class AgentService:
         self._member.join()
         self._feed.start(now_ns)
         self._bus.subscribe(POSE, self._post)
-        if self._untracked:
+        if self._untracked.targets:
             self._bus.subscribe(TRUE_POSE, self._post)
-            for target in sorted(self._untracked):
+            for target in sorted(self._untracked.targets):
                 self._bus.subscribe(SIGHTED, self._post, target=target)
         self._bus.subscribe(PUSHED_ROUTE, self._post, agent=self._setup.id)
         if self._resumption is not None:
@@ -154,7 +150,7 @@ class AgentService:
                 self._presence.hear(fleet, now_ns)
             case Heard(topic=topic, message=TargetPose() as pose):
                 self._detector.set_truth(pose)
-                if topic is POSE and pose.target not in self._untracked:
+                if topic is POSE and pose.target not in self._untracked.targets:
                     agent.hear_pose(pose, now_ns)
             case Heard(message=Sighted() as sighted):
                 self._hear_sighted(sighted, now_ns)
@@ -207,7 +203,8 @@ class AgentService:
                 self._bus.ask(RESERVATIONS, Nothing(), self._post, tag=tag, timeout_s=_RESUME_TIMEOUT_S)
             return
         agent = self._agent
-        self._note_map(now_ns)
+        if self._cost_map.take_dirty():
+            agent.map_changed(now_ns, look=True)
         if self._peers.expire(now_ns):
             self._peers_changed(now_ns)
         self._follow(now_ns)
@@ -249,12 +246,10 @@ class AgentService:
         self._agent.place(placement)
         self._agent.set_planners(self._peers.planners, now_ns)
         count = len(self._agent.vehicles)
-        if not placement.resumed:
-            log.info("%d vehicles start", count)
-        else:
-            log.info("%d vehicles go on where they last stood", count)
-            text = f"agent {self._setup.id} is back: {count} vehicles go on where they last stood"
-            self._member.note(now_ns, "resumed", text)
+        how = "go on where they last stood" if placement.resumed else "start"
+        log.info("%d vehicles %s", count, how)
+        if placement.resumed:
+            self._member.note(now_ns, "resumed", f"agent {self._setup.id} is back: {count} vehicles {how}")
 
     def _follow(self, now_ns: int) -> None:
         """Subscribe to what concerns our vehicles where they are now, and ask about new territory."""
@@ -285,24 +280,18 @@ class AgentService:
     # --- targets in sight -----------------------------------------------------------------------------------
 
     def _tell_sighted(self, now_ns: int) -> None:
-        self._sightings.expire(now_ns)
+        self._untracked.expire(now_ns)
         for sighted in self._detector.look(self._agent.vehicles.values(), now_ns):
             self.counters.count("targets_sighted")
             self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
             self._hear_sighted(sighted, now_ns)
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
-        if sighted.target not in self._untracked or not self._sightings.hear(sighted):
-            return
-        best = self._sightings.best(now_ns).get(sighted.target)  # None where what came late has ended already
-        if best is not None:
-            self._agent.hear_pose(pose_of(best), now_ns)
+        pose = self._untracked.hear(sighted, now_ns)
+        if pose is not None:
+            self._agent.hear_pose(pose, now_ns)
 
     # --- doing what was decided -----------------------------------------------------------------------------
-
-    def _note_map(self, now_ns: int) -> None:
-        if self._cost_map.take_dirty():
-            self._agent.map_changed(now_ns, look=True)
 
     def _perform(self, actions: list[AgentAction], now_ns: int) -> None:
         for action in actions:
@@ -347,5 +336,15 @@ class AgentService:
         self.counters.gauge("lost", float(states.count(VehicleState.LOST)))
 
 
+def _plan_of(setup: RoleSetup) -> AgentPlan:
+    plans = plan_agents(setup.scenario)
+    plan = next((plan for plan in plans if plan.id == setup.id), None)
+    if plan is None:
+        ids = ", ".join(plan.id for plan in plans[:20])
+        raise ConfigError(f"scenario {setup.scenario.name} has no agent {setup.id}; it has {ids}")
+    return plan
+
+
 def _number(tag: str) -> int:
+    """The number at the end of a tag such as route-17."""
     return int(tag.rpartition("-")[2])

@@ -1,10 +1,12 @@
-"""Which targets an agent's vehicles see, and what it publishes of them."""
+"""Which targets an agent's vehicles see, and where targets are that only vehicles see."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
+from shared_map.replication.filter import Reading
+from shared_map.sightings import Sightings, pose_of
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.targets import Sighted, TargetPose
@@ -73,3 +75,25 @@ class TargetDetector:
             y_m=pose.y_m,
             uncertainty_m=0.5 * self._grid.resolution_m + _RANGE_SHARE * distance_m,
         )
+
+
+class UntrackedTargets:
+    """The targets that no tracker reports: each is where the best sighting of it says.
+
+    reading  whose sightings count
+    """
+
+    def __init__(self, targets: Collection[str], reading: Reading) -> None:
+        self.targets = targets
+        self._sightings = Sightings(reading)
+
+    def hear(self, sighted: Sighted, now_ns: int) -> TargetPose | None:
+        """The pose of an untracked target after one more sighting; None if that is no news of one."""
+        if sighted.target not in self.targets or not self._sightings.hear(sighted):
+            return None
+        best = self._sightings.best(now_ns).get(sighted.target)  # None if the sighting came after it expired
+        return None if best is None else pose_of(best)
+
+    def expire(self, now_ns: int) -> None:
+        """Forget expired sightings. A vehicle goes on to where it last knew its target to be."""
+        self._sightings.expire(now_ns)

@@ -1,4 +1,4 @@
-"""How an agent starts: it learns where everybody stands, and only then places its vehicles.
+"""How an agent starts: it learns where all vehicles stand, and only then places its own.
 
 An agent that starts may continue the life of one that died. The vehicles of the dead one stand where it left
 them, and all others keep these cells closed. So the newcomer asks all agents for their reservations and for the
@@ -151,7 +151,7 @@ class Resumption:
 
     def _taken(self, alive: Mapping[str, int]) -> set[int]:
         """Cells on which a vehicle of another agent may be: held, requested by an agent that died since, or the
-        spawn cell of one that nobody has heard of."""
+        spawn cell of an agent that no agent has heard of."""
         taken: set[int] = set()
         for agent, spawns in self._spawns.items():
             if agent != self._agent and agent not in self._newest:

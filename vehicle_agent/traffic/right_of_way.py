@@ -97,7 +97,7 @@ class RightOfWay:
     """The reservations of one agent's vehicles beside those of all other agents.
 
     spawns     agent -> vehicle -> cell where each agent of the run first places its vehicles: these cells count as
-               held by agents that nobody has heard of yet
+               held by agents that we have not heard of yet
     territory  which agents reserve cells in a common plot; None if all do
     """
 
@@ -216,7 +216,7 @@ class RightOfWay:
         self._changed = True
 
     def _allowed(self, mine: _Mine, ahead: Sequence[int]) -> Sequence[int]:
-        """The cells before the first one in a plot that not everybody knows to be ours."""
+        """The cells before the first one in a plot that some live agent does not know to be ours."""
         if self._territory is not None:
             for index, cell in enumerate(ahead):
                 if cell not in mine.held and not self._is_ours(cell):
