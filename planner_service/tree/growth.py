@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.bucket_queue import grow_by_buckets
-from planner_service.kernels.layout import RULE_OCTILE, SQRT2_EXACT, TOO_FINE, Buckets, Labels, PaddedGrid
+from planner_service.kernels.layout import RULE_OCTILE, SQRT2_EXACT, TOO_FINE, Labels, PaddedGrid
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.radix_heap import grow_by_radix_heap
 from shared_map.arrays import Floats
@@ -37,7 +37,7 @@ def grow_tree(
     if longest <= min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)) * lowest:
         width = np.float32(lowest * 0.98)
         count = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
-        last = grow_by_buckets(padded, cost, root, Buckets(width, count))
+        last = grow_by_buckets(padded, cost, root, width, count)
         if last != TOO_FINE:
             if parent is not None:
                 point_to_parents(padded, cost, root, box, parent)
