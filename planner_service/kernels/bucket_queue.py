@@ -224,7 +224,7 @@ def _offer_around(cell_cost, cost, s, corners, batch, n, touched):
 
 
 @njit
-def grow_by_buckets(grid, cost, root, width, ring):
+def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, ring):
     """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
     width  of a bucket, s: below the lowest cell cost, so that nothing in a bucket leads back into it
@@ -234,7 +234,6 @@ def grow_by_buckets(grid, cost, root, width, ring):
     With octile steps a cell waits twice, under its straight exit key in the first `ring` buckets and under its
     diagonal one in as many behind them.
     """
-    cell_cost, stride, rule, corners = grid
     kinds = 2 if rule == RULE_OCTILE else 1
     queue = _make_queue(kinds * ring, kinds * cell_cost.size)
     head, tail = queue[4], queue[5]

@@ -40,9 +40,8 @@ def _no_rows(grid):
 
 
 @njit
-def _note(rows, stride, cells, count):
+def _note(first, last, stride, cells, count):
     """Something has changed about the first `count` of these padded cells."""
-    first, last = rows
     # cell // stride, by a multiplication: exact while the grid's size * stride is below 2**44.
     per_row = np.uint64((1 << 44) // stride + 1)
     for i in range(count):
@@ -55,19 +54,19 @@ def _note(rows, stride, cells, count):
 @njit
 def _note_cheaper(grid, rows, changed, before):
     """Note the cells that got cheaper. Returns whether there are any."""
+    first, last = rows
     found = False
     for i in range(changed.size):
         if grid.cell_cost[changed[i]] < before[i]:
-            _note(rows, grid.stride, changed[i : i + 1], 1)
+            _note(first, last, grid.stride, changed[i : i + 1], 1)
             found = True
     return found
 
 
 @njit
-def _span(rows, stride, row):
+def _span(first, last, stride, row):
     """The cells of a row that something has changed about in it or in the rows beside it, and their neighbours:
     begin <= cell < end, empty if there are none."""
-    first, last = rows
     # Columns, so that three rows can be laid over each other.
     begin, end = stride, -1
     for near in range(row - 1, row + 2):
@@ -110,9 +109,10 @@ def _sweep(grid, cost, rows, floor, lowered, count):
     """Lower the cells of `rows`, and those next to them, to what they are offered, where they cost `floor` (s) or
     more and are offered less. Returns lowered, to which it appends them, and how many there are."""
     stride = grid.stride
+    first, last = rows
     best = np.empty(stride, np.float32)
-    for row in range(1, rows[0].size - 1):
-        begin, end = _span(rows, stride, row)
+    for row in range(1, first.size - 1):
+        begin, end = _span(first, last, stride, row)
         if end <= begin:
             continue
         _best_offers(grid, cost, np.uint64(begin), np.uint64(end), best)
@@ -338,21 +338,24 @@ def repair(grid, labels, changed, before, buckets, most):
     if many > most_detached:
         return -1, INF
     rows = _no_rows(grid)
+    first, last = rows
     lowered = np.empty(1024, np.uint32)
     count = 0
     if many:
-        _note(rows, grid.stride, detached, many)
+        _note(first, last, grid.stride, detached, many)
         lowered, count = _sweep(grid, labels.cost, rows, INF, lowered, count)
     if any_cheaper:
         lowered, count = _sweep(grid, labels.cost, cheaper, np.float32(-INF), lowered, count)
     served, highest = _spread(grid, labels.cost, buckets, lowered, count, rows, 2 * many + most[2])
     if served < 0:
         return -1, INF
+    cell_cost, stride, rule, corners = grid
+    cost, parent, root = labels
     # A cell beside one that changed may have a better neighbour now.
-    _note(rows, grid.stride, changed, changed.size)
-    for row in range(1, rows[0].size - 1):
-        begin, end = _span(rows, grid.stride, row)
+    _note(first, last, grid.stride, changed, changed.size)
+    for row in range(1, first.size - 1):
+        begin, end = _span(first, last, grid.stride, row)
         if begin < end:
-            point_row_to_parents(grid, labels.cost, begin, end, labels.parent)
-    labels.parent[labels.root] = NONE
+            point_row_to_parents(cell_cost, cost, stride, rule, corners, begin, end, parent)
+    parent[root] = NONE
     return served + many, highest

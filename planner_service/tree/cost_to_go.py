@@ -135,7 +135,10 @@ class CostToGoTree:
         rows, cols = grid.grid.rows, grid.grid.cols
         # A neighbour of a cell that got cheaper may lead there now.
         around = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
-        point_to_parents(grid.padded, self.cost, grid.pad(root), around, self.parent)
+        new_root = grid.pad(root)
+        point_to_parents(
+            grid.cell_cost, self.cost, grid.stride, grid.rule, grid.corners, new_root, around, self.parent
+        )
         self.exact = self.exact and root == self.root
         self.root = root
         self._ways_changed()
