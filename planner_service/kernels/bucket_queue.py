@@ -224,18 +224,16 @@ def _offer_around(cell_cost, cost, s, corners, batch, n, touched):
 
 
 @njit
-def grow_by_buckets(grid, cost, root, buckets):
+def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, ring):
     """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
-    buckets  width: below the lowest cell cost, so that nothing in a bucket leads back into it. count: a power of
-             two, the circular queue; count * width exceeds the dearest step by two widths
+    width  of a bucket, s: below the lowest cell cost, so that nothing in a bucket leads back into it
+    ring   buckets of the circular queue, a power of two; ring * width exceeds the dearest step by two widths
     Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
 
-    With octile steps a cell waits twice, under its straight exit key in the first `count` buckets and under its
+    With octile steps a cell waits twice, under its straight exit key in the first `ring` buckets and under its
     diagonal one in as many behind them.
     """
-    cell_cost, stride, rule, corners = grid
-    width, ring = buckets
     kinds = 2 if rule == RULE_OCTILE else 1
     queue = _make_queue(kinds * ring, kinds * cell_cost.size)
     head, tail = queue[4], queue[5]

@@ -18,7 +18,16 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels.compile import njit
-from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, enlarged, step_offsets
+from planner_service.kernels.layout import (
+    INF,
+    NONE,
+    RULE_FOUR,
+    RULE_OCTILE,
+    SQRT2,
+    check_cells,
+    enlarged,
+    step_offsets,
+)
 
 
 @njit
@@ -114,8 +123,9 @@ def tighten(grid, labels, stamp, now, cells):
     (int64, padded) and of all on their ways to the root.
 
     They stay at least what the parent offers. Cells whose stamp is `now` or more are taken to be right, and those
-    that become so are stamped `now`. Returns cells visited.
+    that become so are stamped `now`. Returns cells visited. Raises ValueError where one is no padded cell.
     """
+    check_cells(cells, stamp.size)
     offsets = step_offsets(grid.stride)
     trail = np.empty(1024, np.int64)
     visited = 0

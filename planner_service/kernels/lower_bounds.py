@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.compile import njit
-from planner_service.kernels.layout import INF
+from planner_service.kernels.layout import INF, check_cells
 
 _ROUNDING = 2.0**-23
 """Relative error of one float32 step, doubled for the sum over a route's steps."""
@@ -49,6 +49,7 @@ def _rounding(cost, lowest, most):
 @njit
 def bound_by_exact_cost(cost, starts, lowest, most, bound):
     """bound := what an exact tree says. lowest: cell cost, s; most: cells of the grid."""
+    check_cells(starts, cost.size)
     for i in range(starts.size):
         own = np.float64(cost[starts[i]])
         bound[i] = own * (1.0 - _rounding(own, lowest, most))
@@ -62,6 +63,8 @@ def bound_by_heuristic(heuristic, root, stride, window, starts, lowest, most, bo
     lowest, most  lowest cell cost, s, and cells of the grid: they bound the steps of a route, and so its rounding
     """
     part, box, rim, rim_cost = window
+    if heuristic.size > 0:
+        check_cells(starts, heuristic.size)
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
     known = heuristic.size > 0

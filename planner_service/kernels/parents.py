@@ -68,9 +68,8 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
 
 
 @njit
-def point_row_to_parents(grid, cost, first, last, parent):
+def point_row_to_parents(cell_cost, cost, stride, rule, corners, first, last, parent):
     """As `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out."""
-    cell_cost, stride, rule, corners = grid
     s, begin, end = np.uint64(stride), np.uint64(first), np.uint64(last)
     if rule == RULE_FOUR:
         _parents_of_four(cell_cost, cost, s, begin, end, parent)
@@ -80,11 +79,11 @@ def point_row_to_parents(grid, cost, first, last, parent):
 
 
 @njit
-def point_to_parents(grid, cost, root, box, parent):
+def point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent):
     """Write the parents of the cells of a window: the neighbour with the smallest exit key; of equals the first of
     north, east, south, west, then of the diagonals clockwise."""
     row0, col0, row1, col1 = box
     for row in range(row0, row1):
-        start = (row + 1) * grid.stride + 1
-        point_row_to_parents(grid, cost, start + col0, start + col1, parent)
+        start = (row + 1) * stride + 1
+        point_row_to_parents(cell_cost, cost, stride, rule, corners, start + col0, start + col1, parent)
     parent[root] = NONE

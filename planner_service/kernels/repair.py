@@ -14,9 +14,9 @@ Arrays, beside those of `layout`:
     rows      (first, last)  int64 (rows + 2,)  of each padded row, the first and last padded cell that something
                              has changed about; last < first where nothing has
     lowered   uint32         padded cells whose cost has fallen; as many as a count says
-    queue     (keys float32, items uint32, behind int32, heads int32, counts int32)  entries of the queue: cost when
-              entered (s), padded cell, the next entry of its bucket; of each bucket the first entry, the overflow
-              last; (entries ever used, the first spare one). _NOBODY ends a list
+    keys, items, behind  float32, uint32, int32  entries of the queue: cost when entered (s), padded cell, the next
+                                                 entry of its bucket; _NOBODY ends a list
+    heads     int32    (count + 1,)  first entry of each bucket, the overflow last; _NOBODY if empty
 """
 
 from __future__ import annotations
@@ -40,9 +40,8 @@ def _no_rows(grid):
 
 
 @njit
-def _note(rows, stride, cells, count):
+def _note(first, last, stride, cells, count):
     """Something has changed about the first `count` of these padded cells."""
-    first, last = rows
     # cell // stride, by a multiplication: exact while the grid's size * stride is below 2**44.
     per_row = np.uint64((1 << 44) // stride + 1)
     for i in range(count):
@@ -55,19 +54,19 @@ def _note(rows, stride, cells, count):
 @njit
 def _note_cheaper(grid, rows, changed, before):
     """Note the cells that got cheaper. Returns whether there are any."""
+    first, last = rows
     found = False
     for i in range(changed.size):
         if grid.cell_cost[changed[i]] < before[i]:
-            _note(rows, grid.stride, changed[i : i + 1], 1)
+            _note(first, last, grid.stride, changed[i : i + 1], 1)
             found = True
     return found
 
 
 @njit
-def _span(rows, stride, row):
+def _span(first, last, stride, row):
     """The cells of a row that something has changed about in it or in the rows beside it, and their neighbours:
     begin <= cell < end, empty if there are none."""
-    first, last = rows
     # Columns, so that three rows can be laid over each other.
     begin, end = stride, -1
     for near in range(row - 1, row + 2):
@@ -110,9 +109,10 @@ def _sweep(grid, cost, rows, floor, lowered, count):
     """Lower the cells of `rows`, and those next to them, to what they are offered, where they cost `floor` (s) or
     more and are offered less. Returns lowered, to which it appends them, and how many there are."""
     stride = grid.stride
+    first, last = rows
     best = np.empty(stride, np.float32)
-    for row in range(1, rows[0].size - 1):
-        begin, end = _span(rows, stride, row)
+    for row in range(1, first.size - 1):
+        begin, end = _span(first, last, stride, row)
         if end <= begin:
             continue
         _best_offers(grid, cost, np.uint64(begin), np.uint64(end), best)
@@ -127,64 +127,9 @@ def _sweep(grid, cost, rows, floor, lowered, count):
 
 
 @njit
-def _make_queue(buckets, capacity):
-    heads = np.full(buckets + 1, _NOBODY, np.int32)
-    counts = np.array((0, _NOBODY), np.int32)
-    return (
-        np.empty(capacity, np.float32),
-        np.empty(capacity, np.uint32),
-        np.empty(capacity, np.int32),
-        heads,
-        counts,
-    )
-
-
-@njit
-def _with_room(queue, more):
-    """A queue with room for so many entries more."""
-    keys, items, behind, heads, counts = queue
-    used = np.int64(counts[0])
-    if used + more <= keys.size:
-        return queue
-    capacity = 2 * (used + more)
-    return (
-        enlarged(keys, used, capacity),
-        enlarged(items, used, capacity),
-        enlarged(behind, used, capacity),
-        heads,
-        counts,
-    )
-
-
-@njit
-def _enter(queue, cost, cells, count, base, inverse, current):
-    """Enter the first `count` cells under their costs. Bucket b holds keys from base + b / inverse on; none is
-    entered below bucket `current`, which is the overflow while nothing is served."""
-    keys, items, behind, heads, counts = queue
-    overflow = heads.size - 1
-    top = np.float32(overflow)
-    used, spare = counts[0], counts[1]
-    for i in range(count):
-        key = cost[cells[i]]
-        b = overflow if current == overflow else max(np.int64(min((key - base) * inverse, top)), current)
-        e = spare
-        if e == _NOBODY:
-            e = used
-            used += np.int32(1)
-        else:
-            spare = behind[e]
-        keys[e] = key
-        items[e] = cells[i]
-        behind[e] = heads[b]
-        heads[b] = e
-    counts[0], counts[1] = used, spare
-
-
-@njit
-def _begin_anew(queue, inverse):
+def _begin_anew(keys, behind, heads, inverse):
     """Spread the overflow over the buckets, the first of which begins with its lowest key. Returns that key, or inf
     if nothing waits."""
-    keys, _, behind, heads, _ = queue
     overflow = heads.size - 1
     top = np.float32(overflow)
     rest = heads[overflow]
@@ -213,35 +158,63 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit):
     served).
     """
     cell_cost, stride, rule, corners = grid
+    first, last = rows
     across = np.array((-stride, 1, stride, -1)).astype(np.uint64)
     aslant = np.array((1 - stride, stride + 1, stride - 1, -stride - 1)).astype(np.uint64)
+    per_row = np.uint64((1 << 44) // stride + 1)  # as in `_note`
     inverse = np.float32(1.0) / buckets.width
-    queue = _make_queue(buckets.count, max(1024, 2 * count))
-    base = np.float32(0.0)
     overflow = buckets.count
+    top = np.float32(overflow)
+    heads = np.full(overflow + 1, _NOBODY, np.int32)
+    capacity = max(1024, 2 * count)
+    keys = np.empty(capacity, np.float32)
+    items = np.empty(capacity, np.uint32)
+    behind = np.empty(capacity, np.int32)
+    used = 0
+    spare = _NOBODY
+    base = np.float32(0.0)
     current = overflow
     served = 0
     highest = np.float32(0.0)
     slant = diagonal_length(rule)
     room = np.uint64(lowered.size)
     n = np.uint64(count)
+    # All in one function: of a call's array arguments references are counted: repairs took a fifth more time where
+    # entering a bucket's cells was a call, and treble the time where making offers is one.
     while True:
-        queue = _with_room(queue, np.int64(n))
-        keys, items, behind, heads, counts = queue
-        _note(rows, stride, lowered, n)
-        _enter(queue, cost, lowered, n, base, inverse, current)
+        if used + np.int64(n) > capacity:
+            capacity = 2 * (used + np.int64(n))
+            keys = enlarged(keys, used, capacity)
+            items = enlarged(items, used, capacity)
+            behind = enlarged(behind, used, capacity)
+        for i in range(n):
+            v = lowered[i]
+            row = np.int64(np.uint64(v) * per_row >> _FINE)
+            first[row] = min(first[row], np.int64(v))
+            last[row] = max(last[row], np.int64(v))
+            key = cost[v]
+            b = overflow if current == overflow else max(np.int64(min((key - base) * inverse, top)), current)
+            e = spare
+            if e == _NOBODY:
+                e = used
+                used += 1
+            else:
+                spare = behind[e]
+            keys[e] = key
+            items[e] = v
+            behind[e] = heads[b]
+            heads[b] = e
         n = np.uint64(0)
         while current < overflow and heads[current] == _NOBODY:
             current += 1
         if current == overflow:
-            base = _begin_anew(queue, inverse)
+            base = _begin_anew(keys, behind, heads, inverse)
             if base == INF:
                 return served, highest
             current = 0
             continue
         e = heads[current]
         heads[current] = _NOBODY
-        spare = counts[1]
         while e != _NOBODY:
             u = np.uint64(items[e])
             key = keys[e]
@@ -258,8 +231,7 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit):
                 room = np.uint64(lowered.size)
             straight = key + cell_cost[u]
             diagonal = key + cell_cost[u] * slant
-            # No calls in here: of a call's array arguments references are counted, which trebles the time. And
-            # branches, unlike in a growth: few neighbours are offered less, so that these are foretold.
+            # Branches, unlike in a growth: few neighbours are offered less, so that these are foretold.
             for k in range(4):
                 v = u + across[k]
                 if straight < cost[v] and cell_cost[v] < INF:
@@ -275,7 +247,6 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit):
                     cost[v] = diagonal
                     lowered[n] = v
                     n += _ONE
-        counts[1] = spare
         if served > limit:
             return -1, highest
 
@@ -367,21 +338,24 @@ def repair(grid, labels, changed, before, buckets, most):
     if many > most_detached:
         return -1, INF
     rows = _no_rows(grid)
+    first, last = rows
     lowered = np.empty(1024, np.uint32)
     count = 0
     if many:
-        _note(rows, grid.stride, detached, many)
+        _note(first, last, grid.stride, detached, many)
         lowered, count = _sweep(grid, labels.cost, rows, INF, lowered, count)
     if any_cheaper:
         lowered, count = _sweep(grid, labels.cost, cheaper, np.float32(-INF), lowered, count)
     served, highest = _spread(grid, labels.cost, buckets, lowered, count, rows, 2 * many + most[2])
     if served < 0:
         return -1, INF
+    cell_cost, stride, rule, corners = grid
+    cost, parent, root = labels
     # A cell beside one that changed may have a better neighbour now.
-    _note(rows, grid.stride, changed, changed.size)
-    for row in range(1, rows[0].size - 1):
-        begin, end = _span(rows, grid.stride, row)
+    _note(first, last, grid.stride, changed, changed.size)
+    for row in range(1, first.size - 1):
+        begin, end = _span(first, last, grid.stride, row)
         if begin < end:
-            point_row_to_parents(grid, labels.cost, begin, end, labels.parent)
-    labels.parent[labels.root] = NONE
+            point_row_to_parents(cell_cost, cost, stride, rule, corners, begin, end, parent)
+    parent[root] = NONE
     return served + many, highest

@@ -24,6 +24,7 @@ from planner_service.kernels.layout import (
     RULE_OCTILE,
     SQRT2,
     SQRT2_EXACT,
+    check_cells,
     step_offsets,
 )
 
@@ -109,9 +110,11 @@ def walk_routes(grid, parent, root, starts, max_steps, limit):
     """The routes from `starts` to a padded root, at most `max_steps` long where that is positive.
 
     limit  no route can be longer than so many steps
+    Raises ValueError where a start is no padded cell.
     Returns (directions, ends, driven, diagonals, last).
     """
     cell_cost, stride, rule, _ = grid
+    check_cells(starts, parent.size)
     moves = _moves(stride, rule)
     count = starts.size
     ends = np.empty(count, np.int64)

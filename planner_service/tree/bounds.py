@@ -41,10 +41,9 @@ class LowerBounds:
     def at(self, tree: CostToGoTree, starts: NDArray[np.int64]) -> NDArray[np.float64]:
         """Proven lower bounds, s, on the time from padded cells to the target now.
 
-        Raises OutsideGridError where a start is no padded cell.
+        Raises ValueError where a start is no padded cell.
         """
         grid = self._grid
-        grid.check_padded(starts)
         lowest, most = grid.lowest_cell_cost, grid.grid.cells
         bound = np.zeros(starts.size)
         if tree.exact:

@@ -19,7 +19,6 @@ from planner_service.kernels.layout import (
     SQRT2_EXACT,
     Buckets,
     PaddedGrid,
-    all_inside,
 )
 from planner_service.kernels.route_walk import walk_routes
 from planner_service.tree.growth import grow_tree
@@ -122,11 +121,6 @@ class CostGrid:
         there, and kernels check no index."""
         if not self.passable(cell):
             raise ValueError(f"cell {cell} is lethal: no tree can lead there")
-
-    def check_padded(self, cells: Cells) -> None:
-        """Raises OutsideGridError unless these are padded cells: indices into padded arrays."""
-        if not all_inside(cells, self.size):
-            raise OutsideGridError(f"padded cells must lie in 0..{self.size - 1}")
 
     def pad(self, cell: int) -> int:
         """The padded cell of a cell of the grid."""
@@ -232,12 +226,11 @@ class CostGrid:
         """Routes from padded cells that have a way to a padded root, over the cell costs of this or an earlier map.
 
         most  steps of a route; 0 for all of it
-        Raises OutsideGridError where a start or the root is no padded cell.
+        Raises ValueError where a start or the root is no padded cell.
         """
-        self.check_padded(starts)
         if not 0 <= root < self.size:
             raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
-        padded = self.padded._replace(cell_cost=cell_cost)
+        padded = self.padded if cell_cost is self.cell_cost else self.padded._replace(cell_cost=cell_cost)
         return Walks(*walk_routes(padded, parent, root, starts, most, self.grid.cells))
 
     def passable(self, cell: int) -> bool:

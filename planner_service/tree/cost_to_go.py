@@ -116,7 +116,8 @@ class CostToGoTree:
         `grow`, and OutsideGridError on a window that is not inside the grid or does not hold both roots.
         """
         grid = self.cost_grid
-        labels = self._labels
+        if self.root < 0:
+            raise ValueError("the tree has no root: grow it first")
         grid.check_root(root)
         row0, col0, row1, col1 = box = self._box(window)
         width = col1 - col0 + 2
@@ -130,11 +131,14 @@ class CostToGoTree:
         if not way < math.inf:
             return 0
         self.offset += way
-        merge_window(cost, box, np.float32(self.offset), labels.root, self.cost, grid.stride)
+        merge_window(cost, box, np.float32(self.offset), grid.pad(self.root), self.cost, grid.stride)
         rows, cols = grid.grid.rows, grid.grid.cols
         # A neighbour of a cell that got cheaper may lead there now.
         around = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
-        point_to_parents(grid.padded, self.cost, grid.pad(root), around, self.parent)
+        new_root = grid.pad(root)
+        point_to_parents(
+            grid.cell_cost, self.cost, grid.stride, grid.rule, grid.corners, new_root, around, self.parent
+        )
         self.exact = self.exact and root == self.root
         self.root = root
         self._ways_changed()
@@ -176,12 +180,10 @@ class CostToGoTree:
         """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.
 
         A window raises the costs beyond it by the most that may be, move after move, until a growth comes by or
-        this is asked. Raises OutsideGridError where one is no padded cell.
+        this is asked. Raises ValueError where one is no padded cell.
         """
-        grid = self.cost_grid
-        grid.check_padded(cells)
         if not self.exact:
-            corridor_growth.tighten(grid.padded, self._labels, self._stamps_now(), self._now, cells)
+            corridor_growth.tighten(self.cost_grid.padded, self._labels, self._stamps_now(), self._now, cells)
 
     def _stamps_now(self) -> NDArray[np.uint8]:
         if self._stamps is None:
