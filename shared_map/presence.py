@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.filter import Reading
+from shared_map.replication.filter import MarkFilter
 from swarm.grid import GridSpec
 from swarm.liveness import Leases
 from swarm.wire.messages.vehicles import Fleet, VehicleState
@@ -56,13 +56,13 @@ class Presence:
     """The newest word of each (author, region), for as long as its lease lasts.
 
     bucket_m   side of the squares by which neighbours are looked up: about the radius that is asked for most
-    reading    whose vehicles count; None for everybody's
+    filter     whose vehicles count; None for everybody's
     """
 
-    def __init__(self, grid: GridSpec, lease_ns: int, bucket_m: float, reading: Reading | None = None) -> None:
+    def __init__(self, grid: GridSpec, lease_ns: int, bucket_m: float, filter: MarkFilter | None = None) -> None:
         self._grid = grid
         self._bucket_m = bucket_m
-        self._reading = reading
+        self._filter = filter
         self._leases = Leases(lease_ns)
         self._newest: dict[str, Fleet] = {}
         self._index: _Index | None = None
@@ -70,7 +70,7 @@ class Presence:
 
     def hear(self, fleet: Fleet, now_ns: int) -> None:
         """Take in where an author's vehicles of one region are; late and repeated messages change nothing."""
-        if self._reading is not None and not self._reading.hears(fleet.author, fleet.group):
+        if self._filter is not None and not self._filter.accepts_author(fleet.author, fleet.group):
             return
         key = f"{fleet.author}/{fleet.region}"
         known = self._newest.get(key)

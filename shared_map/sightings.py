@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from shared_map.replication.filter import Reading
+from shared_map.replication.filter import MarkFilter
 from swarm.wire.messages.targets import Sighted, TargetPose
 
 _MOST = 10_000
@@ -17,8 +17,8 @@ _MOST = 10_000
 class Sightings:
     """The newest word of each (target, author), as long as it lasts."""
 
-    def __init__(self, reading: Reading) -> None:
-        self._reading = reading
+    def __init__(self, filter: MarkFilter) -> None:
+        self._filter = filter
         self._newest: dict[tuple[str, str], Sighted] = {}
 
     def hear(self, sighted: Sighted) -> bool:
@@ -27,7 +27,7 @@ class Sightings:
         known = self._newest.get(key)
         if known is not None and (sighted.stamp_ns, sighted.seq) <= (known.stamp_ns, known.seq):
             return False
-        if not self._reading.hears(sighted.author, sighted.group):
+        if not self._filter.accepts_author(sighted.author, sighted.group):
             return False
         if known is None and len(self._newest) >= _MOST:
             return False

@@ -137,12 +137,6 @@ class GridSpec:
             self.north_m - (row + 0.5) * self.resolution_m,
         )
 
-    def cell_at_m(self, x_m: float, y_m: float) -> int:
-        """The cell that holds a point. Raises OutsideGridError outside the grid."""
-        row = int((self.north_m - y_m) // self.resolution_m)
-        col = int((x_m - self.west_m) // self.resolution_m)
-        return self.cell(row, col)
-
     def tile_of(self, cell: int) -> int:
         row, col = self.row_col(cell)
         return (row // TILE_CELLS) * self.tile_cols + col // TILE_CELLS

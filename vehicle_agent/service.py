@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from shared_map.cost_map import CostMap
 from shared_map.presence import Presence
-from shared_map.replication.filter import Reading, author_of, readable_groups
+from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
@@ -88,10 +88,10 @@ class AgentService:
             author=self._author,
             group=group,
             publish_hz=scenario.map.publish_hz,
-            reading=Reading(grid, readable_groups(scenario, group)),
+            filter=MarkFilter(grid, readable_groups(scenario, group)),
         )
         near = scenario.map.interest == "near"
-        self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role, near=near)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
@@ -105,10 +105,10 @@ class AgentService:
         self._map_near = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._listens_to: frozenset[str] = frozenset()
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
-        self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.reading)
+        self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.filter)
         self._looks_at: frozenset[int] = frozenset()
         self._untracked = scenario.untracked
-        self._sightings = Sightings(self._replica.reading)
+        self._sightings = Sightings(self._replica.filter)
         self._lookout = Lookout(
             grid,
             self._author,
@@ -142,7 +142,7 @@ class AgentService:
         self._bus.watch_alive(self._post, role="agent")
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
-        self._feed.start(now_ns)
+        self._sync.start(now_ns)
         self._bus.subscribe(POSE, self._post)
         if self._untracked:
             self._bus.subscribe(TRUE_POSE, self._post)
@@ -153,7 +153,7 @@ class AgentService:
         self._alone_ns = now_ns + _ALONE_NS
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if self._member.handle(event) or self._feed.handle(event, now_ns):
+        if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         agent = self._agent
         match event:
@@ -220,7 +220,7 @@ class AgentService:
 
     def tick(self, now_ns: int) -> None:
         self._member.tick(now_ns)
-        self._feed.tick(now_ns)
+        self._sync.tick(now_ns)
         if self._resumption is not None:
             if self._resume_due_ns is not None and now_ns >= self._resume_due_ns:
                 self._resume_due_ns = None
@@ -241,7 +241,7 @@ class AgentService:
         while (findings := agent.drive(now_ns)) is not None:
             if len(findings):
                 self.counters.count("marks", len(findings))
-                self._feed.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
+                self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(now_ns)
         self._tell_sighted(now_ns)
         self._perform(agent.decide(now_ns), now_ns)
@@ -290,7 +290,7 @@ class AgentService:
         ground = self._ground
         places = self._agent.places
         ground.wish(self._plots.update(places))
-        self._feed.look_at(self._map_near.update(places))
+        self._sync.enter(self._map_near.update(places))
         regions = self._regions.update(places)
         for region in sorted(regions - self._looks_at):
             self._bus.subscribe(FLEET, self._post, region=region)

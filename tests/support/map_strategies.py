@@ -13,17 +13,18 @@ from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
-from swarm.bus.bus import Event
+from swarm.bus.bus import Bus, Event, Heard
 from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.grid import GridSpec
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.marks import FOLDS, MarkSet
+from swarm.wire.messages.marks import SEQ_STEP, Digest, MarkSet
 from swarm.wire.statements import MarkKind
+from swarm.wire.topics import DIGEST
 
 settings.register_profile(
     "shared-cores", deadline=None, suppress_health_check=[HealthCheck.too_slow]
@@ -47,7 +48,7 @@ def set_of(
 ) -> MarkSet:
     """said: cell in the tile -> (kind, pace, stamp); seq counts the author's own sets"""
     cells = sorted(said)
-    seq *= FOLDS
+    seq *= SEQ_STEP
     return mark_set(
         author,
         group,
@@ -91,14 +92,26 @@ class Composite:
     def __init__(self, grid: GridSpec = GRID) -> None:
         self.kinds = np.full(grid.cells, MarkKind.CLEAR, np.uint8)
         self.paces = np.zeros(grid.cells, np.float32)
+        self.changed: list[int] = []  # cells of which the last `apply` told
 
     def apply(self, cells: np.ndarray, kinds: np.ndarray, paces: np.ndarray) -> None:
         assert len(np.unique(cells)) == len(cells)
+        self.changed = sorted(cells.tolist())
         self.kinds[cells] = kinds
         self.paces[cells] = paces
 
     def same(self, other: Composite) -> bool:
         return bool((self.kinds == other.kinds).all() and (self.paces == other.paces).all())
+
+
+def merge_one(replica: MapReplica, each: MarkSet) -> list[int] | None:
+    """The cells whose winner a set changes, of a replica with a `Composite`; None if it is not taken in."""
+    sink = replica._cost_map
+    assert isinstance(sink, Composite)
+    sink.changed = []
+    merged = replica.merge([each])
+    assert merged.changed in ([], [len(sink.changed)])
+    return sink.changed if merged.sets else None
 
 
 def naive_winners(sets: Sequence[MarkSet]) -> dict[tuple[int, int], tuple[int, float]]:
@@ -125,21 +138,21 @@ def naive_winners(sets: Sequence[MarkSet]) -> dict[tuple[int, int], tuple[int, f
     return {at: (kind, pace) for at, (_, _, kind, pace) in best.items()}
 
 
-class FeedService:
+class SyncService:
     """The least service that takes part in the map."""
 
-    def __init__(self, feed: MapFeed) -> None:
-        self.feed = feed
-        self.replica = feed.replica
+    def __init__(self, sync: MapSync) -> None:
+        self.sync = sync
+        self.replica = sync.replica
 
     def start(self, now_ns: int) -> None:
-        self.feed.start(now_ns)
+        self.sync.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        self.feed.handle(event, now_ns)
+        self.sync.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        self.feed.tick(now_ns)
+        self.sync.tick(now_ns)
 
 
 class LossyLinks:
@@ -172,23 +185,23 @@ class MapSwarm:
         self.config = MapConfig()
         self.alive: dict[str, object] = {}
 
-    def writer(self, author: str) -> FeedService:
-        return self._feed(author, author, "agent")
+    def writer(self, author: str) -> SyncService:
+        return self._sync_service(author, author, "agent")
 
-    def listener(self, node: str) -> FeedService:
-        return self._feed(node, None, "planner")
+    def listener(self, node: str) -> SyncService:
+        return self._sync_service(node, None, "planner")
 
-    def _feed(self, node: str, author: str | None, role: str) -> FeedService:
+    def _sync_service(self, node: str, author: str | None, role: str) -> SyncService:
         replica = MapReplica(self.terrain.grid, Composite(self.terrain.grid), author=author)
         bus = self.network.bus(node)
-        service: FeedService | None = None
+        service: SyncService | None = None
 
         def post(event: Event) -> None:
             assert service is not None
             if node in self.alive:
                 service.handle(event, self.clock.now_ns())
 
-        service = FeedService(MapFeed(replica, bus, post, self.config, role))
+        service = SyncService(MapSync(replica, bus, post, self.config, role))
         self._run(node, service)
         return service
 
@@ -207,7 +220,7 @@ class MapSwarm:
         self._run(node, service)
         return service
 
-    def _run(self, node: str, service: FeedService | KeeperService) -> None:
+    def _run(self, node: str, service: SyncService | KeeperService) -> None:
         self.alive[node] = service
         service.start(self.clock.now_ns())
 
@@ -233,10 +246,30 @@ class MapSwarm:
         return self.clock.now_ns()
 
 
+class Acknowledged:
+    """What the keepers' whole digests say is committed."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._committed: dict[str, bytes] | None = None
+        bus.subscribe(DIGEST, self._hear)
+
+    def _hear(self, event: Event) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Digest):
+            digest = event.message
+            if digest.role == "keeper" and digest.whole:
+                self._committed = digest.held
+
+    def not_yet(self, author: SyncService) -> int | None:
+        """How many of an author's sets no keeper has committed yet; None before any keeper spoke."""
+        if self._committed is None or author.replica.author is None:
+            return None
+        return len(author.replica.held.ahead_of(self._committed, [author.replica.author]))
+
+
 def held_winners(replica: MapReplica) -> dict[tuple[int, int], tuple[int, float]]:
     """(tile, cell) -> (kind, pace) as a replica sees it."""
     return {
         (tile, cell): (kind, pace)
-        for tile in replica.tiles
+        for tile in replica.held.tiles
         for cell, kind, pace in zip(*(v.tolist() for v in replica.winners(tile)[:3]), strict=True)
     }

@@ -22,7 +22,7 @@ from shared_map.cost_map import CostMap
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.scheduler import InlineWorker
@@ -169,8 +169,8 @@ class Swarm:
         self._track()
         self.author = MapReplica(self.terrain.grid, author="a0.1")
         node = Node(self.world, "agent")
-        self.feed = MapFeed(self.author, node.bus, node.post, MapConfig(), "agent")
-        node.run(_FeedService(self.feed))
+        self.sync = MapSync(self.author, node.bus, node.post, MapConfig(), "agent")
+        node.run(_SyncService(self.sync))
 
     def planner(self, target: str, incarnation: int = 1) -> Node:
         node = Node(self.world, f"planner-{target}-{incarnation}")
@@ -193,7 +193,7 @@ class Swarm:
 
     def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:
         now_ns = self.world.scheduler.clock.now_ns()
-        self.feed.publish(self.author.write(list(cells), kind, pace, now_ns))
+        self.sync.publish(self.author.write(list(cells), kind, pace, now_ns))
 
     def report(self, *vehicles: tuple[str, int], target: str = "t", seq: int = 1) -> None:
         count = len(vehicles)
@@ -215,9 +215,9 @@ class Swarm:
         self.ear.bus.publish(FLEET, fleet, region=0, author="a0.1")
 
 
-class _FeedService:
-    def __init__(self, feed: MapFeed) -> None:
-        self.start, self.handle, self.tick = feed.start, feed.handle, feed.tick
+class _SyncService:
+    def __init__(self, sync: MapSync) -> None:
+        self.start, self.handle, self.tick = sync.start, sync.handle, sync.tick
 
 
 @pytest.fixture(scope="module", autouse=True)
