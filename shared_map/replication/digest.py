@@ -15,7 +15,7 @@ Held = Mapping[str, bytes]
 
 
 class Ledger:
-    """What is held, by author and tile. A digest is copied out of it, not computed."""
+    """The number of each set held, by author and tile, as the rows that digests are made of."""
 
     def __init__(self) -> None:
         self._authors: dict[str, _Rows] = {}
@@ -32,7 +32,7 @@ class Ledger:
         self._authors.setdefault(author, _Rows()).recorded.update(numbers)
 
     def drop(self, author: str, tile: int) -> None:
-        """Nothing is held any more of this tile of an author."""
+        """An author's set of this tile is held no more."""
         rows = self._authors.get(author)
         if rows is not None and rows.drop(tile) == 0:
             del self._authors[author]
@@ -47,7 +47,7 @@ class Ledger:
         return {name: self._authors[name].sorted().tobytes() for name in names}
 
     def rows_of(self, author: str, tiles: Iterable[int]) -> bytes:
-        """Rows of these tiles of an author, as far as it has them."""
+        """Rows of an author's sets of these tiles, in order of tile; of tiles without a set none."""
         rows = self._authors.get(author)
         return b"" if rows is None else rows.of(tiles).tobytes()
 
@@ -118,7 +118,10 @@ class _Rows:
 
 
 def _newer(rows: NDArray[np.void], base: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Which of `rows` are newer than the row of the same tile in `base`, which is in order of tile."""
+    """Which of `rows` are newer than the row of the same tile in `base`, or have none there: bool (rows,).
+
+    base  in order of tile
+    """
     if not len(base):
         return np.ones(len(rows), bool)
     # Of a garbled digest with a tile twice, the last and thus the newest row of `base` counts.

@@ -1,8 +1,7 @@
-"""What of others' marks a replica takes in: whose, by the policy of groups, and where, by its interest.
+"""Which marks of others a replica takes in: by author (the policy of groups) and by tile (its interest).
 
-The group of an author stands in the author's id (`blue.a3.17f2`), and so in the key of everything that it writes:
-access control can enforce the policy, and a digest, which names authors only, is read without asking for sets that
-would be refused.
+An author's id begins with its group (`blue.a3.17f2`), and so do the keys of all that it writes. So access control
+can enforce the policy, and of a digest, which names only authors, nothing is asked for that would be refused.
 """
 
 from __future__ import annotations
@@ -15,13 +14,16 @@ from swarm.grid import GridSpec
 
 
 def author_of(group: str, name: str) -> str:
-    """The id under which a process of a group writes: `name` is that of its incarnation."""
+    """The author id of a process of a group.
+
+    name  of the process and its incarnation
+    """
     return f"{group}.{name}"
 
 
 def readable_groups(scenario: Scenario, group: str) -> frozenset[str] | None:
-    """The groups whose marks and positions a group takes in: itself, and those that it reads and that write to it.
-    None where that is everybody."""
+    """The groups whose marks and positions a group takes in: its own, and those that it reads and that write to it.
+    None if that is all groups."""
     groups = {each.name: each for each in scenario.groups}
     mine = groups[group]
     heard = {
@@ -33,10 +35,11 @@ def readable_groups(scenario: Scenario, group: str) -> frozenset[str] | None:
 
 
 def readable_for_target(scenario: Scenario, target: str) -> frozenset[str] | None:
-    """The groups whose marks the planner of a target takes in: all that any group reads that chases the target.
+    """The groups whose marks the planner of a target takes in: all that any group reads which chases the target.
+    None if that is all groups.
 
-    So the routes of the least informed group are as good as those of the best: what goes over to it are routes, not
-    marks. Groups that must not learn even that chase targets of their own.
+    So the least informed of these groups gets routes as good as the best informed one, but not the marks behind
+    them. Groups which must not learn even that much have to chase targets of their own.
     """
     heard: set[str] = set()
     for group in scenario.groups:
