@@ -108,7 +108,7 @@ def test_what_is_returned_is_what_was_news_and_how_many_cells_it_changed(
     assert together.counts == singly.counts
 
 
-def test_who_hears_its_own_name_among_many_outbids_as_ever() -> None:
+def test_an_author_whose_set_was_replaced_reasserts_it_among_many_too() -> None:
     own = MapReplica(GRID, Composite(), author="a1.1")
     own.write([5], [LETHAL], [0], 100)
     own.merge([set_of("a1.1", 0, 9, {}, epoch=4), set_of("b", 1, 0, {3: (LETHAL, 0, 1)})])
@@ -226,10 +226,10 @@ def test_messages_of_many_sets_merge_as_these_one_by_one(
 
 def test_what_has_no_room_for_all_is_taken_in_as_far_as_there_is_room() -> None:
     sets = [set_of("b", tile, 1, {3: (LETHAL, 0, 1)}) for tile in range(4)]
-    crowded = MapReplica(GRID, Composite(), capacity=Capacity(max_sets=8, max_marks=1 << 20))
+    bounded = MapReplica(GRID, Composite(), capacity=Capacity(max_sets=8, max_marks=1 << 20))
     [message] = packed(sets)
-    assert len(crowded.merge(unpacked(message)).sets) == 2
-    assert (crowded.held.capacity.sets, crowded.counts["sets_without_room"]) == (2, 2)
+    assert len(bounded.merge(unpacked(message)).sets) == 2
+    assert (bounded.held.capacity.sets, bounded.counts["sets_without_room"]) == (2, 2)
 
 
 def test_an_author_of_whom_nothing_is_taken_in_has_no_place_in_the_books() -> None:
