@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from shared_map.cost_map import CostMap
 from shared_map.presence import Presence
-from shared_map.replication.filter import Reading, author_of, readable_groups
+from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
@@ -92,17 +92,17 @@ class AgentService:
             self._cost_map,
             author=self._author,
             group=group,
-            reading=Reading(grid, readable_groups(scenario, group)),
+            filter=MarkFilter(grid, readable_groups(scenario, group)),
         )
         near = scenario.map.interest == "near"
-        self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role, near=near)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
         territory = Territory(plan.id, setup.incarnation, grid, list(spawns))
         lease_ns = int(scenario.network.lease_s * NS_PER_S)
-        self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.reading)
-        self._untracked = UntrackedTargets(scenario.untracked, self._replica.reading)
+        self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.filter)
+        self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
         self._detector = TargetDetector(
             grid,
             self._author,
@@ -129,7 +129,7 @@ class AgentService:
         self._bus.watch_alive(self._post, role="agent")
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
-        self._feed.start(now_ns)
+        self._sync.start(now_ns)
         self._bus.subscribe(POSE, self._post)
         if self._untracked.targets:
             self._bus.subscribe(TRUE_POSE, self._post)
@@ -140,7 +140,7 @@ class AgentService:
             self._resumption.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if self._member.handle(event) or self._feed.handle(event, now_ns):
+        if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         agent = self._agent
         match event:
@@ -196,7 +196,7 @@ class AgentService:
 
     def tick(self, now_ns: int) -> None:
         self._member.tick(now_ns)
-        self._feed.tick(now_ns)
+        self._sync.tick(now_ns)
         if self._resumption is not None:
             if self._resumption.ask_now(now_ns):
                 tag = f"reservations-{now_ns}"
@@ -215,7 +215,7 @@ class AgentService:
         while (findings := agent.drive(now_ns)) is not None:
             if len(findings):
                 self.counters.count("marks", len(findings))
-                self._feed.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
+                self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(now_ns)
         self._tell_sighted(now_ns)
         self._perform(agent.decide(now_ns), now_ns)
@@ -254,7 +254,7 @@ class AgentService:
     def _follow(self, now_ns: int) -> None:
         """Subscribe to what concerns our vehicles where they are now, and ask about new territory."""
         following = self._neighbourhood.follow(self._agent.places, now_ns)
-        self._feed.look_at(following.map_regions)
+        self._sync.enter(following.map_regions)
         for region in following.presence.begin:
             self._bus.subscribe(FLEET, self._post, region=region)
         for region in following.presence.end:

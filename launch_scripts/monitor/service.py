@@ -29,7 +29,7 @@ from launch_scripts.report.latest_state import VehicleNow
 from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder, messages_per_s
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post
@@ -82,7 +82,7 @@ class MonitorService:
         self.counters: Counters = self._member.counters
         self._cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, self._cost_map)
-        self._feed = MapFeed(replica, bus, post, setup.scenario.map, setup.role)
+        self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role)
         self._ground = ground or Ground(terrain)
         self._target_ids = setup.scenario.target_ids
         self._drawing = Drawing(rec, self._ground, self._target_ids)
@@ -92,7 +92,7 @@ class MonitorService:
         self._target_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
         self._routes: dict[str, RouteNow] = {}
         self._stale_tiles: dict[int, None] = {}
-        self._sightings = Sightings(replica.reading)
+        self._sightings = Sightings(replica.filter)
         self._sighted: Mapping[str, Sighted] = {}
         self._fleets_new = self._targets_new = self._windows_new = False
         self._frame = 0
@@ -110,7 +110,7 @@ class MonitorService:
                 self._bus.subscribe(topic, self._post)
         self._bus.subscribe(SIGHTED, self._post)
         self._bus.watch_alive(self._post)
-        self._feed.start(now_ns)
+        self._sync.start(now_ns)
         self._drawing.set_time(0, 0.0)
         self._drawing.begin()
         self._stale_tiles = dict.fromkeys(range(self._ground.tile_rows * self._ground.tile_cols))
@@ -120,7 +120,7 @@ class MonitorService:
         if isinstance(event, Appeared | Disappeared):
             self._alive(event.peer, isinstance(event, Appeared), now_ns)
             return
-        if self._member.handle(event) or self._feed.handle(event, now_ns):
+        if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         if not isinstance(event, Heard):
             return
@@ -143,7 +143,7 @@ class MonitorService:
 
     def tick(self, now_ns: int) -> None:
         """Draws one frame."""
-        self._feed.tick(now_ns)
+        self._sync.tick(now_ns)
         self._member.tick(now_ns)
         self._announce(now_ns)
         self._frame += 1

@@ -230,9 +230,9 @@ class MapConfig(Section, frozen=True, kw_only=True):
     digest_s            every replica publishes this often which sets it holds
     author_marks_per_s  an author which changes more cells than this for ten seconds is named, its sets delayed
     total_marks_per_s   the same of all authors together: the sets of those above an equal share of it are delayed
-    fold_after_s        an author of whom a keeper has heard nothing for so long is taken for dead, and what it said
-                        is folded with what other dead authors said; longer than a partition is likely to last
-    fold_keep_s         what was folded can be put back for so long
+    compact_after_s     an author of which a keeper has heard nothing for so long counts as dead: its sets are
+                        compacted with those of other dead authors. Longer than a partition is likely to last
+    compact_keep_s      what compaction dropped can be put back for so long
     """
 
     interest: Literal["all", "near"] = "all"
@@ -240,8 +240,8 @@ class MapConfig(Section, frozen=True, kw_only=True):
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0
-    fold_after_s: Positive = 60.0
-    fold_keep_s: Positive = 86_400.0
+    compact_after_s: Positive = 60.0
+    compact_keep_s: Positive = 86_400.0
 
 
 class TlsConfig(Section, frozen=True, kw_only=True):

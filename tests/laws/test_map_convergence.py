@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from support.swarm_model import FeedService, LossyLinks, SwarmModel
+from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
@@ -19,11 +19,11 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.wire.statements import MarkKind
 
 STEP_S = 0.1
-Services = Sequence[FeedService | KeeperService]
+Services = Sequence[SyncService | KeeperService]
 
 
 def equal(services: Services) -> bool:
-    return len({service.replica.fingerprint() for service in services}) == 1
+    return len({service.replica.held.fingerprint() for service in services}) == 1
 
 
 def until_equal_s(swarm: SwarmModel, services: Services, at_most_s: float = 60.0) -> float:
@@ -35,14 +35,14 @@ def until_equal_s(swarm: SwarmModel, services: Services, at_most_s: float = 60.0
     return round(waited_s, 1)
 
 
-def scribble(swarm: SwarmModel, chance: random.Random, author: FeedService, marks: int) -> None:
+def scribble(swarm: SwarmModel, chance: random.Random, author: SyncService, marks: int) -> None:
     """Say something about cells of one place, as a vehicle does."""
     grid = swarm.terrain.grid
     row, col = chance.randrange(grid.rows), chance.randrange(grid.cols)
     near = [(row + chance.randrange(32), col + chance.randrange(32)) for _ in range(marks)]
     cells = [grid.cell(min(r, grid.rows - 1), min(c, grid.cols - 1)) for r, c in near]
     kinds = [chance.choice((MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE)) for _ in cells]
-    author.feed.publish(author.replica.write(cells, kinds, 2.0, swarm.now_ns))
+    author.sync.publish(author.replica.write(cells, kinds, 2.0, swarm.now_ns))
 
 
 def after_loss_s(seed: int) -> float:
@@ -84,8 +84,8 @@ def lost_while_coming_and_going(seed: int, marks: int, agents: int = 6) -> dict[
     )
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     listener = swarm.listener("p")
-    living: dict[str, FeedService] = {}
-    said: dict[str, FeedService] = {}
+    living: dict[str, SyncService] = {}
+    said: dict[str, SyncService] = {}
     written = 0
     while written < marks:
         while len(living) < agents:
@@ -105,7 +105,7 @@ def lost_while_coming_and_going(seed: int, marks: int, agents: int = 6) -> dict[
     lost = 0
     for replica in (keeper.replica, listener.replica, *(each.replica for each in living.values())):
         for name, author in said.items():
-            lost += len(author.replica.ahead_of(replica.digest(), [name]))
+            lost += len(author.replica.held.ahead_of(replica.held.ledger.held(), [name]))
     return {"marks": written, "agents": len(said), "equal_after_s": equal_s, "sets_lost": lost}
 
 

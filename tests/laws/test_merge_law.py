@@ -16,8 +16,8 @@ def test_merging_depends_on_neither_order_nor_repetition(sets: list[MarkSet], da
     replica, composite = replica_of(sets)
     again = data.draw(st.lists(st.sampled_from(sets), max_size=10)) if sets else []
     other, other_composite = replica_of(data.draw(st.permutations(sets + again)))
-    assert replica.digest() == other.digest()
-    assert replica.answer(MarksRequest()) == other.answer(MarksRequest())
+    assert replica.held.ledger.held() == other.held.ledger.held()
+    assert replica.held.answer(MarksRequest()) == other.held.answer(MarksRequest())
     assert composite.same(other_composite)
 
 
@@ -26,10 +26,10 @@ def test_merging_does_not_depend_on_grouping(one: list[MarkSet], two: list[MarkS
     """What two replicas hold, merged into a third, is what all the sets merge to."""
     third, composite = replica_of([])
     for part in (one, two):
-        for each in replica_of(part)[0].answer(MarksRequest()):
-            third.merge(each)
+        for each in replica_of(part)[0].held.answer(MarksRequest()):
+            third.merge([each])
     whole, whole_composite = replica_of(one + two)
-    assert third.digest() == whole.digest()
+    assert third.held.ledger.held() == whole.held.ledger.held()
     assert composite.same(whole_composite)
 
 
@@ -52,12 +52,12 @@ def test_the_cost_map_always_stands_at_the_winners(sets: list[MarkSet]) -> None:
 def test_what_was_lost_is_fetched_after_comparing_digests(sets: list[MarkSet], lost: list[bool]) -> None:
     whole, composite = replica_of(sets)
     partial, partial_composite = replica_of([each for each, gone in zip(sets, lost, strict=False) if not gone])
-    asked = partial.compare(whole.digest())
+    asked = partial.missing(whole.held.ledger.held())
     for author, tiles in asked:
-        for each in whole.answer(MarksRequest(authors=[author], tiles=tiles)):
-            assert partial.merge(each) is not None, "only what differs is fetched"
-    assert partial.compare(whole.digest()) == []
-    assert fingerprint(partial.digest()) == fingerprint(whole.digest())
+        for each in whole.held.answer(MarksRequest(authors=[author], tiles=tiles)):
+            assert partial.merge([each]).sets == [each], "only what differs is fetched"
+    assert partial.missing(whole.held.ledger.held()) == []
+    assert fingerprint(partial.held.ledger.held()) == fingerprint(whole.held.ledger.held())
     # Sets that differ under one number are damage, which digests do not show.
     if len({(s.author, s.tile, s.epoch, s.seq) for s in sets}) == len(sets):
         assert composite.same(partial_composite)

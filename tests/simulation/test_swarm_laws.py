@@ -58,7 +58,7 @@ def check_all(simulation: Simulation, laws: Laws) -> None:
         if node.service is not None and (replica := replica_of(node)) is not None
     }
     assert sorted(left) == ["keeper-0", "planner-t0", "planner-t1"]
-    assert len({replica.fingerprint() for replica in left.values()}) == 1
+    assert len({replica.held.fingerprint() for replica in left.values()}) == 1
     assert missing(laws.stored(), laws.acknowledged) == []
     planners: list[np.ndarray] = [
         simulation.nodes[name].service._cost_map.pace_s_per_m  # type: ignore[union-attr]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from hypothesis import HealthCheck, settings
@@ -10,9 +11,11 @@ from hypothesis import strategies as st
 
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
+from swarm.bus.bus import Bus, Event, Heard
 from swarm.grid import GridSpec
-from swarm.wire.messages.marks import FOLDS, MarkSet
+from swarm.wire.messages.marks import SEQ_STEP, Digest, MarkSet
 from swarm.wire.statements import MarkKind
+from swarm.wire.topics import DIGEST
 
 settings.register_profile(
     "shared-cores", deadline=None, suppress_health_check=[HealthCheck.too_slow]
@@ -35,7 +38,7 @@ def set_of(
 ) -> MarkSet:
     """said: cell in the tile -> (kind, pace, stamp); seq counts the author's own sets"""
     cells = sorted(said)
-    seq *= FOLDS
+    seq *= SEQ_STEP
     return mark_set(
         author,
         group,
@@ -79,14 +82,26 @@ class Composite:
     def __init__(self, grid: GridSpec = GRID) -> None:
         self.kinds = np.full(grid.cells, MarkKind.CLEAR, np.uint8)
         self.paces = np.zeros(grid.cells, np.float32)
+        self.changed: list[int] = []  # cells of which the last `apply` told
 
     def apply(self, cells: np.ndarray, kinds: np.ndarray, paces: np.ndarray) -> None:
         assert len(np.unique(cells)) == len(cells)
+        self.changed = sorted(cells.tolist())
         self.kinds[cells] = kinds
         self.paces[cells] = paces
 
     def same(self, other: Composite) -> bool:
         return bool((self.kinds == other.kinds).all() and (self.paces == other.paces).all())
+
+
+def merge_one(replica: MapReplica, each: MarkSet) -> list[int] | None:
+    """The cells whose winner a set changes, of a replica with a `Composite`; None if it is not taken in."""
+    sink = replica._cost_map
+    assert isinstance(sink, Composite)
+    sink.changed = []
+    merged = replica.merge([each])
+    assert merged.changed in ([], [len(sink.changed)])
+    return sink.changed if merged.sets else None
 
 
 def naive_winners(sets: Sequence[MarkSet]) -> dict[tuple[int, int], tuple[int, float]]:
@@ -117,7 +132,7 @@ def held_winners(replica: MapReplica) -> dict[tuple[int, int], tuple[int, float]
     """(tile, cell) -> (kind, pace) as a replica sees it."""
     return {
         (tile, cell): (kind, pace)
-        for tile in replica.tiles
+        for tile in replica.held.tiles
         for cell, kind, pace in zip(*(v.tolist() for v in replica.winners(tile)[:3]), strict=True)
     }
 
@@ -126,5 +141,25 @@ def replica_of(sets: list[MarkSet]) -> tuple[MapReplica, Composite]:
     composite = Composite()
     replica = MapReplica(GRID, composite)
     for each in sets:
-        replica.merge(each)
+        replica.merge([each])
     return replica, composite
+
+
+class Acknowledged:
+    """What the keepers' whole digests say is committed."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._committed: dict[str, bytes] | None = None
+        bus.subscribe(DIGEST, self._hear)
+
+    def _hear(self, event: Event) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Digest):
+            digest = event.message
+            if digest.role == "keeper" and digest.whole:
+                self._committed = digest.held
+
+    def not_yet(self, author: Any) -> int | None:
+        """How many of an author's sets no keeper has committed yet; None before any keeper spoke."""
+        if self._committed is None or author.replica.author is None:
+            return None
+        return len(author.replica.held.ahead_of(self._committed, [author.replica.author]))

@@ -12,7 +12,7 @@ from support.map_strategies import GRID, Composite
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import Event, Post
 from swarm.bus.memory_bus import LinkModel, MemoryBus, MemoryNetwork, PerfectLinks
@@ -30,14 +30,14 @@ TICK_NS = NS_PER_S // 10
 S = TypeVar("S", bound=Service)
 
 
-class FeedService:
+class SyncService:
     """The least service that takes part in the map."""
 
-    def __init__(self, feed: MapFeed) -> None:
-        self.feed = feed
-        self.replica = feed.replica
+    def __init__(self, sync: MapSync) -> None:
+        self.sync = sync
+        self.replica = sync.replica
         self.counters = Counters()
-        self.start, self.handle, self.tick = feed.start, feed.handle, feed.tick
+        self.start, self.handle, self.tick = sync.start, sync.handle, sync.tick
 
     def stop(self, now_ns: int) -> None:
         pass
@@ -166,15 +166,15 @@ class SwarmModel:
             f"{id}.{incarnation}", lambda bus, post: KeeperService(setup, self.terrain, bus, post, store)
         )
 
-    def writer(self, author: str) -> FeedService:
+    def writer(self, author: str) -> SyncService:
         """An agent that is nothing but an author of marks."""
-        return self._feed(author, "agent", author)
+        return self._sync(author, "agent", author)
 
-    def listener(self, node: str) -> FeedService:
+    def listener(self, node: str) -> SyncService:
         """A planner that is nothing but a replica."""
-        return self._feed(node, "planner", None)
+        return self._sync(node, "planner", None)
 
-    def _feed(self, node: str, role: str, author: str | None) -> FeedService:
+    def _sync(self, node: str, role: str, author: str | None) -> SyncService:
         replica = MapReplica(self.terrain.grid, Composite(self.terrain.grid), author=author)
         config = self.scenario.map
-        return self.start(node, lambda bus, post: FeedService(MapFeed(replica, bus, post, config, role)))
+        return self.start(node, lambda bus, post: SyncService(MapSync(replica, bus, post, config, role)))

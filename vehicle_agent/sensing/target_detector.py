@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable
 
-from shared_map.replication.filter import Reading
+from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings, pose_of
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -83,7 +83,7 @@ class UntrackedTargets:
     reading  whose sightings count
     """
 
-    def __init__(self, targets: Collection[str], reading: Reading) -> None:
+    def __init__(self, targets: Collection[str], reading: MarkFilter) -> None:
         self.targets = targets
         self._sightings = Sightings(reading)
 

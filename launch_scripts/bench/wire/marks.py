@@ -22,7 +22,7 @@ from launch_scripts.bench.wire.remote import (
 )
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import NS_PER_S
@@ -144,17 +144,17 @@ def late_join(far: Far, sets: int, marks: int, joins: int) -> dict[str, float]:
         with open_bus(far.network) as bus:
             inbox = Inbox()
             replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
-            feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench")
+            sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench")
             began_ns, used_ns = time.monotonic_ns(), time.process_time_ns()
-            feed.start(began_ns)
-            while not feed.joined and time.monotonic_ns() - began_ns < _LONGEST_S * NS_PER_S:
+            sync.start(began_ns)
+            while not sync.joined and time.monotonic_ns() - began_ns < _LONGEST_S * NS_PER_S:
                 event = inbox.take(0.1)
                 if event is not None:
-                    feed.handle(event, time.monotonic_ns())
+                    sync.handle(event, time.monotonic_ns())
             times["ours"].append((time.monotonic_ns() - began_ns) / 1e6)
             cpu["ours"].append((time.process_time_ns() - used_ns) / 1e6)
-            if len(replica.tiles) != sets:
-                raise SwarmError(f"a late join had {len(replica.tiles)} of {sets} sets")
+            if len(replica.held.tiles) != sets:
+                raise SwarmError(f"a late join had {len(replica.held.tiles)} of {sets} sets")
     far.end()
     figures = {
         "sets": sets,

@@ -21,7 +21,7 @@ from launch_scripts.launcher.router import RouterService
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import Bus, Event, Post
 from swarm.bus.zenoh_bus import open_bus
@@ -52,7 +52,7 @@ class MapService:
         self.counters = self._member.counters
         author = setup.author if setup.role == "agent" else None
         self.replica = MapReplica(terrain.grid, author=author)
-        self._feed = MapFeed(self.replica, bus, post, setup.scenario.map, setup.role)
+        self._sync = MapSync(self.replica, bus, post, setup.scenario.map, setup.role)
         self._chance = np.random.default_rng(setup.incarnation % (1 << 32))
         self._at = self._chance.integers(_SIDE_CELLS, size=2)
         self._write_due_ns = 0
@@ -60,17 +60,17 @@ class MapService:
 
     def start(self, now_ns: int) -> None:
         self._member.join()
-        self._feed.start(now_ns)
+        self._sync.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if not self._member.handle(event):
-            self._feed.handle(event, now_ns)
+            self._sync.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
         if self.writing and now_ns >= self._write_due_ns:
             self._write_due_ns = now_ns + _WRITE_NS
             self._scribble(now_ns)
-        self._feed.tick(now_ns)
+        self._sync.tick(now_ns)
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
@@ -81,7 +81,7 @@ class MapService:
         self._at = (self._at + self._chance.integers(-8, 9, size=2)) % (_SIDE_CELLS - 8)
         start = self.replica.grid.cell(*self._at.tolist())
         kind = self._chance.choice([MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR])
-        self._feed.publish(self.replica.write(np.arange(start, start + 8), kind, 2.0, now_ns))
+        self._sync.publish(self.replica.write(np.arange(start, start + 8), kind, 2.0, now_ns))
 
 
 def run_child(side: str, role: str, id: str, folder: Path) -> None:
@@ -135,7 +135,7 @@ class _Telling:
         merged = 0 if self._replica is None else self._replica.counts["sets_merged"]
         if self._replica is not None and merged != self._merged:
             self._merged = merged
-            _say([time.monotonic(), self._replica.fingerprint()])
+            _say([time.monotonic(), self._replica.held.fingerprint()])
 
     def stop(self, now_ns: int) -> None:
         self._service.stop(now_ns)

@@ -20,7 +20,7 @@ from shared_map.cost_map import CostMap
 from shared_map.replication.mark_sets import packed
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
@@ -141,20 +141,20 @@ def run_service(service: Any, inbox: Inbox, pipe: Connection, answer: Callable[.
 class _MapPeer:
     """A service which is nothing but a replica."""
 
-    def __init__(self, feed: MapFeed, pipe: Connection) -> None:
+    def __init__(self, sync: MapSync, pipe: Connection) -> None:
         self.counters = Counters()
-        self._feed = feed
+        self._sync = sync
         self._pipe = pipe
 
     def start(self, now_ns: int) -> None:
-        self._feed.start(now_ns)
+        self._sync.start(now_ns)
         self._pipe.send("ready")
 
     def handle(self, event: Event, now_ns: int) -> None:
-        self._feed.handle(event, now_ns)
+        self._sync.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        self._feed.tick(now_ns)
+        self._sync.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
         pass
@@ -189,10 +189,10 @@ def map_peer(network: NetworkConfig, pipe: Connection) -> None:
     with open_bus(network) as bus:
         inbox = Inbox()
         replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
-        feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
+        sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
         raw = bus.session.declare_subscriber(f"{RAW}/**", zenoh.handlers.FifoChannel(1 << 16))
         kept = read_on_thread(raw, received)
-        run_service(_MapPeer(feed, pipe), inbox, pipe, answer)
+        run_service(_MapPeer(sync, pipe), inbox, pipe, answer)
         del kept
 
 
@@ -202,13 +202,13 @@ def map_holder(network: NetworkConfig, pipe: Connection, sets: int, marks: int) 
     with open_bus(network) as bus:
         inbox = Inbox()
         replica = MapReplica(GRID)
-        replica.merge_many(held)
-        feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench", name="holder.1", serves_all=True)
+        replica.merge(held)
+        sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench", name="holder.1", serves_all=True)
         kept = [
             _serve_raw(bus, f"{RAW}/sets", [encode(each) for each in held]),
             _serve_raw(bus, f"{RAW}/bulk", [encode(each) for each in packed(held)]),
         ]
-        run_service(_MapPeer(feed, pipe), inbox, pipe, lambda *_: None)
+        run_service(_MapPeer(sync, pipe), inbox, pipe, lambda *_: None)
         del kept
 
 
@@ -225,26 +225,26 @@ def replica_cost(network: NetworkConfig, pipe: Connection) -> None:
     """Measures memory and times of a replica of a 4096 x 4096 map with a million marks."""
     grid = GridSpec(4096, 4096, 1.0)
     replica = MapReplica(grid)
-    replica.merge_many([some_set(tile, 0, 61) for tile in range(16)])
-    replica.digest()
+    replica.merge([some_set(tile, 0, 61) for tile in range(16)])
+    replica.held.ledger.held()
     before = resident_bytes()
     cpu_s = time.process_time()
     for tile in range(grid.tiles):
-        replica.merge(some_set(tile, 1, 61, f"a{tile % 8}.1"))
+        replica.merge([some_set(tile, 1, 61, f"a{tile % 8}.1")])
     one_by_one_s = time.process_time() - cpu_s
     held = resident_bytes() - before
     marks = grid.tiles * 61
     began_s = time.perf_counter()
-    digest = replica.digest()
+    digest = replica.held.ledger.held()
     first_ms = (time.perf_counter() - began_s) * 1e3
-    replica.merge(some_set(7, 2, 61, "a7.1"))
+    replica.merge([some_set(7, 2, 61, "a7.1")])
     began_s = time.perf_counter()
-    replica.digest()
+    replica.held.ledger.held()
     again_ms = (time.perf_counter() - began_s) * 1e3
     again = [some_set(tile, 3, 61, f"a{tile % 8}.1") for tile in range(grid.tiles)]
     cpu_s = time.process_time()
     for first in range(0, len(again), 1024):
-        replica.merge_many(again[first : first + 1024])
+        replica.merge(again[first : first + 1024])
     together_s = time.process_time() - cpu_s
     pipe.send("ready")
     pipe.recv()

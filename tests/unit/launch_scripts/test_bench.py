@@ -319,7 +319,7 @@ def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
 
 def test_folding_leaves_the_marked_cells_and_drops_what_was_said_twice() -> None:
     without, folded = bench("compaction", "--lives", "8")["rows"]
-    assert (without["folding"], folded["folding"]) == ("without", "with")
+    assert (without["compaction"], folded["compaction"]) == ("without", "with")
     assert folded["cells_marked"] == without["cells_marked"] == folded["marks"] < without["marks"]
     assert_fits(words_of("compaction", "--lives", "2"))
 

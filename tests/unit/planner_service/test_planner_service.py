@@ -153,7 +153,7 @@ class Swarm(SwarmModel):
         self.scheduler.after(TICK, self._track)
 
     def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:
-        self.author.feed.publish(self.author.replica.write(list(cells), kind, pace, self.now_ns))
+        self.author.sync.publish(self.author.replica.write(list(cells), kind, pace, self.now_ns))
 
     def report(self, *vehicles: tuple[str, int], target: str = "t", seq: int = 1) -> None:
         count = len(vehicles)

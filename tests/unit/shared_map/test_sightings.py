@@ -9,7 +9,7 @@ from support.simulated_swarm import SMALL, Laws
 
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.keeper.store import KeeperStore
-from shared_map.replication.filter import Reading
+from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings, pose_of
 from swarm.bus.bus import Heard
 from swarm.grid import GridSpec
@@ -47,7 +47,7 @@ def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighte
     told = list({(each.target, each.author, each.stamp_ns, each.seq): each for each in told}.values())
     again = [*told, *told]
     chance.shuffle(again)  # type: ignore[attr-defined]
-    one, other = Sightings(Reading(GRID)), Sightings(Reading(GRID))
+    one, other = Sightings(MarkFilter(GRID)), Sightings(MarkFilter(GRID))
     for each in told:
         one.hear(each)
     for each in again:
@@ -59,7 +59,7 @@ def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighte
 
 
 def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
-    seen = Sightings(Reading(GRID))
+    seen = Sightings(MarkFilter(GRID))
     seen.hear(sighted(5, author="red.a0.1", cell=1, until_ns=10))
     seen.hear(sighted(4, author="blue.a1.1", cell=2, until_ns=20))
     assert seen.best(9)["t"].cell == 1
@@ -68,7 +68,7 @@ def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
 
 
 def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
-    seen = Sightings(Reading(GRID, frozenset({"red"})))
+    seen = Sightings(MarkFilter(GRID, frozenset({"red"})))
     assert not seen.hear(sighted(5, author="blue.a1.1"))
     assert seen.hear(sighted(4, author="red.a0.1"))
     assert pose_of(seen.best(9)["t"]).seq == 4

@@ -1,6 +1,7 @@
-"""What is true of the ground and missing from the map: closed roads, rubble, a flooded valley, painted zones.
+"""The true ground: the ground of the map, changed by what the map does not know.
 
-Vehicles find it out; planners never see it. Seeded, and never so much that the terrain falls apart.
+These changes are closed roads, rubble, a flooded valley and painted zones. Sensors find them; planners never see
+them. They follow from the seed, and leave most of the passable ground connected.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 RUBBLE_FACTOR = np.float32(3.0)
 CONNECTED_SHARE = 0.85
-"""At least this share of what was passable and connected stays so."""
+"""At least this share of the largest passable part stays passable and connected, besides what is flooded."""
 
 
-def hide(
+def true_ground(
     hidden: HiddenConfig,
     cost: CostConfig,
     grid: GridSpec,
@@ -29,9 +30,9 @@ def hide(
     classes: Bytes,
     seed: int,
 ) -> Floats:
-    """True pace of the ground, float32 (rows, cols): that of the map, changed. The map's array is left alone.
+    """True pace in s/m, float32 (rows, cols), without inflation. A new array.
 
-    ground       float32  (rows, cols)  s/m; what the map says, before inflation; inf is lethal
+    ground       float32  (rows, cols)  s/m; the map's ground, without inflation; inf is lethal
     elevation_m  float32  (rows, cols)  NaN is a void
     classes      uint8    (rows, cols)  TerrainClass
     """
@@ -64,7 +65,8 @@ def _largest(passable: Bools) -> int:
 
 
 def _close_a_road(truth: Floats, road: Bools, rng: np.random.Generator, least: float) -> None:
-    """A barrier: a stretch of road and the ground beside it is lethal, so that it has to be driven around."""
+    """Make a stretch of road and the cells beside it lethal. Up to 20 places are tried; none fits if each would cut
+    the largest passable part to fewer than `least` cells."""
     roads = np.flatnonzero((road & np.isfinite(truth)).reshape(-1))
     if len(roads) == 0:
         return
@@ -81,7 +83,7 @@ def _close_a_road(truth: Floats, road: Bools, rng: np.random.Generator, least: f
 
 
 def _rubble(truth: Floats, count: int, rng: np.random.Generator) -> None:
-    """Ragged fields of three times the pace, 4 to 10 cells in radius."""
+    """Multiply the pace by three in ragged fields of 4 to 10 cells in radius."""
     if count == 0:
         return
     rows, cols = truth.shape
@@ -104,7 +106,8 @@ def _rubble(truth: Floats, count: int, rng: np.random.Generator) -> None:
 
 
 def _flood(truth: Floats, height: Floats, share: float, rng: np.random.Generator) -> list[int]:
-    """Cells of one valley as water reaches them from a seeded low place: always the lowest cell at its shore."""
+    """Flat indices of the cells of one valley, in the order in which rising water reaches them from a seeded low
+    cell."""
     passable = np.isfinite(truth)
     wanted = int(share * passable.sum())
     if wanted == 0:

@@ -8,7 +8,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.keeper.service import THROTTLED
 from shared_map.keeper.store import KeeperStore
-from shared_map.replication.quota import Quota
+from shared_map.replication.limits import Quota
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario
@@ -85,7 +85,7 @@ def test_two_that_wait_take_turns() -> None:
 def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up() -> None:
     swarm = SwarmModel(scenario=Scenario(map=MapConfig(author_marks_per_s=20)))
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
-    keeper._feed._quota = Quota(20)
+    keeper._sync._quota = Quota(20)
     notes: list[str] = []
 
     def hear(event: Event) -> None:
@@ -97,18 +97,20 @@ def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up()
     swarm.run(1)
     cells = np.arange(40 * 70)
     for kind in (MarkKind.LETHAL, MarkKind.CLEAR):
-        loud.feed.publish(loud.replica.write(cells, kind, 0.0, swarm.now_ns))
+        loud.sync.publish(loud.replica.write(cells, kind, 0.0, swarm.now_ns))
         swarm.run(0.2)
-    calm.feed.publish(calm.replica.write([5], MarkKind.LETHAL, 0.0, swarm.now_ns))
+    calm.sync.publish(calm.replica.write([5], MarkKind.LETHAL, 0.0, swarm.now_ns))
     swarm.run(1)
-    assert listener.feed.throttled == ["loud.1"]
-    assert "calm.1" in listener.replica.digest()
+    assert listener.sync.throttled == ["loud.1"]
+    assert "calm.1" in listener.replica.held.ledger.held()
     assert keeper.counters.gauges[THROTTLED + "loud.1"] == 1
     assert notes == ["author loud.1 marks more than its share: it is heard with delay"]
     swarm.run(400)
-    assert listener.feed.throttled == []
+    assert listener.sync.throttled == []
     assert THROTTLED + "loud.1" not in keeper.counters.gauges
-    assert listener.replica.fingerprint() == loud.replica.fingerprint() == keeper.replica.fingerprint()
+    assert (
+        listener.replica.held.fingerprint() == loud.replica.held.fingerprint() == keeper.replica.held.fingerprint()
+    )
 
 
 def test_status_names_who_is_throttled() -> None:
