@@ -15,6 +15,7 @@ from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window
+from swarm.liveness import Succession
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import (
@@ -95,7 +96,8 @@ class Planner:
         self._newest_mark_ns = newest_mark_ns
         self._push_ns = int(config.push_s * NS_PER_S)
         self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
-        # The newest pose heard; the tick takes it in.
+        # The newest pose heard, and which poses of the tracker count; the tick takes it in.
+        self._succession = Succession()
         self._pose: TargetPose | None = None
         # (target cell, map version) that the tree was last told.
         self._told: tuple[int, int] | None = None
@@ -120,13 +122,14 @@ class Planner:
         for name in COUNTS:
             counters.count(name, 0)
 
-    def hear_pose(self, pose: TargetPose) -> None:
-        """Note where the target is, if the pose is newer than what is known. The next tick takes it in."""
-        known = self._pose
-        if pose.target != self.target:
-            return
-        if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
+        """Note where the target's tracker says it is, if that is news. The next tick takes it in."""
+        if pose.target == self.target and self._succession.accepts(pose.target, pose.incarnation, pose.seq, now_ns):
             self._pose = pose
+
+    def set_pose(self, pose: TargetPose) -> None:
+        """Note where the target is, by the best sighting of it: sightings are ordered before they come here."""
+        self._pose = pose
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> None:
         """Note where an agent's vehicles are, and which of them chase this target."""

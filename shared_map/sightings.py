@@ -2,16 +2,37 @@
 
 Of each author's sightings of a target the newest counts, and of all authors' the newest that has not expired. So,
 as with marks, merging depends on neither order, grouping nor repetition.
+
+No author's clock is trusted further than the reader's own: what an author dates ahead counts as seen when it was
+heard, and no sighting outlives `LONGEST_NS` from then. So a vehicle with a fast clock outweighs nobody.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from shared_map.replication.filter import MarkFilter
+from swarm.clock import NS_PER_S
+from swarm.liveness import SUCCESSION_LEASE_NS
 from swarm.wire.messages.targets import Sighted, TargetPose
 
+LONGEST_NS = 120 * NS_PER_S
 _MOST = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A sighting by the reader's clock: when it was heard, the instant it counts as, and when it expires."""
+
+    sighted: Sighted
+    heard_ns: int
+    stamp_ns: int
+    until_ns: int
+
+    @property
+    def rank(self) -> tuple[int, float, str]:
+        return self.stamp_ns, -self.sighted.uncertainty_m, self.sighted.author
 
 
 class Sightings:
@@ -22,19 +43,26 @@ class Sightings:
 
     def __init__(self, filter: MarkFilter) -> None:
         self._filter = filter
-        self._newest: dict[tuple[str, str], Sighted] = {}
+        self._newest: dict[tuple[str, str], _Seen] = {}
 
-    def hear(self, sighted: Sighted) -> bool:
-        """Take in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit."""
+    def hear(self, sighted: Sighted, now_ns: int) -> bool:
+        """Take in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit.
+
+        An author's sighting with a lower number is news once none of it has been heard for the lease: see
+        `Succession`.
+        """
         key = (sighted.target, sighted.author)
         known = self._newest.get(key)
-        if known is not None and (sighted.stamp_ns, sighted.seq) <= (known.stamp_ns, known.seq):
-            return False
+        if known is not None and now_ns - known.heard_ns <= SUCCESSION_LEASE_NS:
+            before = known.sighted
+            if (sighted.stamp_ns, sighted.seq) <= (before.stamp_ns, before.seq):
+                return False
         if not self._filter.accepts_author(sighted.author, sighted.group):
             return False
         if known is None and len(self._newest) >= _MOST:
             return False
-        self._newest[key] = sighted
+        until_ns = min(sighted.until_ns, now_ns + LONGEST_NS)
+        self._newest[key] = _Seen(sighted, now_ns, min(sighted.stamp_ns, now_ns), until_ns)
         return True
 
     def expire(self, now_ns: int) -> None:
@@ -43,15 +71,11 @@ class Sightings:
 
     def best(self, now_ns: int) -> Mapping[str, Sighted]:
         """Target -> its newest sighting; of two with one stamp the surer, then that of the larger author id."""
-        best: dict[str, Sighted] = {}
+        best: dict[str, _Seen] = {}
         for (target, _), each in self._newest.items():
-            if each.until_ns > now_ns and (target not in best or _rank(each) > _rank(best[target])):
+            if each.until_ns > now_ns and (target not in best or each.rank > best[target].rank):
                 best[target] = each
-        return best
-
-
-def _rank(sighted: Sighted) -> tuple[int, float, str]:
-    return sighted.stamp_ns, -sighted.uncertainty_m, sighted.author
+        return {target: each.sighted for target, each in best.items()}
 
 
 def pose_of(sighted: Sighted) -> TargetPose:

@@ -66,3 +66,28 @@ class Leases:
         for key in late:
             del self._heard_ns[key]
         return late
+
+
+SUCCESSION_LEASE_NS = 1_000_000_000
+
+
+class Succession:
+    """Which of the numbered values that are heard under a key counts, whatever the clocks of its senders.
+
+    A value counts if its (life, seq) is higher than that of the last which counted, or if none has counted for the
+    lease. So a sender that restarts with an earlier clock is followed after the lease, and no single value with a
+    huge number outweighs those that follow it.
+    """
+
+    def __init__(self, lease_ns: int = SUCCESSION_LEASE_NS) -> None:
+        self._lease_ns = lease_ns
+        # Key -> (life, seq) of the last value that counted, and when it was heard.
+        self._last: dict[str, tuple[tuple[int, int], int]] = {}
+
+    def accepts(self, key: str, life: int, seq: int, now_ns: int) -> bool:
+        """Whether a value counts. If so it is the last one from now on."""
+        known = self._last.get(key)
+        if known is not None and (life, seq) <= known[0] and now_ns - known[1] <= self._lease_ns:
+            return False
+        self._last[key] = ((life, seq), now_ns)
+        return True

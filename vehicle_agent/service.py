@@ -149,7 +149,7 @@ class AgentService:
             case Heard(message=Fleet() as fleet):
                 self._presence.hear(fleet, now_ns)
             case Heard(topic=topic, message=TargetPose() as pose):
-                self._detector.set_truth(pose)
+                self._detector.set_truth(pose, now_ns)
                 if topic is POSE and pose.target not in self._untracked.targets:
                     agent.hear_pose(pose, now_ns)
             case Heard(message=Sighted() as sighted):
@@ -289,7 +289,7 @@ class AgentService:
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
         pose = self._untracked.hear(sighted, now_ns)
         if pose is not None:
-            self._agent.hear_pose(pose, now_ns)
+            self._agent.set_pose(pose, now_ns)
 
     # --- doing what was decided -----------------------------------------------------------------------------
 

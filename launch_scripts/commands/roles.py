@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -116,6 +115,7 @@ def _run(role: str, id: str, part: Part, tls: Tls, *, listen: str | None = None,
 
     from launch_scripts.launcher import options
     from launch_scripts.launcher.child import load_entry, log_to
+    from launch_scripts.launcher.lives import next_life
     from launch_scripts.launcher.progress import progress
     from launch_scripts.launcher.run_terrain import fetch_if_missing
     from launch_scripts.launcher.watcher import check_vacant
@@ -150,9 +150,9 @@ def _run(role: str, id: str, part: Part, tls: Tls, *, listen: str | None = None,
     if role != "router":
         with progress() as tell:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
-    now_ns = time.time_ns()
+    life = next_life(run_dir, role, id)
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
-    setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir)
+    setup = RoleSetup(scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir)
     load_entry(ENTRIES[role])(setup, None, **role_options)
 
 

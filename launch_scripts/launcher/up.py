@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from launch_scripts.launcher.child import log_to
+from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.launcher.options import check_ports, common_run_id, listening, make_run_dir, new_run_id
 from launch_scripts.launcher.progress import progress
@@ -188,7 +189,7 @@ class _Run:
             run_id=self._run_id,
             role=spec.role,
             id=spec.id,
-            incarnation=time.time_ns(),
+            incarnation=next_life(self._run_dir, spec.role, spec.id),
             started_ns=self._started_ns,
             run_dir=self._run_dir,
         )

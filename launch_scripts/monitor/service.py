@@ -133,7 +133,7 @@ class MonitorService:
                 self._targets_new = True
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
             case Sighted() as sighted:
-                self._sightings.hear(sighted)
+                self._sightings.hear(sighted, now_ns)
             case PlannerStatus():
                 self._windows_new = True
             case Followed() as followed:

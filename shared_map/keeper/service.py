@@ -90,7 +90,7 @@ class KeeperService:
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, Heard) and isinstance(event.message, Sighted):
-            self._sightings.hear(event.message)
+            self._sightings.hear(event.message, now_ns)
             return
         if isinstance(event, Heard) and isinstance(event.message, Digest):
             self._plan.heard(event.message.author, now_ns)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.marks import SEQ_STEP, MarkSet
@@ -96,6 +97,20 @@ def base_seq(seq: int) -> int:
 def next_seq(seq: int) -> int:
     """The number of an author's next set: above those of all that its last one can be compacted to."""
     return base_seq(seq) + SEQ_STEP
+
+
+MAX_AHEAD_NS = 24 * 3600 * NS_PER_S
+"""A statement stamped further ahead of the reader's clock than this is refused: nobody could overrule one that is
+stamped near the limit. As wide as clocks that are set for another zone."""
+_CLOCK_WAS_SET_NS = 1_735_689_600 * NS_PER_S
+"""2025: a clock before this was never set, as after a start without a network, and says nothing about stamps."""
+
+
+def is_ahead(of: MarkSet, now_ns: int) -> bool:
+    """Whether a set states something from further ahead than clocks may differ."""
+    if now_ns < _CLOCK_WAS_SET_NS or not of.kinds:
+        return False
+    return max(memoryview(of.stamps_ns).cast("q")) > now_ns + MAX_AHEAD_NS
 
 
 def is_tombstone(of: MarkSet) -> bool:

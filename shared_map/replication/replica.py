@@ -20,6 +20,7 @@ from shared_map.replication.marks import (
     HybridClock,
     Statements,
     dense,
+    is_ahead,
     is_tombstone,
     mark_set,
     next_expiry_ns,
@@ -161,14 +162,15 @@ class MapReplica:
         for each in received:
             first = each.tile not in held and each.kinds and not each.untils_ns
             ours = each.author == author and each.group == group and accepts_tile(each.tile)
-            (taken if first and ours and not off_grid(each) else rest).append(each)
+            sound = first and ours and not off_grid(each) and not is_ahead(each, self._now_ns)
+            (taken if sound else rest).append(each)
         if not taken or not self.held.put_all(author, taken):
             return [], received
         return taken, rest
 
     def _admits(self, received: MarkSet, held: MarkSet | None) -> bool:
         """Whether a set is part of this map, wanted and news; counts why not."""
-        if self.held.off_grid(received):
+        if self.held.off_grid(received) or is_ahead(received, self._now_ns):
             self.counts["sets_refused"] += 1
             return False
         if received.author != self.author:

@@ -158,7 +158,7 @@ class World:
 
     def pose(self, row: int, col: int, seq: int = 1, incarnation: int = 1) -> None:
         cell = GRID.cell(row, col)
-        self.planner.hear_pose(pose(cell, seq, incarnation))
+        self.planner.hear_pose(pose(cell, seq, incarnation), self.now_ns)
 
     def mark(self, *cells: int, stamp_ns: int | None = None) -> None:
         kinds = np.full(len(cells), MarkKind.LETHAL, np.uint8)
@@ -264,8 +264,24 @@ def test_the_newest_pose_wins_in_whatever_order_poses_arrive(order: list[tuple[i
     assert world.tree.target_cell == GRID.cell(2, 2)
 
 
+def test_a_tracker_whose_clock_was_put_back_is_followed_after_the_lease(ready: World) -> None:
+    ready.pose(10, 20, seq=500, incarnation=10**18)
+    for seq in range(1, 30):
+        ready.pose(12, seq, seq=seq, incarnation=10**18 - 3600 * NS_PER_S)
+        ready.tick()
+    assert ready.tree.target_cell == GRID.cell(12, 29)
+
+
+def test_no_single_pose_misleads_a_planner_for_longer_than_the_lease(ready: World) -> None:
+    ready.pose(1, 1, seq=(1 << 62) - 1, incarnation=(1 << 62) - 1)
+    for seq in range(2, 14):
+        ready.pose(10, 20, seq=seq)
+        ready.tick()
+    assert ready.tree.target_cell == GRID.cell(10, 20)
+
+
 def test_the_pose_of_another_target_is_not_ours(world: World) -> None:
-    world.planner.hear_pose(pose(5, target="t1"))
+    world.planner.hear_pose(pose(5, target="t1"), 0)
     assert world.tick() == []
     assert world.planner.status(0).target_cell is None
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.map_strategies import GRID, Composite, merge_one, replica_of, set_of
 
-from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.marks import MAX_AHEAD_NS, Statements, mark_set
 from shared_map.replication.replica import MapReplica, PublishSet
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
@@ -212,3 +212,24 @@ def test_saying_the_same_again_prolongs_a_lifetime() -> None:
     assert composite.kinds[5] == LETHAL
     replica.tick(NOW + 3 * NS_PER_S)
     assert composite.kinds[5] == CLEAR
+
+
+def test_a_mark_from_the_far_future_is_refused_and_every_other_can_be_overruled() -> None:
+    """A statement stamped just below the limit could not be taken back by anybody."""
+    now_ns = 1_800_000_000 * NS_PER_S
+    replica = MapReplica(GRID, author="a1.1")
+    replica.tick(now_ns)
+    for ahead_ns in ((1 << 62) - 1 - now_ns, MAX_AHEAD_NS + 1):
+        assert replica.merge([set_of("b1.1", 0, 1, {3: (MarkKind.LETHAL, 0.0, now_ns + ahead_ns)})]).sets == []
+    assert replica.counts["sets_refused"] == 2
+    late = set_of("b1.1", 0, 1, {3: (MarkKind.LETHAL, 0.0, now_ns + MAX_AHEAD_NS)})
+    assert replica.merge([late]).sets == [late]
+    replica.write([GRID.cell(0, 3)], MarkKind.PACE, 2.0, now_ns)
+    assert replica.winners(0).kinds[list(replica.winners(0).cells).index(3)] == MarkKind.PACE
+
+
+def test_a_replica_whose_clock_was_never_set_takes_in_what_others_say() -> None:
+    replica = MapReplica(GRID)
+    replica.tick(5 * NS_PER_S)
+    said = set_of("b1.1", 0, 1, {3: (MarkKind.LETHAL, 0.0, 1_800_000_000 * NS_PER_S)})
+    assert replica.merge([said]).sets == [said]

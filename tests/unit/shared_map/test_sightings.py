@@ -10,9 +10,11 @@ from support.simulated_swarm import SMALL, Laws
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.filter import MarkFilter
-from shared_map.sightings import Sightings, pose_of
+from shared_map.sightings import LONGEST_NS, Sightings, pose_of
 from swarm.bus.bus import Heard
+from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
+from swarm.liveness import SUCCESSION_LEASE_NS
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.topics import POSE, SIGHTED
 from vehicle_agent.driving.vehicle import Vehicle
@@ -49,9 +51,9 @@ def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighte
     chance.shuffle(again)  # type: ignore[attr-defined]
     one, other = Sightings(MarkFilter(GRID)), Sightings(MarkFilter(GRID))
     for each in told:
-        one.hear(each)
+        one.hear(each, 5)
     for each in again:
-        other.hear(each)
+        other.hear(each, 5)
     assert one.best(4) == other.best(4)
     for target, best in one.best(4).items():
         assert best.until_ns > 4
@@ -60,24 +62,42 @@ def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighte
 
 def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
     seen = Sightings(MarkFilter(GRID))
-    seen.hear(sighted(5, author="red.a0.1", cell=1, until_ns=10))
-    seen.hear(sighted(4, author="blue.a1.1", cell=2, until_ns=20))
+    seen.hear(sighted(5, author="red.a0.1", cell=1, until_ns=10), 5)
+    seen.hear(sighted(4, author="blue.a1.1", cell=2, until_ns=20), 5)
     assert seen.best(9)["t"].cell == 1
     assert seen.best(10)["t"].cell == 2
     assert seen.best(20) == {}
 
 
+def test_an_author_with_a_fast_clock_outweighs_nobody_and_its_sightings_expire_all_the_same() -> None:
+    seen, hour_ns = Sightings(MarkFilter(GRID)), 3600 * NS_PER_S
+    assert seen.hear(sighted(hour_ns, author="red.a0.1", cell=1, until_ns=2 * hour_ns), NS_PER_S)
+    assert seen.best(NS_PER_S)["t"].cell == 1
+    assert seen.hear(sighted(2 * NS_PER_S, author="red.a1.1", cell=2, until_ns=hour_ns), 2 * NS_PER_S)
+    assert seen.best(2 * NS_PER_S)["t"].cell == 2
+    seen.expire(NS_PER_S + LONGEST_NS)
+    assert seen.best(NS_PER_S + LONGEST_NS)["t"].cell == 2
+
+
+def test_an_author_whose_clock_is_put_back_is_heard_again_after_the_lease() -> None:
+    seen = Sightings(MarkFilter(GRID))
+    seen.hear(sighted(1 << 61, cell=1, until_ns=1 << 62), 0)
+    assert not seen.hear(sighted(5, seq=9, cell=2, until_ns=1 << 62), SUCCESSION_LEASE_NS)
+    assert seen.hear(sighted(5, seq=9, cell=2, until_ns=1 << 62), SUCCESSION_LEASE_NS + 1)
+    assert seen.best(SUCCESSION_LEASE_NS + 1)["t"].cell == 2
+
+
 def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
     seen = Sightings(MarkFilter(GRID, frozenset({"red"})))
-    assert not seen.hear(sighted(5, author="blue.a1.1"))
-    assert seen.hear(sighted(4, author="red.a0.1"))
+    assert not seen.hear(sighted(5, author="blue.a1.1"), 5)
+    assert seen.hear(sighted(4, author="red.a0.1"), 5)
     assert pose_of(seen.best(9)["t"]).seq == 4
 
 
 def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
     detector = TargetDetector(GRID, "red.a0.1", "red", range_m=100.0, lasts_s=2.0)
     x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
-    detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m))
+    detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m), 0)
     far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
     assert detector.look([far], 0) == []
     (told,) = detector.look([far, near], 0)

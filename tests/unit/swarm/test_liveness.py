@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.liveness import Leases, Peer, Roster
+from swarm.liveness import Leases, Peer, Roster, Succession
 
 
 def test_a_new_incarnation_may_appear_before_the_old_one_is_gone():
@@ -61,3 +61,29 @@ def test_a_lease_runs_out_once_and_a_word_renews_it():
     assert leases.expired(11) == ["b"]
     assert leases.expired(30) == ["a"]
     assert leases.expired(99) == []
+
+
+numbered = st.tuples(st.integers(0, 3), st.integers(0, 5))
+
+
+@given(st.lists(numbered, min_size=1), st.randoms(use_true_random=False))
+def test_within_the_lease_the_newest_value_counts_in_whatever_order_they_come(
+    values: list[tuple[int, int]], chance: random.Random
+) -> None:
+    succession, last = Succession(10), None
+    chance.shuffle(values)
+    for life, seq in values:
+        if succession.accepts("t", life, seq, 0):
+            last = (life, seq)
+    assert last == max(values)
+
+
+@given(st.lists(st.tuples(st.integers(0, (1 << 62) - 1), st.integers(0, (1 << 62) - 1)), max_size=20))
+def test_whatever_was_heard_before_a_sender_that_goes_on_is_followed_after_the_lease(
+    lies: list[tuple[int, int]],
+) -> None:
+    succession = Succession(10)
+    for life, seq in lies:
+        succession.accepts("t", life, seq, 0)
+    assert any(succession.accepts("t", 1, now, now) for now in range(12))
+    assert succession.accepts("t", 1, 12, 12)
