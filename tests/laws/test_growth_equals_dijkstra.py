@@ -14,7 +14,6 @@ from support import slow_twins as naive
 from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
 from support.planner_strategies import RULES, random_pace
 
-from planner_service.kernels.layout import Labels
 from planner_service.kernels.radix_heap import grow_by_radix_heap
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import MAX_RATIO, grow_tree
@@ -61,7 +60,7 @@ def test_ring_and_radix_heap_give_the_same_costs_to_the_last_bit(rules: dict) ->
         longest = ground.highest_cell_cost * ground.diagonal
         assert longest <= MAX_RATIO * ground.lowest_cell_cost  # so that it is the ring that grows it
         grow_tree(ground.padded, ground.lowest_cell_cost, ground.highest_cell_cost, root, by_ring, None)
-        grow_by_radix_heap(ground.padded, Labels(by_heap, parent, root), np.float32(ground.lowest_cell_cost))
+        grow_by_radix_heap(ground.padded, (by_heap, parent, root), ground.lowest_cell_cost)
         np.testing.assert_array_equal(by_heap, by_ring)
 
 
