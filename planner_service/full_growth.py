@@ -25,7 +25,7 @@ class GrownTree:
     cell_cost    float32, s, the cell costs of the snapshot
     reach        s; no cost exceeds it. Negative where nothing was grown, as no tree can lead there
     offered      parents of the tree that was served when the snapshot was taken; None where none led there
-    corridors     the corridors of the snapshot; None unless they were wanted
+    corridors    the corridors of the snapshot; None unless they were wanted
     """
 
     target_cell: int

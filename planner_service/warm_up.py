@@ -31,21 +31,21 @@ def warm_up() -> None:
         for edge, neighbours in RULES
     ]
     for config in configs:
-        for dearest in (0.2, 1e4):  # beyond a ratio, another flood is taken
+        for dearest in (0.2, 1e4):  # beyond a ratio, another queue is taken
             pace = np.full((_SIDE, _SIDE), 0.1, np.float32)
             pace[0, 0] = dearest
             _live(TargetTree(grid, config), pace)
     level = climb_of(grid, np.zeros_like(pace), CostConfig(directional=True))
     _live(TargetTree(grid, configs[0], level), pace)
-    ground = CostGrid(grid, configs[0])
-    ground.load(pace)
-    tree = CostToGoTree(ground)
+    cost_grid = CostGrid(grid, configs[0])
+    cost_grid.load(pace)
+    tree = CostToGoTree(cost_grid)
     tree.grow(_SIDE)
     tree.relabel()
     window = grid.around(_SIDE + 1, 4)
     tree.move(_SIDE + 1, window)
-    tree.grow_corridors(window, find_corridors(ground))
-    tree.tighten(np.array([ground.pad(0)]))
+    tree.grow_corridors(window, find_corridors(cost_grid))
+    tree.tighten(np.array([cost_grid.pad(0)]))
 
 
 def _live(tree: TargetTree, pace: NDArray[np.float32]) -> None:

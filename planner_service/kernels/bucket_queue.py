@@ -86,12 +86,11 @@ def _choose(cell_cost, cost, length, inverse, least, cells, count, buckets):
 
 
 @njit
-def _put(queue, cells, count, buckets, ring, first):
-    """Put cells into the queue, each into its bucket modulo `ring`, of the circular queue that begins at bucket
-    `first`."""
+def _put(queue, cells, count, buckets, mask, first):
+    """Put cells into the queue, each into its bucket, modulo the length of the circular queue that begins at
+    bucket `first`; `mask` is that length less one."""
     pool, link, spare, counts, _, tail, shift = queue
     low = (_ONE << shift) - _ONE
-    mask = ring - _ONE
     for i in range(count):
         b = (np.uint64(buckets[i]) & mask) + first
         t = tail[b]
@@ -224,27 +223,27 @@ def _offer_around(cell_cost, cost, s, corners, batch, n, touched):
 
 
 @njit
-def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, ring):
+def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, buckets):
     """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
-    width  of a bucket, s: below the lowest cell cost, so that nothing in a bucket leads back into it
-    ring   buckets of the circular queue, a power of two; ring * width exceeds the dearest step by two widths
+    width    of a bucket, s: below the lowest cell cost, so that nothing in a bucket leads back into it
+    buckets  of the circular queue, a power of two; buckets * width exceeds the dearest step by two widths
     Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
 
-    With octile steps a cell waits twice, under its straight exit key in the first `ring` buckets and under its
+    With octile steps a cell waits twice, under its straight exit key in the first `buckets` and under its
     diagonal one in as many behind them.
     """
     kinds = 2 if rule == RULE_OCTILE else 1
-    queue = _make_queue(kinds * ring, kinds * cell_cost.size)
+    queue = _make_queue(kinds * buckets, kinds * cell_cost.size)
     head, tail = queue[4], queue[5]
     # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
     touched = np.empty(cell_cost.size + 1, np.uint32)
     batch = np.empty(cell_cost.size + _AHEAD, np.uint32)
     s = np.uint64(stride)
-    ring = np.uint64(ring)
-    mask = ring - _ONE
-    second = ring if rule == RULE_OCTILE else _ZERO
-    inverse = _ONE32 / width
+    length = np.uint64(buckets)
+    mask = length - _ONE
+    second = length if rule == RULE_OCTILE else _ZERO
+    inverse = _ONE32 / np.float32(width)
 
     _open_costs(cell_cost, cost)
     cost[np.uint64(root)] = _ZERO32
@@ -257,11 +256,11 @@ def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, ring):
         waiting += count
         following = np.int32(current + 1)
         _choose(cell_cost, cost, _ONE32, inverse, following, touched, count, batch)
-        _put(queue, touched, count, batch, ring, _ZERO)
+        _put(queue, touched, count, batch, mask, _ZERO)
         if rule == RULE_OCTILE:
             waiting += count
             _choose(cell_cost, cost, SQRT2, inverse, following, touched, count, batch)
-            _put(queue, touched, count, batch, ring, ring)
+            _put(queue, touched, count, batch, mask, length)
         if waiting == _ZERO:
             _close_costs(cost)
             return current
@@ -279,7 +278,7 @@ def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, ring):
         else:
             count = _offer_straight(cell_cost, cost, s, batch, n, touched)
         if rule == RULE_OCTILE:
-            n = _take(queue, b + ring, batch)
+            n = _take(queue, b + length, batch)
             waiting -= n
             count = _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
 

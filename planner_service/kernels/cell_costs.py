@@ -24,6 +24,7 @@ _ONE = np.uint64(1)
 def pad_cell_costs(pace, resolution, extra, stride, cell_cost):
     """cell_cost := pace * resolution + extra, everywhere; resolution in m, extra in s. Returns how many cells have
     a pace that is NaN, zero or negative."""
+    resolution, extra = np.float32(resolution), np.float32(extra)
     bad = 0
     for row in range(pace.shape[0]):
         base = np.uint64((row + 1) * stride + 1)
@@ -44,6 +45,7 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
     lowest, highest finite new cell cost: inf, 0 if there is none).
     """
     row0, col0, row1, col1 = box
+    resolution, extra = np.float32(resolution), np.float32(extra)
     count = 0
     bad = 0
     lowest = INF
@@ -91,8 +93,10 @@ def cut_window(cell_cost, stride, box, part):
     highest = np.int32(0)
     bits = cell_cost.view(np.int32)
     taken = part.view(np.int32)
-    part[:width] = INF
-    part[part.size - width :] = INF
+    # By a loop: see `enlarged` in `layout`.
+    for i in range(np.uint64(width)):
+        part[i] = INF
+        part[np.uint64(part.size) - _ONE - i] = INF
     for row in range(row0, row1):
         a = np.uint64((row + 1) * stride + 1 + col0)
         b = np.uint64((row - row0 + 1) * width + 1)
@@ -117,6 +121,7 @@ def merge_window(part, box, offset, old_root, cost, stride):
     """
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
+    offset = np.float32(offset)
     for row in range(row0, row1):
         a = np.uint64((row + 1) * stride + 1 + col0)
         b = np.uint64((row - row0 + 1) * width + 1)

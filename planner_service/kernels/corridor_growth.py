@@ -94,10 +94,8 @@ def mark_levels(parent, stride, least, level):
 
 
 @njit
-def _tighten(grid, labels, stamp, now, offsets, v, trail):
+def _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail):
     """As `tighten`, for one padded cell. Returns (cells visited, the trail, which may have been enlarged)."""
-    cost, parent = labels.cost, labels.parent
-    cell_cost = grid.cell_cost
     many = 0
     while stamp[v] < now and parent[v] != NONE:
         if many == trail.size:
@@ -111,7 +109,7 @@ def _tighten(grid, labels, stamp, now, offsets, v, trail):
         v = trail[j]
         k = parent[v]
         u = v + offsets[k]
-        driven = cost[u] + (cell_cost[u] * SQRT2 if grid.rule == RULE_OCTILE and k & 1 else cell_cost[u])
+        driven = cost[u] + (cell_cost[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else cell_cost[u])
         cost[v] = min(cost[v], driven)
         stamp[v] = now
     return many, trail
@@ -126,12 +124,14 @@ def tighten(grid, labels, stamp, now, cells):
     that become so are stamped `now`. Returns cells visited. Raises ValueError where one is no padded cell.
     """
     check_cells(cells, stamp.size)
-    offsets = step_offsets(grid.stride)
+    cell_cost, stride, rule, _ = grid
+    cost, parent, root = labels
+    offsets = step_offsets(stride)
     trail = np.empty(1024, np.int64)
     visited = 0
-    stamp[labels.root] = now
+    stamp[root] = now
     for i in range(cells.size):
-        many, trail = _tighten(grid, labels, stamp, now, offsets, cells[i], trail)
+        many, trail = _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, cells[i], trail)
         visited += many
     return visited
 
@@ -182,7 +182,7 @@ def grow_corridors(grid, labels, level, stamp, now, box, inner):
             if k & 1 and not corners and shut:
                 continue
             if stamp[v] < now:
-                many, trail = _tighten(grid, labels, stamp, now, offsets, v, trail)
+                many, trail = _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail)
                 visited += many
             stamp[v] = now + 1
             if offer < cost[v]:
@@ -200,7 +200,7 @@ def _rim_heap(cost, stride, box):
     capacity = 4096 + 4 * (row1 - row0 + col1 - col0)
     keys = np.empty(capacity, np.float32)
     items = np.empty(capacity, np.int64)
-    size = 0
+    size = np.int64(0)  # a literal would have `_heap_push` compiled twice
     for row in range(row0, row1):
         across = 1 if row == row0 or row == row1 - 1 else max(1, col1 - col0 - 1)
         for col in range(col0, col1, across):

@@ -15,8 +15,6 @@ Arrays, beside those of `layout`:
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,15 +25,14 @@ _NOBODY = np.int32(-1)
 _OUT = np.int32(-2)
 
 
-class Climbs(NamedTuple):
-    """What steps cost by their difference in height."""
+Climbs = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""What steps cost by their difference in height: (height, factors, scale).
 
-    height: NDArray[np.float32]
-    """(size,) m, padded; NaN is a void, and a step from or to it is level."""
-    factors: NDArray[np.float32]
-    """(2 * n + 1,) what a step of each rise costs, relative to the cheapest; its least value is 1."""
-    scale: NDArray[np.float32]
-    """(2,) of straight and diagonal steps, entries of `factors` per metre of rise, counted from the middle."""
+height   float32  (size,)       m, padded; NaN is a void, and a step from or to it is level
+factors  float32  (2 * n + 1,)  what a step of each rise costs, relative to the cheapest; its least value is 1
+scale    float32  (2,)          of straight and diagonal steps, entries of `factors` per metre of rise, counted from
+                                the middle
+"""
 
 
 @njit
@@ -47,21 +44,22 @@ def grow_directed(grid, labels, climbs, buckets):
              power of two, the circular queue; count * width exceeds the dearest step by two widths
 
     Costs end as a fixed point of float32 arithmetic: each is its parent's plus the step, rounded, and the least of
-    what its neighbours offer. So no ring of parents can be: its cells would all have one cost, and each would have
+    what its neighbours offer. So no cycle of parents can be: its cells would all have one cost, and each would have
     got it, for the last time, after its parent did.
     """
     cell_cost, stride, rule, corners = grid
     cost, parent, root = labels
     height, factors, scale = climbs
+    width, count = buckets
     offsets = step_offsets(stride)
     links = np.empty((cell_cost.size, 2), np.int32)
     for i in range(cell_cost.size):
         cost[i] = INF
         parent[i] = NONE
         links[i, 0] = _OUT
-    first = np.full(buckets.count, _NOBODY, np.int32)
-    mask = buckets.count - 1
-    inverse = 1.0 / np.float64(buckets.width)
+    first = np.full(count, _NOBODY, np.int32)
+    mask = count - 1
+    inverse = 1.0 / np.float64(width)
     half = np.float32(factors.size // 2)
     every = 2 if rule == RULE_FOUR else 1
     cost[root] = np.float32(0.0)

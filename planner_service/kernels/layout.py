@@ -17,8 +17,6 @@ reversed steps: a cell u offers each neighbour its *exit key*, cost[u] + cell_co
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,33 +42,20 @@ TOO_FINE = -1
 """Returned by a growth whose keys grew so large, in lowest cell costs, that float32 could not tell them apart."""
 
 
-class PaddedGrid(NamedTuple):
-    """What a search runs on. From Python it takes two microseconds more to pass one than its four parts: growth and
-    parents of a small window are called with the parts."""
+PaddedGrid = tuple[NDArray[np.float32], int, int, bool]
+"""What a search runs on: (cell_cost, stride, rule, corners).
 
-    cell_cost: NDArray[np.float32]
-    stride: int
-    rule: int
-    """RULE_FOUR, RULE_PAPER or RULE_OCTILE."""
-    corners: bool
-    """Whether a diagonal step may pass a lethal cell."""
+rule     RULE_FOUR, RULE_PAPER or RULE_OCTILE
+corners  whether a diagonal step may pass a lethal cell
+A plain tuple, as all that kernels are handed from Python: numba takes two microseconds to read a named one, and as
+long to read a NumPy scalar.
+"""
 
+Labels = tuple[NDArray[np.float32], NDArray[np.uint8], int]
+"""What a search writes: (cost, parent, root), a tree's labels and the padded cell where it leads."""
 
-class Labels(NamedTuple):
-    """What a search writes: a tree's labels, and the padded cell where it leads."""
-
-    cost: NDArray[np.float32]
-    parent: NDArray[np.uint8]
-    root: int
-
-
-class Buckets(NamedTuple):
-    """Size of a bucket queue."""
-
-    width: float | np.float32
-    """s; keys less than this apart share a bucket."""
-    count: int
-    """How many buckets there are."""
+Buckets = tuple[float, int]
+"""Size of a bucket queue: (width, count). Keys less than `width` (s, rounded to float32) apart share a bucket."""
 
 
 @njit

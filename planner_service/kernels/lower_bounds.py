@@ -13,8 +13,6 @@ Arrays, beside those of `layout`:
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,18 +23,16 @@ _ROUNDING = 2.0**-23
 """Relative error of one float32 step, doubled for the sum over a route's steps."""
 
 
-class WindowBound(NamedTuple):
-    """What a window around the root costs on its own: a lower bound on every way that stays inside."""
+WindowBound = tuple[NDArray[np.float32], tuple[int, int, int, int], NDArray[np.int64], NDArray[np.float64]]
+"""What a window around the root costs on its own, a lower bound on every way that stays inside: (part, box, rim,
+rim_cost).
 
-    cost: NDArray[np.float32]
-    """(cells,) s, of the window as a padded grid of its own; exact inside it."""
-    box: tuple[int, int, int, int]
-    """(row0, col0, row1, col1) of the window."""
-    rim: NDArray[np.int64]
-    """Padded cells of the window, in the whole grid, from which a step leads out of it. Empty if there is no
-    window."""
-    rim_cost: NDArray[np.float64]
-    """s; the window's own cost of each cell of the rim."""
+part      float32  (cells,)  s; cost of the window's cells as a padded grid of its own; exact inside it
+box       (row0, col0, row1, col1) of the window
+rim       int64    (m,)      padded cells of the window, in the whole grid, from which a step leads out of it; empty
+                             if there is no window
+rim_cost  float64  (m,)      s; the window's own cost of each cell of the rim
+"""
 
 
 @njit

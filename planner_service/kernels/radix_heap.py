@@ -57,6 +57,7 @@ def grow_by_radix_heap(grid, labels, width):
     """
     cell_cost, stride, rule, corners = grid
     cost, parent, root = labels
+    width = np.float32(width)
     offsets = step_offsets(stride)
     every = 2 if rule == RULE_FOUR else 1
     kinds = 2 if rule == RULE_OCTILE else 1

@@ -33,34 +33,52 @@ _FINE = np.uint64(44)
 
 
 @njit
-def _no_rows(grid):
-    """`rows` of nothing."""
-    count = grid.cell_cost.size // grid.stride
-    return np.full(count, grid.cell_cost.size, np.int64), np.full(count, -1, np.int64)
+def _no_rows(size, stride):
+    """`rows` of nothing, in arrays of `size` padded cells."""
+    count = size // stride
+    first, last = np.empty(count, np.int64), np.empty(count, np.int64)
+    for row in range(count):
+        first[row] = size
+        last[row] = -1
+    return first, last
 
 
 @njit
 def _note(first, last, stride, cells, count):
     """Something has changed about the first `count` of these padded cells."""
-    # cell // stride, by a multiplication: exact while the grid's size * stride is below 2**44.
-    per_row = np.uint64((1 << 44) // stride + 1)
     for i in range(count):
-        v = np.int64(cells[i])
-        row = np.int64(np.uint64(v) * per_row >> _FINE)
-        first[row] = min(first[row], v)
-        last[row] = max(last[row], v)
+        row = cells[i] // stride
+        first[row] = min(first[row], cells[i])
+        last[row] = max(last[row], cells[i])
 
 
 @njit
-def _note_cheaper(grid, rows, changed, before):
-    """Note the cells that got cheaper. Returns whether there are any."""
-    first, last = rows
+def _any_cheaper(cell_cost, changed, before):
     found = False
     for i in range(changed.size):
-        if grid.cell_cost[changed[i]] < before[i]:
-            _note(first, last, grid.stride, changed[i : i + 1], 1)
-            found = True
+        found |= cell_cost[changed[i]] < before[i]
     return found
+
+
+@njit
+def _cheaper_rows(cell_cost, stride, changed, before):
+    """`rows` of the cells that got cheaper."""
+    first, last = _no_rows(cell_cost.size, stride)
+    for i in range(changed.size):
+        if cell_cost[changed[i]] < before[i]:
+            _note(first, last, stride, changed[i : i + 1], np.int64(1))
+    return first, last
+
+
+@njit
+def _near_rows(first, last):
+    """The inner rows in which something has changed, the rows beside these, and all between: begin <= row < end."""
+    begin, end = 0, first.size
+    while begin < end and last[begin] < first[begin]:
+        begin += 1
+    while end > begin and last[end - 1] < first[end - 1]:
+        end -= 1
+    return max(begin - 1, 1), min(end + 1, first.size - 1)
 
 
 @njit
@@ -77,14 +95,11 @@ def _span(first, last, stride, row):
 
 
 @njit
-def _best_offers(grid, cost, begin, end, best):
+def _best_offers(cell_cost, cost, s, begin, end, diagonal, corners, best):
     """best[0 : end - begin] := the smallest exit key among the neighbours of each cell of a part of a row.
 
-    Free of branches, so that it vectorises; the length of a diagonal is inf where there is none.
+    Free of branches, so that it vectorises; `diagonal`, the length of such a step, is inf where there is none.
     """
-    cell_cost, stride, rule, corners = grid
-    s = np.uint64(stride)
-    diagonal = diagonal_length(rule)
     for i in range(begin, end):
         north = cell_cost[i - s]
         east = cell_cost[i + _ONE]
@@ -108,18 +123,20 @@ def _best_offers(grid, cost, begin, end, best):
 def _sweep(grid, cost, rows, floor, lowered, count):
     """Lower the cells of `rows`, and those next to them, to what they are offered, where they cost `floor` (s) or
     more and are offered less. Returns lowered, to which it appends them, and how many there are."""
-    stride = grid.stride
+    cell_cost, stride, rule, corners = grid
     first, last = rows
     best = np.empty(stride, np.float32)
-    for row in range(1, first.size - 1):
+    diagonal = diagonal_length(rule)
+    from_row, to_row = _near_rows(first, last)
+    for row in range(from_row, to_row):
         begin, end = _span(first, last, stride, row)
         if end <= begin:
             continue
-        _best_offers(grid, cost, np.uint64(begin), np.uint64(end), best)
+        _best_offers(cell_cost, cost, np.uint64(stride), np.uint64(begin), np.uint64(end), diagonal, corners, best)
         if count + stride > lowered.size:
             lowered = enlarged(lowered, count, 2 * lowered.size + stride)
         for i in range(begin, end):
-            if best[i - begin] < cost[i] and cost[i] >= floor and grid.cell_cost[i] < INF:
+            if best[i - begin] < cost[i] and cost[i] >= floor and cell_cost[i] < INF:
                 cost[i] = best[i - begin]
                 lowered[count] = i
                 count += 1
@@ -161,9 +178,10 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit):
     first, last = rows
     across = np.array((-stride, 1, stride, -1)).astype(np.uint64)
     aslant = np.array((1 - stride, stride + 1, stride - 1, -stride - 1)).astype(np.uint64)
-    per_row = np.uint64((1 << 44) // stride + 1)  # as in `_note`
-    inverse = np.float32(1.0) / buckets.width
-    overflow = buckets.count
+    # cell // stride, by a multiplication: exact while the grid's size * stride is below 2**44.
+    per_row = np.uint64((1 << 44) // stride + 1)
+    width, overflow = buckets
+    inverse = np.float32(1.0) / np.float32(width)
     top = np.float32(overflow)
     heads = np.full(overflow + 1, _NOBODY, np.int32)
     capacity = max(1024, 2 * count)
@@ -258,23 +276,23 @@ def lower_costs(grid, cost, changed, before, buckets, limit):
     Needs no parents, and no root but a cell that costs least. Returns cells served, or -1 beyond `limit`; then
     `cost` is of no use any more.
     """
-    rows = _no_rows(grid)
-    _note_cheaper(grid, rows, changed, before)
-    lowered, count = _sweep(grid, cost, rows, np.float32(-INF), np.empty(1024, np.uint32), 0)
+    cell_cost, stride, _, _ = grid
+    rows = _cheaper_rows(cell_cost, stride, changed, before)
+    lowered, count = _sweep(grid, cost, rows, np.float32(-INF), np.empty(1024, np.uint32), np.int64(0))
     served, _ = _spread(grid, cost, buckets, lowered, count, rows, limit)
     return served
 
 
 @njit
-def _detach(grid, labels, changed, before, limit):
+def _detach(grid, cost, parent, changed, before, limit):
     """Take cost and parent from the cells whose way leads over a cell that got dearer.
 
     Returns them (int64) and how many; more than `limit` if that is so, and then not all.
     """
-    cell_cost, parent = grid.cell_cost, labels.parent
-    offsets = step_offsets(grid.stride)
+    cell_cost, stride, _, corners = grid
+    offsets = step_offsets(stride)
     detached = np.empty(64 + 16 * changed.size, np.int64)
-    count = 0
+    count = np.int64(0)  # a literal would have `_detach_behind` compiled twice
     for i in range(changed.size):
         x = changed[i]
         if not cell_cost[x] > before[i]:
@@ -290,19 +308,18 @@ def _detach(grid, labels, changed, before, limit):
             if way == NONE:
                 continue
             squeezed = False
-            if lethal and not grid.corners and way & 1:
+            if lethal and not corners and way & 1:
                 squeezed = v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x
             if squeezed or way == (k + 4) & 7:
                 parent[v] = NONE
                 detached[count] = v
                 count += 1
-    return _detach_behind(labels, offsets, detached, count, limit)
+    return _detach_behind(cost, parent, offsets, detached, count, limit)
 
 
 @njit
-def _detach_behind(labels, offsets, detached, count, limit):
+def _detach_behind(cost, parent, offsets, detached, count, limit):
     """Detach all whose way leads over the `count` cells that are detached already."""
-    cost, parent, _ = labels
     capacity = detached.size
     done = 0
     while done < count and count <= limit:
@@ -331,30 +348,31 @@ def repair(grid, labels, changed, before, buckets, most):
     An exact tree is exact afterwards, equal to one grown from scratch. Returns (cells visited, the largest new
     cost, s); -1 cells where that is more than `most`: then the tree is of no use any more and must be grown.
     """
-    cheaper = _no_rows(grid)
-    any_cheaper = _note_cheaper(grid, cheaper, changed, before)
-    most_detached = most[1] if any_cheaper else most[0]
-    detached, many = _detach(grid, labels, changed, before, most_detached)
-    if many > most_detached:
-        return -1, INF
-    rows = _no_rows(grid)
-    first, last = rows
-    lowered = np.empty(1024, np.uint32)
-    count = 0
-    if many:
-        _note(first, last, grid.stride, detached, many)
-        lowered, count = _sweep(grid, labels.cost, rows, INF, lowered, count)
-    if any_cheaper:
-        lowered, count = _sweep(grid, labels.cost, cheaper, np.float32(-INF), lowered, count)
-    served, highest = _spread(grid, labels.cost, buckets, lowered, count, rows, 2 * many + most[2])
-    if served < 0:
-        return -1, INF
     cell_cost, stride, rule, corners = grid
     cost, parent, root = labels
+    any_cheaper = _any_cheaper(cell_cost, changed, before)
+    most_detached = most[1] if any_cheaper else most[0]
+    detached, many = _detach(grid, cost, parent, changed, before, most_detached)
+    if many > most_detached:
+        return -1, INF
+    rows = _no_rows(cell_cost.size, stride)
+    first, last = rows
+    lowered = np.empty(1024, np.uint32)
+    count = np.int64(0)  # a literal would have `_sweep` compiled twice
+    if many:
+        _note(first, last, stride, detached, many)
+        lowered, count = _sweep(grid, cost, rows, INF, lowered, count)
+    if any_cheaper:
+        cheaper = _cheaper_rows(cell_cost, stride, changed, before)
+        lowered, count = _sweep(grid, cost, cheaper, np.float32(-INF), lowered, count)
+    served, highest = _spread(grid, cost, buckets, lowered, count, rows, 2 * many + most[2])
+    if served < 0:
+        return -1, INF
     # A cell beside one that changed may have a better neighbour now.
-    _note(first, last, grid.stride, changed, changed.size)
-    for row in range(1, first.size - 1):
-        begin, end = _span(first, last, grid.stride, row)
+    _note(first, last, stride, changed, changed.size)
+    from_row, to_row = _near_rows(first, last)
+    for row in range(from_row, to_row):
+        begin, end = _span(first, last, stride, row)
         if begin < end:
             point_row_to_parents(cell_cost, cost, stride, rule, corners, begin, end, parent)
     parent[root] = NONE

@@ -136,7 +136,7 @@ def walk_routes(grid, parent, root, starts, max_steps, limit):
         if route[j] < until[j]:
             cells[j] = starts[route[j]]
     while True:
-        steps = 0
+        steps = np.int64(0)  # a literal would have `_walk_on` compiled twice
         for j in range(_LANES):
             if route[j] < until[j]:
                 left = min(_STRETCH, most - (fill[j] - begun[j]))
@@ -242,7 +242,9 @@ def price_routes(cost, offset, root, metres, walks, status, prices):
     for i in range(status.size):
         if status[i] != OK:
             prices[0, i] = np.inf
-            prices[1:, i] = 0.0
+            prices[1, i] = 0.0
+            prices[2, i] = 0.0
+            prices[3, i] = 0.0
             continue
         if ends[i] < 0:
             return False

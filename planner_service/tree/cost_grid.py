@@ -95,7 +95,7 @@ class CostGrid:
         """Cells of a padded array."""
         self.diagonal = SQRT2_EXACT if self.rule == RULE_OCTILE else 1.0
         """Length of a diagonal step in straight ones."""
-        self._metres = np.float32(grid.resolution_m)
+        self._metres = grid.resolution_m
         self.length_weight_s = config.length_weight * grid.resolution_m
         """s; what a cell's length costs beside the time. It is part of every cell cost."""
         self.cell_cost: Floats = np.full(self.size, np.inf, np.float32)
@@ -106,7 +106,7 @@ class CostGrid:
         inf if all is lethal."""
         self.highest_cell_cost = 0.0
         """s; no finite cell cost is more. `load` sets it, `apply` only raises it; 0 if all is lethal."""
-        self.padded = PaddedGrid(self.cell_cost, self.stride, self.rule, self.corners)
+        self.padded: PaddedGrid = (self.cell_cost, self.stride, self.rule, self.corners)
         """The same for kernels."""
 
     @property
@@ -114,7 +114,7 @@ class CostGrid:
         """Of a repair: as wide as the lowest cell cost, and enough to hold all that costs at most a step more."""
         longest = self.highest_cell_cost * self.diagonal
         count = math.ceil(longest / self.lowest_cell_cost) + 2
-        return Buckets(np.float32(self.lowest_cell_cost), min(max(count, _FEWEST), _MOST))
+        return self.lowest_cell_cost, min(max(count, _FEWEST), _MOST)
 
     def check_root(self, cell: int) -> None:
         """Raises OutsideGridError unless the cell is one of the grid, ValueError where it is lethal: no tree leads
@@ -140,8 +140,7 @@ class CostGrid:
     def load(self, pace: Floats) -> None:
         """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative."""
         check_pace(self.grid, pace)
-        extra = np.float32(self.length_weight_s)
-        bad = kernels.pad_cell_costs(pace, self._metres, extra, self.stride, self.cell_cost)
+        bad = kernels.pad_cell_costs(pace, self._metres, self.length_weight_s, self.stride, self.cell_cost)
         if bad:
             raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
         lowest, highest = kernels.cell_cost_range(self.cell_cost)
@@ -159,7 +158,7 @@ class CostGrid:
             count, bad, lowest, highest = kernels.changed_cells(
                 pace,
                 self._metres,
-                np.float32(self.length_weight_s),
+                self.length_weight_s,
                 box,
                 self.stride,
                 self.cell_cost,
@@ -230,7 +229,7 @@ class CostGrid:
         """
         if not 0 <= root < self.size:
             raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
-        padded = self.padded if cell_cost is self.cell_cost else self.padded._replace(cell_cost=cell_cost)
+        padded = (cell_cost, self.stride, self.rule, self.corners)
         return Walks(*walk_routes(padded, parent, root, starts, most, self.grid.cells))
 
     def passable(self, cell: int) -> bool:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import corridor_growth, route_walk
 from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
-from planner_service.kernels.layout import NONE, Labels, PaddedGrid
+from planner_service.kernels.layout import NONE, Labels
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
@@ -28,7 +28,7 @@ from shared_map.arrays import Floats
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
 
-NO_WINDOW = WindowBound(np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
+NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
 
 
 class CostToGoTree:
@@ -92,7 +92,7 @@ class CostToGoTree:
         """For kernels. Raises ValueError where there is no tree yet."""
         if self.root < 0:
             raise ValueError("the tree has no root: grow it first")
-        return Labels(self.cost, self.parent, self.cost_grid.pad(self.root))
+        return self.cost, self.parent, self.cost_grid.pad(self.root)
 
     def grow_corridors(self, window: Window, corridors: CorridorGraph) -> int:
         """After a window around the root was grown: renew what lies beyond, on the cells of corridors only, from
@@ -125,13 +125,12 @@ class CostToGoTree:
         part = np.empty((row1 - row0 + 2) * width, np.float32)
         lowest, highest = cut_window(grid.cell_cost, grid.stride, box, part)
         cost = np.empty_like(part)
-        padded = PaddedGrid(part, width, grid.rule, grid.corners)
-        grow_tree(padded, float(lowest), float(highest), start, cost, None)
+        grow_tree((part, width, grid.rule, grid.corners), float(lowest), float(highest), start, cost, None)
         way = float(cost[old])
         if not way < math.inf:
             return 0
         self.offset += way
-        merge_window(cost, box, np.float32(self.offset), grid.pad(self.root), self.cost, grid.stride)
+        merge_window(cost, box, self.offset, grid.pad(self.root), self.cost, grid.stride)
         rows, cols = grid.grid.rows, grid.grid.cols
         # A neighbour of a cell that got cheaper may lead there now.
         around = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
@@ -145,7 +144,7 @@ class CostToGoTree:
         rim = np.empty(2 * (row1 - row0 + col1 - col0), np.int64)
         rim_cost = np.empty(rim.size, np.float64)
         many = find_rim(cost, box, rows, grid.stride, rim, rim_cost)
-        self.window_bound = WindowBound(cost, box, rim[:many], rim_cost[:many])
+        self.window_bound = (cost, box, rim[:many], rim_cost[:many])
         return window.cells
 
     def _box(self, window: Window) -> tuple[int, int, int, int]:

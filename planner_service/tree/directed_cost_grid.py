@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.directed_growth import Climbs, grow_directed
-from planner_service.kernels.layout import Buckets, Labels, step_offsets
+from planner_service.kernels.layout import step_offsets
 from planner_service.tree.cost_grid import CostGrid, Walks
 from shared_map.arrays import Floats
 from shared_map.terrain.climb import Climb
@@ -33,18 +33,18 @@ class DirectedCostGrid(CostGrid):
         super().__init__(grid, config)
         self._climb = climb
         self._lowest = climb.lowest
-        self._metres = np.float32(grid.resolution_m * self._lowest)
+        self._metres = grid.resolution_m * self._lowest
         factors = climb.factors / np.float32(self._lowest)
         self._highest = float(factors.max())
         height = np.zeros((grid.rows + 2, self.stride), np.float32)
         height[1:-1, 1:-1] = climb.elevation_m
-        self._climbs = Climbs(height.reshape(-1), factors, np.array(climb.per_metre, np.float32))
+        self._climbs: Climbs = (height.reshape(-1), factors, np.array(climb.per_metre, np.float32))
 
     def _grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
         dearest = self.highest_cell_cost * self.diagonal * self._highest
         width = max(self.lowest_cell_cost * _WIDTH, dearest / (_BUCKETS - 4))
         count = 1 << math.ceil(math.log2(dearest / width + 3))
-        return float(grow_directed(self.padded, Labels(cost, parent, root), self._climbs, Buckets(width, count)))
+        return float(grow_directed(self.padded, (cost, parent, root), self._climbs, (width, count)))
 
     def walk(
         self, parent: NDArray[np.uint8], root: int, starts: NDArray[np.int64], most: int, cell_cost: Floats

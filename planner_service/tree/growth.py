@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.bucket_queue import grow_by_buckets
-from planner_service.kernels.layout import RULE_OCTILE, SQRT2_EXACT, TOO_FINE, Labels, PaddedGrid
+from planner_service.kernels.layout import RULE_OCTILE, SQRT2_EXACT, TOO_FINE, PaddedGrid
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.radix_heap import grow_by_radix_heap
 from shared_map.arrays import Floats
@@ -18,7 +18,7 @@ MAX_RATIO = 1 << 12
 costs more than a radix heap; on a small grid, beyond one bucket for so many cells:"""
 CELLS_PER_BUCKET = 16
 SMALL_RATIO = 64
-"""No grid is so small that a ring of this many buckets does not pay."""
+"""No grid is so small that a queue of this many buckets does not pay."""
 FINE = float(1 << 20)
 """While no cost exceeds so many lowest cell costs, float32 tells any cell's cost from its parent's."""
 
@@ -38,13 +38,13 @@ def grow_tree(
     if longest <= min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)) * lowest:
         width = np.float32(lowest * 0.98)
         count = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
-        last = grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, count)
+        last = grow_by_buckets(cell_cost, cost, stride, root, rule, corners, float(width), count)
         if last != TOO_FINE:
             if parent is not None:
                 point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent)
             return float((last + 1) * width)
     parents = np.empty(size, np.uint8) if parent is None else parent
-    reach = float(grow_by_radix_heap(padded, Labels(cost, parents, root), np.float32(lowest)))
+    reach = float(grow_by_radix_heap(padded, (cost, parents, root), lowest))
     if parent is not None and reach <= FINE * lowest:
         point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent)
     return reach

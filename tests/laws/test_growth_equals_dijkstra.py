@@ -14,7 +14,6 @@ from support import slow_twins as naive
 from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
 from support.planner_strategies import RULES, random_pace
 
-from planner_service.kernels.layout import Labels
 from planner_service.kernels.radix_heap import grow_by_radix_heap
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import MAX_RATIO, grow_tree
@@ -48,7 +47,7 @@ def test_the_smallest_grids_equal_dijkstra(shape: tuple[int, int], rules: dict) 
 
 
 @pytest.mark.parametrize("rules", RULES)
-def test_ring_and_radix_heap_give_the_same_costs_to_the_last_bit(rules: dict) -> None:
+def test_bucket_queue_and_radix_heap_give_the_same_costs_to_the_last_bit(rules: dict) -> None:
     rng = np.random.default_rng(4)
     for ratio in (1.0, 50.0, 2000.0):
         pace = random_pace(rng, 260, 259, ratio, 0.2)
@@ -56,13 +55,13 @@ def test_ring_and_radix_heap_give_the_same_costs_to_the_last_bit(rules: dict) ->
         ground = CostGrid(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules))
         ground.load(pace)
         root = ground.pad(target)
-        by_ring, by_heap = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
+        by_buckets, by_heap = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
         parent = np.empty(ground.size, np.uint8)
         longest = ground.highest_cell_cost * ground.diagonal
-        assert longest <= MAX_RATIO * ground.lowest_cell_cost  # so that it is the ring that grows it
-        grow_tree(ground.padded, ground.lowest_cell_cost, ground.highest_cell_cost, root, by_ring, None)
-        grow_by_radix_heap(ground.padded, Labels(by_heap, parent, root), np.float32(ground.lowest_cell_cost))
-        np.testing.assert_array_equal(by_heap, by_ring)
+        assert longest <= MAX_RATIO * ground.lowest_cell_cost  # so that it is buckets that grow it
+        grow_tree(ground.padded, ground.lowest_cell_cost, ground.highest_cell_cost, root, by_buckets, None)
+        grow_by_radix_heap(ground.padded, (by_heap, parent, root), ground.lowest_cell_cost)
+        np.testing.assert_array_equal(by_heap, by_buckets)
 
 
 @pytest.mark.parametrize("ratio", [1e4, 1e6, 1e9, 1e30])

@@ -7,7 +7,6 @@ import pytest
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels import repair as kernels
-from planner_service.kernels.layout import Buckets, Labels
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from swarm.config.scenario import PlannerConfig
@@ -100,7 +99,7 @@ def test_a_repair_may_concern_the_whole_map(rules: dict) -> None:
         work.pace *= np.float32(factor)
         changes = work.ground.apply(work.pace, [work.grid.window])
         tree, ground = work.tree, work.ground
-        labels = Labels(tree.cost, tree.parent, ground.pad(work.root))
+        labels = (tree.cost, tree.parent, ground.pad(work.root))
         most = (10**9, 10**9, 10**9)
         taken, highest = kernels.repair(ground.padded, labels, changes.cells, changes.before, ground.buckets, most)
         assert taken > 1000
@@ -140,8 +139,8 @@ def test_costs_do_not_depend_on_the_width_or_number_of_buckets(width: float) -> 
         work.pace[20:25, 20:40] *= np.float32(0.5)
         changes = work.ground.apply(work.pace, [Window(10, 10, 30, 40)])
         tree, ground = work.tree, work.ground
-        labels = Labels(tree.cost, tree.parent, ground.pad(work.root))
-        buckets, most = Buckets(np.float32(width), count), (10**9, 10**9, 10**9)
+        labels = (tree.cost, tree.parent, ground.pad(work.root))
+        buckets, most = (width, count), (10**9, 10**9, 10**9)
         _, highest = kernels.repair(ground.padded, labels, changes.cells, changes.before, buckets, most)
         tree.reach = max(tree.reach, float(highest))
         work.check()

@@ -41,22 +41,22 @@ def run(
     agreement  largest relative difference of any cell's cost to ours, over all roots
     memory_mb  peak increase of the resident memory of a process of its own; None if not measured
     """
-    ground = Field(make_field(field, size, seed))
+    made_field = Field(make_field(field, size, seed))
     names = ["ours", "floor", *present_peers(edge)]
-    roots = ground.draw(repeats + 1, np.random.default_rng(seed + 1)).tolist()
+    roots = made_field.draw(repeats + 1, np.random.default_rng(seed + 1)).tolist()
     total = len(roots) + (len(names) if with_memory else 0)
     tell = progress or (lambda done, total: None)
     memory_mb = {}
     if with_memory:
         with tempfile.TemporaryDirectory() as folder:
             saved = Path(folder) / "field.npy"
-            np.save(saved, ground.pace)
+            np.save(saved, made_field.pace)
             for name in names:
                 memory_mb[name] = measure("memory", str(saved), name, str(roots[0]), edge)["mb"]
                 tell(len(memory_mb), total)
     took: dict[str, list[float]] = {name: [] for name in names}
     agreement: dict[str, float] = {}
-    tools = {name: MAKERS[name](ground.pace, edge) for name in names}
+    tools = {name: MAKERS[name](made_field.pace, edge) for name in names}
     for turn, root in enumerate(roots):
         grown: Costs | None = None
         for name, tool in tools.items():
@@ -74,7 +74,7 @@ def run(
     medians = {name: statistics.median(values) for name, values in took.items()}
     peers = {name: round(ms, 3) for name, ms in medians.items() if name not in ("ours", "floor")}
     return {
-        "size": ground.pace.shape[0],
+        "size": made_field.pace.shape[0],
         "field": field,
         "ours_ms": round(medians["ours"], 3),
         "floor_ms": round(medians["floor"], 3),
@@ -82,7 +82,7 @@ def run(
         "ratios": {name: round(medians[name] / medians["ours"], 2) for name in peers},
         "agreement": agreement,
         "memory_mb": memory_mb or None,
-        "shape": list(ground.pace.shape),
+        "shape": list(made_field.pace.shape),
         "edge": edge,
         "repeats": repeats,
         "over_floor": round(medians["ours"] / medians["floor"], 2),

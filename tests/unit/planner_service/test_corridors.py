@@ -1,4 +1,4 @@
-"""WindowSchedule, rings and their corridors: what is grown near the target, and what far from it."""
+"""WindowSchedule and corridors: what is grown near the target, and what far from it."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def thin_walls(rng: np.random.Generator, side: int, doors: float) -> np.ndarray:
 
 
 @pytest.fixture
-def small_rings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rings and a corridors as they are on a large map, in the sizes of a small one."""
+def small_corridors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows and corridors as they are on a large map, in the sizes of a small one."""
     monkeypatch.setattr(corridor_graphs, "LEAST", 3)
     monkeypatch.setattr(corridor_graphs, "AROUND", 2)
     monkeypatch.setattr("planner_service.tree.cost_to_go.INNER", 6)
@@ -45,7 +45,7 @@ def small_rings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(target_tree, "WIDE_SHARE", 64)
 
 
-@pytest.mark.usefixtures("small_rings")
+@pytest.mark.usefixtures("small_corridors")
 @pytest.mark.parametrize("rules", RULES)
 @pytest.mark.parametrize("strategy", COARSE)
 def test_rings_keep_the_laws_past_thin_walls_and_marks(strategy: str, rules: dict) -> None:
@@ -68,7 +68,7 @@ def test_rings_keep_the_laws_past_thin_walls_and_marks(strategy: str, rules: dic
     play.check()
 
 
-@pytest.mark.usefixtures("small_rings")
+@pytest.mark.usefixtures("small_corridors")
 def test_far_from_the_target_rings_hold_where_windows_alone_drift() -> None:
     """The target crosses the map; nothing is grown whole. Mean gap of all cells at the end."""
     rng = np.random.default_rng(8)
@@ -92,7 +92,7 @@ def test_far_from_the_target_rings_hold_where_windows_alone_drift() -> None:
     assert gaps[False] > 1.1
 
 
-def test_a_skeleton_is_where_the_traffic_is() -> None:
+def test_a_corridor_is_where_the_traffic_is() -> None:
     """A valley between two plains has one cheap pass: everything drives through it."""
     pace = np.full((64, 64), 1.0, np.float32)
     pace[:, 32] = np.inf
@@ -126,7 +126,7 @@ def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_w
     rng = np.random.default_rng(seed)
     cell = grid.cell(128, 128)
     schedule.note_grown(cell, 256)
-    since = {8 << rung: cell for rung in range(5)}
+    since = {8 << doublings: cell for doublings in range(5)}
     for _ in range(steps):
         row, col = grid.row_col(cell)
         cell = grid.cell(
