@@ -15,7 +15,20 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Post, Replied
+from swarm.bus.bus import (
+    LONGEST_TIMEOUT_S,
+    TIMEOUT_PARAMETER,
+    USUAL_TIMEOUT_S,
+    Appeared,
+    Asked,
+    AskEnded,
+    Disappeared,
+    Heard,
+    HeardMany,
+    LinkChanged,
+    Post,
+    Replied,
+)
 from swarm.bus.zenoh_config import session_config
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
@@ -167,8 +180,10 @@ class ZenohBus:
             self._count("messages_in")
             key = str(query.key_expr)
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
+            timeout = parameters.pop(TIMEOUT_PARAMETER, "")
             answerer = _ZenohAnswerer(self, topic, query, concrete, parameters.get("format") == "json")
             try:
+                answerer.timeout_s = _timeout_s(timeout)
                 payload = query.payload
                 if payload is None:
                     request = decode_parameters(parameters, request_type)
@@ -226,7 +241,7 @@ class ZenohBus:
             return
         self._count("messages_out")
         self._session.get(
-            topic.expression(self._namespace, **fields),
+            f"{topic.expression(self._namespace, **fields)}?{TIMEOUT_PARAMETER}={timeout_s}",
             zenoh.handlers.Callback(arrive, finish, indirect=False),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
@@ -344,9 +359,24 @@ def _peer(key: str) -> Peer:
     return Peer(role, id, int(incarnation))
 
 
+def _timeout_s(said: str) -> float:
+    """The timeout that a query states, within bounds. Raises ProtocolError on what is no positive number."""
+    if not said:
+        return USUAL_TIMEOUT_S
+    try:
+        timeout_s = float(said)
+    except ValueError:
+        timeout_s = 0.0
+    if not timeout_s > 0:  # neither is NaN
+        raise ProtocolError(f"{TIMEOUT_PARAMETER} {said[:40]!r} is not a positive number of seconds")
+    return min(timeout_s, LONGEST_TIMEOUT_S)
+
+
 class _ZenohAnswerer:
-    """The answers to one query. `concrete` are the fields that `serve` was given; `_query` is None after the
-    end."""
+    """The answers to one query, which arrives when this is made.
+
+    `concrete` are the fields that `serve` was given; `_query` is None after the end.
+    """
 
     def __init__(
         self, bus: ZenohBus, topic: Topic, query: zenoh.Query, concrete: dict[str, str], as_json: bool
@@ -356,6 +386,11 @@ class _ZenohAnswerer:
         self._query: zenoh.Query | None = query
         self._concrete = concrete
         self._as_json = as_json
+        self._arrived_s = time.monotonic()
+        self.timeout_s = USUAL_TIMEOUT_S
+
+    def waited_s(self) -> float:
+        return time.monotonic() - self._arrived_s
 
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
         if self._query is None:

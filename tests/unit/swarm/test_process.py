@@ -167,7 +167,7 @@ def test_late_ticks_are_taken_once_and_the_missed_ones_counted():
     process = Process(service, inbox, clock, tick_hz=10)
     process.run()
     assert [tick // 10**6 for tick in service.ticks] == [0, 100, 450, 550]
-    assert service.counters.counts == {"ticks_dropped": 2}
+    assert service.counters.counts == {"ticks_dropped": 2, "events_dropped": 0, "asks_expired": 0}
     assert service.log == ["start", "stop"]
 
 
