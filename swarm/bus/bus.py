@@ -11,6 +11,7 @@ Order       Samples of one publisher on one topic come in the order of their pub
 Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is congested or down, without
             a subscriber, and where a reader falls behind by more than `Topic.buffer` samples (the oldest go).
             Queries and replies are lost with their link. On the memory bus a sample may come twice or late.
+Failures    A thread of the bus that ends by an unexpected error ends the process (`Process.run` raises it).
 Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has not taken by then.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
             logged once per key and minute, and never posted.
@@ -249,5 +250,5 @@ class Worker(Protocol):
         ...
 
     def close(self) -> None:
-        """Wait for the job in hand, forget the others."""
+        """Wait for the job in hand, but not for long; forget the others."""
         ...

@@ -8,6 +8,7 @@ same link; replies are posted on Zenoh's own thread, because a thread per query 
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -34,6 +35,7 @@ from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.codec import decode, decode_either, decode_many, encode
+from swarm.wire.fields import check_id
 from swarm.wire.messages.base import Message
 from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic
@@ -53,6 +55,7 @@ _QUERY_BUFFER = 4096
 """Queries that wait to be answered, per queryable. It takes no more until one is read."""
 _TOKEN_BUFFER = 65_536
 """Changes of tokens that wait to be read: more than processes can start in a second."""
+_INCARNATION = re.compile(r"[0-9]{1,19}")
 _CLOSE_S = 3.0
 """How long `close` waits for a router that does not answer."""
 _TOGETHER = 1024
@@ -78,7 +81,8 @@ class ZenohBus:
     """A `Bus` on one Zenoh session. Always `close` it: an open session can hang the interpreter's exit.
 
     Its methods are called by the thread that owns the service. The threads that read channels change the counters
-    and the log only; each ends when what it reads is undeclared.
+    and the log only; each ends when what it reads is undeclared. An unexpected error in one, or in a callback of
+    Zenoh's, goes to `threading.excepthook`, by which `Process` ends.
     """
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
@@ -242,7 +246,7 @@ class ZenohBus:
         self._count("messages_out")
         self._session.get(
             f"{topic.expression(self._namespace, **fields)}?{TIMEOUT_PARAMETER}={timeout_s}",
-            zenoh.handlers.Callback(arrive, finish, indirect=False),
+            zenoh.handlers.Callback(_guarded(arrive), _guarded(finish), indirect=False),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
@@ -313,7 +317,7 @@ class ZenohBus:
                     arrive(_waiting(channel) if together else channel.recv())
             except zenoh.ZError:
                 if not self._closed and entity in self._entities:
-                    log.exception("the %s channel ended by itself", name)
+                    raise  # by itself, so that nothing more would be heard
 
         thread = threading.Thread(target=run, name=name, daemon=True)
         thread.start()
@@ -337,7 +341,7 @@ class ZenohBus:
             if len(self._logged_s) > _LOGGED_KEYS:
                 self._logged_s.clear()
             self._logged_s[key] = now_s
-            log.warning("dropped a payload on %s: %s", key, error)
+            log.warning("dropped a payload on %s: %s", key[:200], error)
 
 
 def _waiting(channel: Any) -> list[Any]:
@@ -352,10 +356,29 @@ def _waiting(channel: Any) -> list[Any]:
     return items
 
 
+def _guarded(callback: Callable[..., None]) -> Callable[..., None]:
+    """A callback for Zenoh's own threads, which swallow an error: it ends like one of a thread of ours."""
+
+    def guarded(*arguments: Any) -> None:
+        try:
+            callback(*arguments)
+        except Exception as error:
+            what = (type(error), error, error.__traceback__, threading.current_thread())
+            threading.excepthook(threading.ExceptHookArgs(what))
+
+    return guarded
+
+
 def _peer(key: str) -> Peer:
+    """The process of a token. Raises ProtocolError on a key that is none: anybody may raise a token."""
     *_, role, id, incarnation = key.split("/")
-    if not incarnation.isdecimal():
-        raise ProtocolError(f"incarnation {incarnation!r} of {key} is not a number")
+    try:
+        check_id("role", role)
+        check_id("id", id)
+    except ValueError as error:
+        raise ProtocolError(f"token {key[:200]!r}: {error}") from error
+    if _INCARNATION.fullmatch(incarnation) is None or int(incarnation) >= 1 << 62:
+        raise ProtocolError(f"token {key[:200]!r}: incarnation is not a number below 2^62")
     return Peer(role, id, int(incarnation))
 
 

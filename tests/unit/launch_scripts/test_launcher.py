@@ -113,6 +113,19 @@ def test_a_process_that_crashes_is_restarted_until_it_runs(swarms: list[LocalSwa
     assert swarm.stop(lambda: time.sleep(0.02)) == []
 
 
+def test_a_process_that_loses_a_thread_ends_with_the_reason_and_is_restarted(
+    swarms: list[LocalSwarm], tmp_path: Path
+) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "lose_a_thread"))
+    swarm.start()
+    (ending,) = endings_within(swarm)
+    assert ending.sentence == "IndexError: list index out of range"
+    assert (ending.exit_code, ending.refused, ending.restart_in_s) == (70, False, 0.2)
+    assert "thread reader ended by IndexError: list index out of range" in (tmp_path / "planner-t0.log").read_text()
+    (again,) = endings_within(swarm)
+    assert again.restart_in_s == 0.4
+
+
 def test_a_process_killed_from_outside_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:
     swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "quiet"))
     swarm.start()
