@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -77,17 +78,31 @@ class _StopAsked:
 
     def __init__(self) -> None:
         self.times = 0
+        self._interrupts = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._asked)
 
     def _asked(self, number: int, frame: object) -> None:
         self.times += 1
+        if self._interrupts:
+            raise KeyboardInterrupt
 
     def __bool__(self) -> bool:
         return self.times > 0
 
     def force(self) -> bool:
         return self.times > 1
+
+    @contextlib.contextmanager
+    def interrupting(self) -> Iterator[None]:
+        """A signal leaves this block at once: for work that takes long while there is no process to be ended."""
+        self._interrupts = True
+        try:
+            yield
+        except KeyboardInterrupt:
+            log.info("stopped while preparing")
+        finally:
+            self._interrupts = False
 
 
 def run_swarm(options: UpOptions) -> int:
@@ -135,8 +150,11 @@ class _Run:
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         warm_up = WarmUp(list(self._options.preload))
         warm_up.begin()
-        self._terrain, self._truth = self._prepared()
-        log.info("terrain is ready")
+        with self._stop_asked.interrupting():
+            self._terrain, self._truth = self._prepared()
+            log.info("terrain is ready")
+        if self._stop_asked:
+            return 0
         self._wait("loading kernels; the first start on a machine compiles them, about a minute", warm_up.done)
         log.info("kernels are loaded")
         if self._stop_asked:
@@ -277,7 +295,8 @@ class _Run:
 
     def _stop(self, watcher: Watcher) -> list[str]:
         """Stops all roles in order, and records their last messages."""
-        self._terminal.say("stopping")
+        asked = "; once more, and what still runs is killed" if self._stop_asked else ""
+        self._terminal.say(f"stopping{asked}")
         return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
 
     def _say_begin(self) -> None:
