@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from launch_scripts.launcher.child import log_to
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
+from launch_scripts.launcher.log_file import log_to
 from launch_scripts.launcher.options import check_ports, common_run_id, listening, make_run_dir, new_run_id
 from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
@@ -21,14 +21,14 @@ from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import ROLES, ProcessSpec, processes_of
 from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.write_report import write_report
+from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
 from swarm.bus.bus import Bus
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import Scenario
-from swarm.errors import BusError, SwarmError
+from swarm.errors import BusError, StoreError, SwarmError
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
 
@@ -181,12 +181,17 @@ class _Run:
         finally:
             self._terminal.close()
             self._swarm.kill()
-        self._report(watcher.recorder, seconds)
+        code = 0
+        try:
+            self._report(watcher.recorder, seconds)
+        except StoreError as error:
+            self._terminal.say(str(error), "red")
+            code = error.exit_code
         if self._startup_s is None and not self._stop_asked:
             failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
         for failure in failures:
             self._terminal.say(failure, "red")
-        return 1 if failures else 0
+        return 1 if failures else code
 
     def _prepared(self) -> tuple[Terrain, Floats]:
         """Builds the terrain from its files, or fetches it from a keeper where one is missing and a swarm runs."""
@@ -308,11 +313,9 @@ class _Run:
         self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 
     def _report(self, recorder: Recorder, seconds: float) -> None:
-        report = write_report(
-            self._run_dir,
+        report = make_report(
             recorder,
             self._terrain,
-            truth=self._truth,
             run_id=self._run_id,
             seconds=seconds,
             processes=len(self._swarm.running),
@@ -324,4 +327,7 @@ class _Run:
             print(json.dumps(numbers, indent=2))
         else:
             self._terminal.report(numbers)
+        # The figures come first: a full disk keeps nobody from them.
+        write_report(self._run_dir, report, recorder, self._terrain, truth=self._truth)
+        if not self._options.as_json:
             self._terminal.say(f"report: {self._run_dir / 'report.json'}, picture: {self._run_dir / 'report.png'}")
