@@ -15,6 +15,9 @@ ROLES = ("router", "keeper", "monitor", "planner", "targets", "agent")
 STOP_ORDER = ("agent", "targets", "planner", "monitor", "keeper", "router")
 """Each role stops after those which still talk to it."""
 
+EXPENDABLE = frozenset({"monitor"})
+"""Roles without which a run goes on, whatever keeps them from starting."""
+
 ENTRIES = {
     "router": "launch_scripts.launcher.router:run",
     "keeper": "shared_map.keeper.main:run",

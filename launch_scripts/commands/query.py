@@ -299,3 +299,5 @@ def simulate(name: str, seed: int | None, seconds: float | None, trace: Path | N
         f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
         f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
     )
+    if result.trace_cut is not None:
+        raise StoreError(f"the event log {trace} has no end: {result.trace_cut}")

@@ -114,8 +114,9 @@ def _run(role: str, id: str, part: Part, tls: Tls, *, listen: str | None = None,
     import msgspec
 
     from launch_scripts.launcher import options
-    from launch_scripts.launcher.child import load_entry, log_to
+    from launch_scripts.launcher.child import load_entry
     from launch_scripts.launcher.lives import next_life
+    from launch_scripts.launcher.log_file import log_to
     from launch_scripts.launcher.progress import progress
     from launch_scripts.launcher.run_terrain import fetch_if_missing
     from launch_scripts.launcher.watcher import check_vacant

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
 import importlib
 import logging
@@ -15,6 +16,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.launcher.log_file import log_to
 from swarm.errors import SwarmError
 from swarm.runtime.role import RoleSetup
 
@@ -83,29 +85,22 @@ def _watch_launcher() -> None:
 
 
 def _redirect(log_path: Path) -> None:
-    """Sends all output of this process, that of native libraries included, to its log file."""
-    file = os.open(log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    """Sends all output of this process, that of native libraries included, to its log file: once that can be
+    opened, for a full disk must not keep a process from its start."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     sys.stdout.flush()
     sys.stderr.flush()
-    os.dup2(file, 1)
-    os.dup2(file, 2)
-    os.close(file)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
     faulthandler.enable()
-    log_to(None)
-
-
-def log_to(path: Path | None) -> None:
-    """Logs to a file, or to standard error if there is none."""
-    handler = logging.StreamHandler(sys.stderr) if path is None else logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(
-        logging.Formatter("%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
-    )
-    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+    log_to(log_path, takes_output=True)
 
 
 def _leave(code: int) -> None:
     """Ends the process now: threads left waiting after a crash must not keep it alive."""
-    logging.shutdown()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    with contextlib.suppress(OSError):  # of a full disk
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
     os._exit(code)

@@ -19,7 +19,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 from launch_scripts.launcher.child import ExitReason, run_child
-from launch_scripts.process_table import STOP_ORDER, ProcessSpec
+from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -30,6 +30,10 @@ SETTLED_S = 10.0
 """After a run of so many seconds the wait starts at its shortest again."""
 STOP_GRACE_S = 5.0
 REFUSALS_ALLOWED = 5
+"""So many refusals within `REFUSALS_WITHIN_S` are taken for final."""
+REFUSALS_WITHIN_S = 60.0
+FINALLY_REFUSED_WAIT_S = 60.0
+"""Wait before the next start of an expendable process whose refusal is final."""
 
 _HELD_BACK = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
@@ -71,7 +75,8 @@ class Running:
     began_s: float = 0.0
     due_s: float | None = None
     restarts: int = 0
-    refusals: int = 0
+    refused_s: list[float] = field(default_factory=list)
+    """When it refused to run, within the last `REFUSALS_WITHIN_S`."""
     backoff: Backoff = field(default_factory=Backoff)
 
     @property
@@ -128,7 +133,8 @@ class LocalSwarm:
         before_role: Callable[[str], None] = lambda _: None,
         force: Callable[[], bool] = lambda: False,
     ) -> list[str]:
-        """Ends all processes, role by role. Returns a sentence for each that did not end as asked."""
+        """Ends all processes, role by role: after `STOP_GRACE_S`, or once `force` says so, by SIGKILL. Returns a
+        sentence for each that did not end as asked."""
         for running in self.running:
             running.due_s = None
         roles = [*STOP_ORDER, *sorted({r.spec.role for r in self.running} - set(STOP_ORDER))]
@@ -169,15 +175,22 @@ class LocalSwarm:
         reason = self._exit_reason(running, process)
         self._forget(running)
         now_s = time.monotonic()
-        restart = running.spec.restart == "always"
-        if reason.refused:
-            running.refusals += 1
-            # A refused first start will be refused again; a later refusal may be the network's.
-            restart = restart and running.restarts > 0 and running.refusals < REFUSALS_ALLOWED
-        wait_s = running.backoff.crashed(now_s - running.began_s) if restart else None
+        ran_s = now_s - running.began_s
+        wait_s: float | None = running.backoff.crashed(ran_s)
+        if reason.refused and self._is_final(running, ran_s, now_s):
+            wait_s = FINALLY_REFUSED_WAIT_S if running.spec.role in EXPENDABLE else None
+        if running.spec.restart != "always":
+            wait_s = None
         if wait_s is not None:
             running.due_s = now_s + wait_s
         return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)
+
+    def _is_final(self, running: Running, ran_s: float, now_s: float) -> bool:
+        """Whether a process that refused to run now would do so again. A refused first start is; a later one may be
+        the network's, so it takes several in a short time."""
+        running.refused_s = [each for each in running.refused_s if now_s - each < REFUSALS_WITHIN_S] + [now_s]
+        first = running.restarts == 0 and ran_s < SETTLED_S
+        return first or len(running.refused_s) >= REFUSALS_ALLOWED
 
     def _exit_reason(self, running: Running, process: ForkServerProcess) -> ExitReason:
         code = process.exitcode if process.exitcode is not None else 1
@@ -210,10 +223,11 @@ class LocalSwarm:
         for running in of_role:
             process = running.process
             assert process is not None
-            if running in waiting:
+            if process.exitcode is None:
                 process.kill()
                 process.join(1.0)
-                failures.append(f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed")
+                how = "was asked twice to end" if force() else f"did not end within {STOP_GRACE_S:g} s"
+                failures.append(f"{running.spec.name} {how} and was killed")
             elif process.exitcode not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
                 reason = self._exit_reason(running, process)
                 failures.append(f"{running.spec.name} was asked to end, but {reason.sentence}")

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from launch_scripts.launcher.child import log_to
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
+from launch_scripts.launcher.log_file import log_to
 from launch_scripts.launcher.options import check_ports, common_run_id, listening, make_run_dir, new_run_id
 from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
@@ -21,14 +22,14 @@ from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import ROLES, ProcessSpec, processes_of
 from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.write_report import write_report
+from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
 from swarm.bus.bus import Bus
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import Scenario
-from swarm.errors import BusError, SwarmError
+from swarm.errors import BusError, StoreError, SwarmError
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
 
@@ -78,17 +79,31 @@ class _StopAsked:
 
     def __init__(self) -> None:
         self.times = 0
+        self._interrupts = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._asked)
 
     def _asked(self, number: int, frame: object) -> None:
         self.times += 1
+        if self._interrupts:
+            raise KeyboardInterrupt
 
     def __bool__(self) -> bool:
         return self.times > 0
 
     def force(self) -> bool:
         return self.times > 1
+
+    @contextlib.contextmanager
+    def interrupting(self) -> Iterator[None]:
+        """A signal leaves this block at once: for work that takes long while there is no process to be ended."""
+        self._interrupts = True
+        try:
+            yield
+        except KeyboardInterrupt:
+            log.info("stopped while preparing")
+        finally:
+            self._interrupts = False
 
 
 def run_swarm(options: UpOptions) -> int:
@@ -136,8 +151,11 @@ class _Run:
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         warm_up = WarmUp(list(self._options.preload))
         warm_up.begin()
-        self._terrain, self._truth = self._prepared()
-        log.info("terrain is ready")
+        with self._stop_asked.interrupting():
+            self._terrain, self._truth = self._prepared()
+            log.info("terrain is ready")
+        if self._stop_asked:
+            return 0
         self._wait("loading kernels; the first start on a machine compiles them, about a minute", warm_up.done)
         log.info("kernels are loaded")
         if self._stop_asked:
@@ -164,12 +182,17 @@ class _Run:
         finally:
             self._terminal.close()
             self._swarm.kill()
-        self._report(watcher.recorder, seconds)
+        code = 0
+        try:
+            self._report(watcher.recorder, seconds)
+        except StoreError as error:
+            self._terminal.say(str(error), "red")
+            code = error.exit_code
         if self._startup_s is None and not self._stop_asked:
             failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
         for failure in failures:
             self._terminal.say(failure, "red")
-        return 1 if failures else 0
+        return 1 if failures else code
 
     def _prepared(self) -> tuple[Terrain, Floats]:
         """Builds the terrain from its files, or fetches it from a keeper where one is missing and a swarm runs."""
@@ -278,7 +301,8 @@ class _Run:
 
     def _stop(self, watcher: Watcher) -> list[str]:
         """Stops all roles in order, and records their last messages."""
-        self._terminal.say("stopping")
+        asked = "; once more, and what still runs is killed" if self._stop_asked else ""
+        self._terminal.say(f"stopping{asked}")
         return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
 
     def _say_begin(self) -> None:
@@ -290,11 +314,9 @@ class _Run:
         self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 
     def _report(self, recorder: Recorder, seconds: float) -> None:
-        report = write_report(
-            self._run_dir,
+        report = make_report(
             recorder,
             self._terrain,
-            truth=self._truth,
             run_id=self._run_id,
             seconds=seconds,
             processes=len(self._swarm.running),
@@ -306,4 +328,7 @@ class _Run:
             print(json.dumps(numbers, indent=2))
         else:
             self._terminal.report(numbers)
+        # The figures come first: a full disk keeps nobody from them.
+        write_report(self._run_dir, report, recorder, self._terrain, truth=self._truth)
+        if not self._options.as_json:
             self._terminal.say(f"report: {self._run_dir / 'report.json'}, picture: {self._run_dir / 'report.png'}")

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
 from swarm.grid import REGION_TILES, TILE_CELLS
 from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES
 from swarm.wire.messages.base import WIRE_VERSION, Message
@@ -44,6 +45,10 @@ Any Zenoh session may ask, with parameters instead of a payload and JSON as the 
     session.get("swarm/target/t3/route?row=40;col=200;format=json")
     session.get("swarm/target/*/cost?row=40;col=200;format=json")
     session.get("swarm/run/**?format=json")
+
+A query says how long its asker waits, in seconds, by a parameter such as `?{TIMEOUT_PARAMETER}=2.5`; without it
+{USUAL_TIMEOUT_S:g} are assumed, and never more than {LONGEST_TIMEOUT_S:g}. The time counts from the arrival at the
+process that answers, by its own clock. A query that was not begun by then is refused and counted (`asks_expired`).
 """
 
 

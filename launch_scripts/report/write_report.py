@@ -19,20 +19,12 @@ from swarm.errors import StoreError
 log = logging.getLogger(__name__)
 
 
-def write_report(
-    folder: Path,
-    recorder: Recorder,
-    terrain: Terrain,
-    *,
-    truth: NDArray[np.float32] | None = None,
-    **measured: Any,
-) -> dict[str, Any]:
-    """Writes both files and returns the numbers. Raises StoreError if the folder cannot be written.
+def make_report(recorder: Recorder, terrain: Terrain, **measured: Any) -> dict[str, Any]:
+    """The numbers of a run.
 
-    truth     true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
     measured  what the caller knows better than the recorder, as `Recorder.report` takes it
     """
-    report = {
+    return {
         **recorder.report(**measured),
         "version": importlib.metadata.version("terrain-swarm"),
         "terrain": {
@@ -44,12 +36,25 @@ def write_report(
         },
         "series": recorder.series(),
     }
+
+
+def write_report(
+    folder: Path,
+    report: dict[str, Any],
+    recorder: Recorder,
+    terrain: Terrain,
+    *,
+    truth: NDArray[np.float32] | None = None,
+) -> None:
+    """Writes both files. Raises StoreError if the folder cannot be written.
+
+    truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
+    """
     try:
         _write(folder / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     except OSError as error:
         raise StoreError(f"cannot write {folder / 'report.json'}: {error.strerror or error}") from error
     _draw(folder / "report.png", recorder, report, terrain, truth)
-    return report
 
 
 def _draw(

@@ -48,6 +48,7 @@ class SimulationResult:
     report      the numbers of report.json; the same for the same seed
     deliveries  number of messages that arrived
     wall_s      seconds that it took on this machine
+    trace_cut   why the event log has no end; None if it is whole or was not asked for
     """
 
     report: dict[str, Any]
@@ -56,6 +57,7 @@ class SimulationResult:
     seconds: float
     deliveries: int
     wall_s: float
+    trace_cut: str | None = None
 
     @property
     def speed(self) -> float:
@@ -288,6 +290,7 @@ def simulate(
         if progress is not None:
             progress(simulation.now_s)
     simulation.finish()
+    simulation.log.flush()
     return SimulationResult(
         report=simulation.report(seconds),
         recorder=simulation.recorder,
@@ -295,4 +298,5 @@ def simulate(
         seconds=seconds,
         deliveries=simulation.log.deliveries,
         wall_s=time.perf_counter() - began_s,
+        trace_cut=simulation.log.cut,
     )

@@ -11,6 +11,8 @@ Order       Samples of one publisher on one topic come in the order of their pub
 Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is congested or down, without
             a subscriber, and where a reader falls behind by more than `Topic.buffer` samples (the oldest go).
             Queries and replies are lost with their link. On the memory bus a sample may come twice or late.
+Failures    A thread of the bus that ends by an unexpected error ends the process (`Process.run` raises it).
+Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has not taken by then.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
             logged once per key and minute, and never posted.
 Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the
@@ -26,6 +28,13 @@ from typing import Protocol
 from swarm.liveness import Peer
 from swarm.wire.messages.base import Message
 from swarm.wire.topics import Topic
+
+TIMEOUT_PARAMETER = "timeout_s"
+"""Parameter of a query on the wire: how many seconds its asker waits."""
+USUAL_TIMEOUT_S = 10.0
+"""Of a query without that parameter: what Zenoh's own `get` waits by default."""
+LONGEST_TIMEOUT_S = 60.0
+"""A query is taken to wait no longer, whatever it says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +68,21 @@ class Asked:
     fields: Mapping[str, str]
     request: Message
     answerer: Answerer
+
+    @property
+    def timeout_s(self) -> float:
+        """How long the asker waits. It travels with the query, as a duration: no clock is compared with another."""
+        return self.answerer.timeout_s
+
+    @property
+    def waited_s(self) -> float:
+        """Seconds since the query arrived here, by the bus's own monotonic clock."""
+        return self.answerer.waited_s()
+
+    @property
+    def expired(self) -> bool:
+        """Whether the asker has left: it began to wait before the query arrived."""
+        return self.waited_s >= self.timeout_s
 
     def answer(self, message: Message, **fields: str | int) -> None:
         """Send one reply. `fields` complete the key where `serve` left wildcards; a reply whose key is not
@@ -139,6 +163,10 @@ Post = Callable[[Event], None]
 class Answerer(Protocol):
     """The bus's side of `Asked`."""
 
+    @property
+    def timeout_s(self) -> float: ...
+
+    def waited_s(self) -> float: ...
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None: ...
     def refuse(self, reason: str) -> None: ...
     def end(self) -> None: ...
@@ -222,5 +250,5 @@ class Worker(Protocol):
         ...
 
     def close(self) -> None:
-        """Wait for the job in hand, forget the others."""
+        """Wait for the job in hand, but not for long; forget the others."""
         ...

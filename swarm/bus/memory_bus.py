@@ -186,7 +186,7 @@ class MemoryBus:
             raise TypeError(f"topic {topic.name} is not a queryable")
         wanted = topic.every(fields)
         scheduler = self.network.scheduler
-        asking = Asking(self, topic, wanted, tag, post)
+        asking = Asking(self, topic, wanted, tag, post, timeout_s)
         if self.closed:
             scheduler.after(0, asking.finish)
             return
@@ -206,7 +206,7 @@ class MemoryBus:
         parsed = decode(payload, topic.request)
         for index, queryable in enumerate(queryables):
             for when_ns in self.network.arrivals_ns(self, queryable.bus, topic.name):
-                answerer = MemoryAnswerer(asking, queryable, index)
+                answerer = MemoryAnswerer(asking, queryable, index, when_ns)
                 event = Asked(topic, wanted, parsed, answerer)
                 scheduler.at(when_ns, _Delivery(self, queryable.bus, topic.name, payload, queryable.post, event))
         scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from swarm.bus.bus import AskEnded, Post, Replied
+from swarm.clock import NS_PER_S
 from swarm.wire.codec import decode_either, encode
 from swarm.wire.messages.base import Message
 from swarm.wire.topics import Topic
@@ -31,6 +32,7 @@ class Asking:
     wanted: dict[str, str]
     tag: str
     post: Post
+    timeout_s: float
     waiting: set[int] = field(default_factory=set)
     replies: int = 0
     failure: str | None = None
@@ -52,6 +54,7 @@ class MemoryAnswerer:
     """The answers of one queryable to one query.
 
     index            the queryable's number in `Asking.waiting`
+    arrived_ns       when the query arrives
     ended            whether `end` was called
     last_arrival_ns  when its latest answer arrives: no later answer overtakes it
     """
@@ -59,8 +62,16 @@ class MemoryAnswerer:
     asking: Asking
     queryable: Declaration
     index: int
+    arrived_ns: int
     ended: bool = False
     last_arrival_ns: int = 0
+
+    @property
+    def timeout_s(self) -> float:
+        return self.asking.timeout_s
+
+    def waited_s(self) -> float:
+        return (self.queryable.bus.network.scheduler.clock.now_ns() - self.arrived_ns) / NS_PER_S
 
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
         if self.ended:

@@ -8,6 +8,7 @@ same link; replies are posted on Zenoh's own thread, because a thread per query 
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -15,12 +16,26 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Post, Replied
+from swarm.bus.bus import (
+    LONGEST_TIMEOUT_S,
+    TIMEOUT_PARAMETER,
+    USUAL_TIMEOUT_S,
+    Appeared,
+    Asked,
+    AskEnded,
+    Disappeared,
+    Heard,
+    HeardMany,
+    LinkChanged,
+    Post,
+    Replied,
+)
 from swarm.bus.zenoh_config import session_config
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.codec import decode, decode_either, decode_many, encode
+from swarm.wire.fields import check_id
 from swarm.wire.messages.base import Message
 from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic
@@ -40,6 +55,7 @@ _QUERY_BUFFER = 4096
 """Queries that wait to be answered, per queryable. It takes no more until one is read."""
 _TOKEN_BUFFER = 65_536
 """Changes of tokens that wait to be read: more than processes can start in a second."""
+_INCARNATION = re.compile(r"[0-9]{1,19}")
 _CLOSE_S = 3.0
 """How long `close` waits for a router that does not answer."""
 _TOGETHER = 1024
@@ -65,7 +81,8 @@ class ZenohBus:
     """A `Bus` on one Zenoh session. Always `close` it: an open session can hang the interpreter's exit.
 
     Its methods are called by the thread that owns the service. The threads that read channels change the counters
-    and the log only; each ends when what it reads is undeclared.
+    and the log only; each ends when what it reads is undeclared. An unexpected error in one, or in a callback of
+    Zenoh's, goes to `threading.excepthook`, by which `Process` ends.
     """
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
@@ -167,8 +184,10 @@ class ZenohBus:
             self._count("messages_in")
             key = str(query.key_expr)
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
+            timeout = parameters.pop(TIMEOUT_PARAMETER, "")
             answerer = _ZenohAnswerer(self, topic, query, concrete, parameters.get("format") == "json")
             try:
+                answerer.timeout_s = _timeout_s(timeout)
                 payload = query.payload
                 if payload is None:
                     request = decode_parameters(parameters, request_type)
@@ -226,8 +245,8 @@ class ZenohBus:
             return
         self._count("messages_out")
         self._session.get(
-            topic.expression(self._namespace, **fields),
-            zenoh.handlers.Callback(arrive, finish, indirect=False),
+            f"{topic.expression(self._namespace, **fields)}?{TIMEOUT_PARAMETER}={timeout_s}",
+            zenoh.handlers.Callback(_guarded(arrive), _guarded(finish), indirect=False),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
@@ -298,7 +317,7 @@ class ZenohBus:
                     arrive(_waiting(channel) if together else channel.recv())
             except zenoh.ZError:
                 if not self._closed and entity in self._entities:
-                    log.exception("the %s channel ended by itself", name)
+                    raise  # by itself, so that nothing more would be heard
 
         thread = threading.Thread(target=run, name=name, daemon=True)
         thread.start()
@@ -322,7 +341,7 @@ class ZenohBus:
             if len(self._logged_s) > _LOGGED_KEYS:
                 self._logged_s.clear()
             self._logged_s[key] = now_s
-            log.warning("dropped a payload on %s: %s", key, error)
+            log.warning("dropped a payload on %s: %s", key[:200], error)
 
 
 def _waiting(channel: Any) -> list[Any]:
@@ -337,16 +356,50 @@ def _waiting(channel: Any) -> list[Any]:
     return items
 
 
+def _guarded(callback: Callable[..., None]) -> Callable[..., None]:
+    """A callback for Zenoh's own threads, which swallow an error: it ends like one of a thread of ours."""
+
+    def guarded(*arguments: Any) -> None:
+        try:
+            callback(*arguments)
+        except Exception as error:
+            what = (type(error), error, error.__traceback__, threading.current_thread())
+            threading.excepthook(threading.ExceptHookArgs(what))
+
+    return guarded
+
+
 def _peer(key: str) -> Peer:
+    """The process of a token. Raises ProtocolError on a key that is none: anybody may raise a token."""
     *_, role, id, incarnation = key.split("/")
-    if not incarnation.isdecimal():
-        raise ProtocolError(f"incarnation {incarnation!r} of {key} is not a number")
+    try:
+        check_id("role", role)
+        check_id("id", id)
+    except ValueError as error:
+        raise ProtocolError(f"token {key[:200]!r}: {error}") from error
+    if _INCARNATION.fullmatch(incarnation) is None or int(incarnation) >= 1 << 62:
+        raise ProtocolError(f"token {key[:200]!r}: incarnation is not a number below 2^62")
     return Peer(role, id, int(incarnation))
 
 
+def _timeout_s(said: str) -> float:
+    """The timeout that a query states, within bounds. Raises ProtocolError on what is no positive number."""
+    if not said:
+        return USUAL_TIMEOUT_S
+    try:
+        timeout_s = float(said)
+    except ValueError:
+        timeout_s = 0.0
+    if not timeout_s > 0:  # neither is NaN
+        raise ProtocolError(f"{TIMEOUT_PARAMETER} {said[:40]!r} is not a positive number of seconds")
+    return min(timeout_s, LONGEST_TIMEOUT_S)
+
+
 class _ZenohAnswerer:
-    """The answers to one query. `concrete` are the fields that `serve` was given; `_query` is None after the
-    end."""
+    """The answers to one query, which arrives when this is made.
+
+    `concrete` are the fields that `serve` was given; `_query` is None after the end.
+    """
 
     def __init__(
         self, bus: ZenohBus, topic: Topic, query: zenoh.Query, concrete: dict[str, str], as_json: bool
@@ -356,6 +409,11 @@ class _ZenohAnswerer:
         self._query: zenoh.Query | None = query
         self._concrete = concrete
         self._as_json = as_json
+        self._arrived_s = time.monotonic()
+        self.timeout_s = USUAL_TIMEOUT_S
+
+    def waited_s(self) -> float:
+        return time.monotonic() - self._arrived_s
 
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
         if self._query is None:

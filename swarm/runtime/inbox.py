@@ -3,21 +3,38 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import OrderedDict
 from collections.abc import Hashable
 
-from swarm.bus.bus import Event, Heard, HeardMany
+from swarm.bus.bus import Asked, Event, Heard, HeardMany
+
+CAPACITY = 4096
+"""Unread samples, or questions, per topic: more than a process gets in a second. Beyond it the oldest goes."""
+LATE_S = 0.5
+"""Once the oldest question of a topic has waited this long, or half of its asker's timeout, the newest is taken
+first: an answer to it still finds its asker."""
 
 _UNREAD_BATCHES = 2
 """Unread batches beyond which `post` blocks: one to be read while the next is decoded."""
+_KEPT = ""
+"""Name of the queue of what is never dropped."""
+
+_Queue = OrderedDict[Hashable, tuple[int, Event | BaseException]]
+"""Key -> (number, event), in the order of arrival. The key is the number, or what only the newest counts of."""
 
 
 class Inbox:
-    """A queue of events from any thread to the one that owns the state.
+    """Queues of events from any thread to the one that owns the state.
 
-    Of topics whose samples each carry the whole state of their key (`Topic.newest`) only the newest per key is
-    kept, in the place of the oldest unread one: a slow reader is behind by at most one value per key. All other
-    events are kept, in order. Batches (`HeardMany`) are bounded by blocking their poster.
+    Samples    `CAPACITY` per topic, then the oldest goes. Of topics whose samples each carry the whole state of
+               their key (`Topic.newest`) only the newest per key is kept, in the place of the oldest unread one.
+    Questions  `CAPACITY` per topic, then the oldest is refused. One whose asker has left is refused, too.
+    Batches    (`HeardMany`) are bounded by blocking their poster.
+    The rest   is never dropped: replies, ends of our own questions, tokens, links, results of workers, errors.
+
+    Events are taken in the order of their arrival. While a question comes late (`LATE_S`), queues take turns, and
+    of late questions the newest is taken (adaptive LIFO): under overload the newest are answered in time and the
+    others expire, instead of all being answered too late.
     """
 
     def __init__(self) -> None:
@@ -35,14 +52,17 @@ class Inbox:
         """`HeardMany` events posted and not yet taken."""
         self._closed = False
         """Set by `close`, for good."""
-        self._order: deque[Hashable] = deque()
-        """Keys of `_events` in the order of taking."""
-        self._events: dict[Hashable, Event | BaseException] = {}
-        """Unread events: by topic and fields where only the newest counts, else by number."""
+        self._queues: OrderedDict[str, _Queue] = OrderedDict()
+        """Unread events by kind and topic. The queue whose turn was longest ago comes first."""
+        self._unread = 0
+        """Events in all queues."""
         self._next = 0
-        """Number of the event last posted without a key."""
+        """Number of the event last posted."""
         self.superseded = 0
         """Samples replaced unread by a newer one, since the start."""
+        self.counts = {"events_dropped": 0, "asks_expired": 0}
+        """Since the start: samples and questions that found their queue full; questions whose asker left before
+        their turn came."""
 
     def post(self, event: Event) -> None:
         """Add an event, from any thread.
@@ -50,50 +70,70 @@ class Inbox:
         With a `HeardMany` it blocks the caller while more than two batches are unread. The bus then drops its
         oldest samples instead of this inbox growing.
         """
-        if isinstance(event, HeardMany):
-            with self._lock:
-                self._unread_batches += 1
-                self._put(event, None)
-            while True:
-                self._batch_taken.clear()
-                if self._unread_batches <= _UNREAD_BATCHES or self._closed:
-                    break
-                self._batch_taken.wait()
-        else:
-            self._put(event, _newest_key(event))
+        match event:
+            case HeardMany():
+                with self._lock:
+                    self._unread_batches += 1
+                    self._put(event, _KEPT)
+                while True:
+                    self._batch_taken.clear()
+                    if self._unread_batches <= _UNREAD_BATCHES or self._closed:
+                        break
+                    self._batch_taken.wait()
+            case Heard(topic=topic, fields=fields):
+                newest = tuple(fields.values()) if topic.newest else None
+                self._put(event, topic.name, newest)
+            case Asked(topic=topic):
+                dropped = self._put(event, f"? {topic.name}")
+                if isinstance(dropped, Asked):
+                    _refuse(dropped, "too many questions wait")
+            case _:
+                self._put(event, _KEPT)
 
     def fail(self, error: BaseException) -> None:
-        """Make the owner raise: how a worker thread ends its process."""
-        self._put(error, None)
+        """Make the owner raise: how another thread ends its process."""
+        self._put(error, _KEPT)
 
-    def _put(self, event: Event | BaseException, key: Hashable | None) -> None:
+    def _put(
+        self, event: Event | BaseException, name: str, newest: Hashable | None = None
+    ) -> Event | BaseException | None:
+        """Add an event to a queue. Returns the one that is dropped for it.
+
+        newest  what only the newest event counts of; None if each counts
+        """
+        dropped = None
         with self._lock:
-            if key is None:
-                self._next += 1
-                key = self._next
-            elif key in self._events:
-                self._events[key] = event
+            queue = self._queues.setdefault(name, OrderedDict())
+            if newest is not None and newest in queue:
+                queue[newest] = (queue[newest][0], event)
                 self.superseded += 1
-                return
-            self._order.append(key)
-            self._events[key] = event
+                return None
+            if name != _KEPT and len(queue) >= CAPACITY:
+                _, (_, dropped) = queue.popitem(last=False)
+                self.counts["events_dropped"] += 1
+            else:
+                self._unread += 1
+            self._next += 1
+            queue[self._next if newest is None else newest] = (self._next, event)
             self._ring()
+        return dropped
 
     def take(self, timeout_s: float) -> Event | None:
-        """The oldest event; None if there is none within the timeout. Raises the error that `fail` was given, in
-        its turn. Called by the owner only."""
+        """The next event; None if there is none within the timeout. Raises the error that `fail` was given, in its
+        turn. Called by the owner only."""
         with self._lock:
-            self._asleep = not self._order and timeout_s > 0
+            self._asleep = not self._unread and timeout_s > 0
             asleep = self._asleep
         if asleep and not self._bell.acquire(timeout=timeout_s):
             with self._lock:
                 if not self._asleep:  # a poster released the bell between the timeout and this line
                     self._bell.acquire()
                 self._asleep = False
+        expired: list[Asked] = []
         with self._lock:
-            if not self._order:
-                return None
-            event = self._events.pop(self._order.popleft())
+            event = self._pop(expired)
+        for asked in expired:
+            _refuse(asked, f"no answer within the {asked.timeout_s:g} s of its asker: too many questions")
         if isinstance(event, HeardMany):
             with self._lock:
                 self._unread_batches -= 1
@@ -101,6 +141,46 @@ class Inbox:
         if isinstance(event, BaseException):
             raise event
         return event
+
+    def _pop(self, expired: list[Asked]) -> Event | BaseException | None:
+        """Remove the next event. Questions whose time is over are removed on the way, into `expired`."""
+        while self._unread:
+            name, newest_first = self._choose(expired)
+            if name is None:
+                break
+            _, (_, event) = self._queues[name].popitem(last=newest_first)
+            self._unread -= 1
+            if not (isinstance(event, Asked) and event.expired):
+                return event
+            self._expire(event, expired)  # newer than the oldest, but its asker had less time
+        return None
+
+    def _choose(self, expired: list[Asked]) -> tuple[str | None, bool]:
+        """The queue whose turn it is, and whether its newest event is to be taken instead of its oldest."""
+        first: dict[str, int] = {}
+        late: set[str] = set()
+        for name, queue in self._queues.items():
+            while queue:
+                number, event = next(iter(queue.values()))
+                if isinstance(event, Asked):
+                    if event.expired:
+                        queue.popitem(last=False)
+                        self._unread -= 1
+                        self._expire(event, expired)
+                        continue
+                    if event.waited_s >= min(LATE_S, event.timeout_s / 2):
+                        late.add(name)
+                first[name] = number
+                break
+        if not late:
+            return min(first, key=first.__getitem__, default=None), False
+        name = next(iter(first))
+        self._queues.move_to_end(name)
+        return name, name in late
+
+    def _expire(self, asked: Asked, expired: list[Asked]) -> None:
+        self.counts["asks_expired"] += 1
+        expired.append(asked)
 
     def wake(self) -> None:
         """End a `take` that waits, from any thread and from a signal handler."""
@@ -118,10 +198,9 @@ class Inbox:
             self._bell.release()
 
     def __len__(self) -> int:
-        return len(self._order)
+        return self._unread
 
 
-def _newest_key(event: Event) -> Hashable | None:
-    if isinstance(event, Heard) and event.topic.newest:
-        return (event.topic.name, *event.fields.values())
-    return None
+def _refuse(asked: Asked, why: str) -> None:
+    asked.refuse(f"{asked.topic.name}: {why}")
+    asked.end()

@@ -6,10 +6,11 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import queue
 import signal
 import threading
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 from swarm.bus.bus import Event, Post, WorkDone
@@ -18,6 +19,9 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.stats import Counters
 
 log = logging.getLogger(__name__)
+
+WORK_GRACE_S = 1.5
+"""How long a closed worker waits for the job in hand; the launcher kills a process that takes 5 s to end."""
 
 
 class Service(Protocol):
@@ -51,9 +55,14 @@ class ThreadWorker:
     in a job is raised in the process's own thread, by its next `take`."""
 
     def __init__(self, name: str, inbox: Inbox, clock: Clock) -> None:
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix=name)
         self._inbox = inbox
         self._clock = clock
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        """What is to be run; None ends the thread."""
+        self._closed = False
+        # A daemon, because the interpreter waits at its exit for all other threads, however long a kernel takes.
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
 
     def submit(self, tag: str, job: Callable[[], object], post: Post, model_ns: int = 0) -> None:
         def run() -> None:
@@ -61,15 +70,21 @@ class ThreadWorker:
             result = job()
             post(WorkDone(tag, result, self._clock.now_ns() - began_ns))
 
-        self._pool.submit(run).add_done_callback(self._failed)
+        self._jobs.put(run)
 
-    def _failed(self, future: Future[None]) -> None:
-        error = None if future.cancelled() else future.exception()
-        if error is not None:
-            self._inbox.fail(error)
+    def _work(self) -> None:
+        while (run := self._jobs.get()) is not None and not self._closed:
+            try:
+                run()
+            except BaseException as error:
+                self._inbox.fail(error)
 
     def close(self) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._closed = True
+        self._jobs.put(None)
+        self._thread.join(WORK_GRACE_S)
+        if self._thread.is_alive():
+            log.warning("left the job in hand, which did not end within %g s", WORK_GRACE_S)
 
 
 class Process:
@@ -102,13 +117,18 @@ class Process:
 
     def run(self) -> None:
         """Start the service, loop, stop it. Of ticks that are late one is taken and the others are counted as
-        dropped. Raises what the service or a worker's job raised, after stopping the service.
+        dropped. Raises what the service, a worker's job or any other thread raised, after stopping the service.
 
         Ticks and events share the thread: while events wait, they get at least as long as the last tick took before
         the next one is taken. So a tick that takes its whole period halves its rate and starves nobody.
         """
+        with _failing_with_threads(self._inbox):
+            self._run()
+
+    def _run(self) -> None:
         counters = self._service.counters
         counters.count("ticks_dropped", 0)
+        counters.counts.update(self._inbox.counts)
         self._service.start(self._clock.now_ns())
         gc.freeze()  # terrain and kernels live to the end: a collection in the middle of a tick need not scan them
         due_ns = events_until_ns = self._clock.now_ns()
@@ -125,6 +145,7 @@ class Process:
                     events_until_ns = now_ns + 2 * took_ns
                     counters.observe("tick_ms", took_ns / 1e6)
                     counters.gauge("inbox", float(len(self._inbox)))
+                    counters.counts.update(self._inbox.counts)
                 # Bounded, because a signal handler does not interrupt a wait for a lock.
                 wait_s = min((due_ns - self._clock.now_ns()) / NS_PER_S, 0.5)
                 event = self._inbox.take(wait_s)
@@ -135,7 +156,31 @@ class Process:
             for number in self._signals:
                 signal.signal(number, signal.SIG_IGN)
             self._inbox.close()
+            counters.counts.update(self._inbox.counts)
             self._service.stop(self._clock.now_ns())
+
+
+@contextmanager
+def _failing_with_threads(inbox: Inbox) -> Iterator[None]:
+    """Let the owner of the inbox raise what any thread of this interpreter ends by.
+
+    A thread that dies alone leaves its process deaf: alive to the others, but without subscription, tokens or
+    worker.
+    """
+    before = threading.excepthook
+
+    def died(args: threading.ExceptHookArgs) -> None:
+        if args.exc_type is SystemExit:
+            return
+        name = "?" if args.thread is None else args.thread.name
+        log.critical("thread %s ended by %s: %s", name, args.exc_type.__name__, args.exc_value)
+        inbox.fail(args.exc_value or args.exc_type())
+
+    threading.excepthook = died
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def end_with(parent_gone: Callable[[], object], stop: Callable[[], None], grace_s: float = 3.0) -> None:

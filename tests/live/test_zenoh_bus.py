@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -16,10 +17,15 @@ import zenoh
 from support.bus_behaviour import *  # noqa: F403
 from support.bus_behaviour import Box, answering, asked, pose, run_info
 
-from swarm.bus.bus import Asked, AskEnded, Heard, LinkChanged, Replied
+from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError
+from swarm.liveness import Peer
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process
+from swarm.runtime.stats import Counters
 from swarm.wire.codec import encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.base import Nothing
@@ -252,3 +258,81 @@ def test_a_slow_reader_keeps_the_newest_and_nobody_waits(world):
     world.until(lambda: seen and seen[-1] == 4999, within_s=30)
     assert seen == sorted(seen)
     assert len(seen) < 5000
+
+
+@pytest.mark.parametrize(
+    "token",
+    [
+        *("agent/a9/" + "9" * 5000, "agent/a9/-1", "agent/a9/x", f"agent/a9/{2**62}", "agent/a 9/1"),
+        *("agent/" + "a" * 5000 + "/1", "agent/a9/\u0663", "ag%ent/a9/1"),
+    ],
+)
+def test_a_token_that_names_nobody_is_dropped_and_others_are_still_told(world, token):
+    a, b, stranger, box = world.bus("a"), world.bus("b"), world.bus("stranger"), Box()
+    peer = Peer("agent", "a1", 7)
+    b.watch_alive(box)
+    raised = stranger.session.liveliness().declare_token(f"swarm/alive/{token}")
+    world.until(lambda: b.counts["payloads_dropped"] == 1)
+    a.declare_alive(peer)
+    world.until(lambda: box)
+    a.close()
+    world.until(lambda: len(box) == 2)
+    assert box == [Appeared(peer), Disappeared(peer)]
+    raised.undeclare()
+
+
+class Deaf:
+    """A service one of whose readers cannot post: `listen` says which."""
+
+    def __init__(self, listen: Callable[[], None]) -> None:
+        self.counters = Counters()
+        self.stopped = False
+        self.start = lambda now_ns: listen()
+
+    def handle(self, event: object, now_ns: int) -> None:
+        pass
+
+    def tick(self, now_ns: int) -> None:
+        pass
+
+    def stop(self, now_ns: int) -> None:
+        self.stopped = True
+
+
+@pytest.mark.parametrize("what", ["sample", "batch", "query", "reply", "end", "token", "link"])
+def test_a_reader_that_dies_ends_the_process_with_its_reason(world, what):
+    a, b = world.bus("a"), world.bus("b")
+
+    def broken(event: object) -> None:
+        if what == "reply" and isinstance(event, AskEnded):
+            return
+        raise ZeroDivisionError(f"a bug of ours, {what}")
+
+    listen = {
+        "sample": lambda: b.subscribe(POSE, broken),
+        "batch": lambda: b.subscribe(POSE, broken, together=True),
+        "query": lambda: b.serve(RUN, broken, role="agent", id="b"),
+        "reply": lambda: b.ask(RUN, Nothing(), broken, tag="q"),
+        "end": lambda: b.ask(COST, CostRequest(cells=[1]), broken, tag="q", target="nobody"),
+        "token": lambda: b.watch_alive(broken),
+        "link": lambda: b.watch_links(broken),
+    }[what]
+    a.serve(RUN, answering((run_info("a"), {})), role="agent", id="a")
+    a.declare_alive(Peer("agent", "a1", 7))
+    world.settle()
+    service = Deaf(listen)
+    process = Process(service, Inbox(), MonotonicClock(), tick_hz=20.0)
+
+    def provoke() -> None:
+        time.sleep(0.3)
+        a.publish(POSE, pose(), target="t0")
+        a.ask(RUN, Nothing(), Box(), tag="q")
+        if what == "link":
+            world.cut(b)
+        time.sleep(5.0)
+        process.stop()
+
+    threading.Thread(target=provoke, daemon=True).start()
+    with pytest.raises(ZeroDivisionError, match=f"a bug of ours, {what}"):
+        process.run()
+    assert service.stopped

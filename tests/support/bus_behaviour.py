@@ -328,6 +328,20 @@ def test_answers_may_come_later_than_the_event(world: World):
     assert len(box.of(Replied)) == 1
 
 
+def test_who_serves_learns_how_long_the_asker_waits_and_that_it_has_left(world: World):
+    a, b, kept, box = world.bus("a"), world.bus("b"), Box(), Box()
+    b.serve(RUN, kept, role="agent", id="b")
+    world.settle()
+    a.ask(RUN, Nothing(), box, tag="q", timeout_s=0.7)
+    world.until(lambda: kept)
+    assert kept[0].timeout_s == 0.7
+    assert not kept[0].expired
+    assert 0 <= kept[0].waited_s < 0.7
+    world.until(lambda: box)
+    world.settle()
+    assert kept[0].expired
+
+
 def test_an_answer_after_the_end_is_a_bug_that_raises(world: World):
     a, b, kept = world.bus("a"), world.bus("b"), Box()
     b.serve(RUN, kept, role="agent", id="b")

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 
+from swarm.bus.bus import Event
+from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
-from swarm.runtime.process import end_with
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import Counters
 
 StopWhen = Callable[[], None] | None
 
@@ -38,6 +43,28 @@ def crash_twice(setup: RoleSetup, stop_when: StopWhen) -> None:
     if len(tries.read_text()) <= 2:
         raise ZeroDivisionError("a bug of ours")
     quiet(setup, stop_when)
+
+
+class Idle:
+    """A service without any work, which starts a thread that dies."""
+
+    counters = Counters()
+
+    def start(self, now_ns: int) -> None:
+        threading.Thread(target=lambda: [][1], name="reader").start()
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        pass
+
+    def tick(self, now_ns: int) -> None:
+        pass
+
+    def stop(self, now_ns: int) -> None:
+        pass
+
+
+def lose_a_thread(setup: RoleSetup, stop_when: StopWhen) -> None:
+    Process(Idle(), Inbox(), MonotonicClock(), tick_hz=20.0).run()
 
 
 def refuse(setup: RoleSetup, stop_when: StopWhen) -> None:

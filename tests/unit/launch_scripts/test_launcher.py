@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,9 @@ from pathlib import Path
 import pytest
 from support.processes import eventually, session_of
 
+from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm, WarmUp
+from launch_scripts.launcher.up import _StopAsked
 from launch_scripts.process_table import ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
 from swarm.runtime.role import RoleSetup
@@ -113,6 +116,19 @@ def test_a_process_that_crashes_is_restarted_until_it_runs(swarms: list[LocalSwa
     assert swarm.stop(lambda: time.sleep(0.02)) == []
 
 
+def test_a_process_that_loses_a_thread_ends_with_the_reason_and_is_restarted(
+    swarms: list[LocalSwarm], tmp_path: Path
+) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "lose_a_thread"))
+    swarm.start()
+    (ending,) = endings_within(swarm)
+    assert ending.sentence == "IndexError: list index out of range"
+    assert (ending.exit_code, ending.refused, ending.restart_in_s) == (70, False, 0.2)
+    assert "thread reader ended by IndexError: list index out of range" in (tmp_path / "planner-t0.log").read_text()
+    (again,) = endings_within(swarm)
+    assert again.restart_in_s == 0.4
+
+
 def test_a_process_killed_from_outside_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:
     swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "quiet"))
     swarm.start()
@@ -154,6 +170,91 @@ def test_who_does_not_end_when_asked_is_killed_and_named(
     wait_for_line(tmp_path / "order.txt", "+router-0")
     time.sleep(0.3)
     assert swarm.stop(lambda: time.sleep(0.02)) == ["agent-a0 did not end within 0.5 s and was killed"]
+
+
+def test_who_is_killed_because_the_end_was_asked_for_twice_is_named_with_that_reason(
+    swarms: list[LocalSwarm], tmp_path: Path
+) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
+    swarm.start()
+    wait_for_line(tmp_path / "order.txt", "+router-0")
+    time.sleep(0.3)
+    began_s = time.monotonic()
+    failures = swarm.stop(lambda: time.sleep(0.02), force=lambda: time.monotonic() > began_s + 0.3)
+    assert failures[0] == "agent-a0 was asked twice to end and was killed"
+    assert time.monotonic() - began_s < 2.0
+
+
+class Ended:
+    """A process that has ended, and the last words in its pipe."""
+
+    exitcode, pid = 4, 1
+
+    def __init__(self, refused: bool = True) -> None:
+        self._reason = ExitReason("cannot reach a router", 4, refused)
+
+    def join(self, timeout_s: float) -> None:
+        pass
+
+    def poll(self) -> bool:
+        return True
+
+    def recv(self) -> ExitReason:
+        return self._reason
+
+    def close(self) -> None:
+        pass
+
+
+def refused(swarm: LocalSwarm, ran_s: float, *, restarts: int = 1) -> float | None:
+    """Let the only process end by a refusal after a run; what the launcher waits before the next start."""
+    running = swarm.running[0]
+    running.process = running.pipe = Ended()  # type: ignore[assignment]
+    running.restarts, running.began_s = restarts, time.monotonic() - ran_s
+    (ending,) = swarm.poll()
+    return ending.restart_in_s
+
+
+def test_refusals_far_apart_never_end_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = [1000.0]
+    monkeypatch.setattr("time.monotonic", lambda: now_s[0])
+    swarm = swarm_of([], tmp_path, ("planner", "t0", "quiet"))
+    for _ in range(30):
+        assert refused(swarm, ran_s=80_000.0) == 0.2
+        now_s[0] += 86_400
+    assert refused(swarm, ran_s=80_000.0, restarts=0) == 0.2  # its first life was a good one
+
+
+def test_five_refusals_within_a_minute_and_a_refused_first_start_are_final(tmp_path: Path) -> None:
+    swarm = swarm_of([], tmp_path, ("planner", "t0", "quiet"))
+    assert [refused(swarm, ran_s=1.0) for _ in range(5)] == [0.2, 0.4, 0.8, 1.6, None]
+    swarm = swarm_of([], tmp_path, ("planner", "t0", "quiet"))
+    assert refused(swarm, ran_s=1.0, restarts=0) is None
+
+
+def test_a_monitor_that_is_refused_is_tried_once_a_minute_and_ends_nothing(tmp_path: Path) -> None:
+    swarm = swarm_of([], tmp_path, ("monitor", "0", "quiet"))
+    assert refused(swarm, ran_s=1.0, restarts=0) == 60.0
+    assert [refused(swarm, ran_s=1.0) for _ in range(6)] == [0.4, 0.8, 1.6, 60.0, 60.0, 60.0]
+
+
+def test_a_signal_ends_what_takes_long_before_there_is_a_process(tmp_path: Path) -> None:
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    try:
+        asked = _StopAsked()
+        began_s = time.monotonic()
+        with asked.interrupting():
+            threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGTERM]).start()
+            time.sleep(20.0)
+        assert time.monotonic() - began_s < 5.0
+        assert asked
+        assert not asked.force()
+        os.kill(os.getpid(), signal.SIGINT)  # is only counted from here on
+        assert asked.force()
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from launch_scripts.report import picture
 from launch_scripts.report.hillshade import hillshade
 from launch_scripts.report.plot_style import STYLE
 from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.write_report import write_report
+from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
@@ -77,15 +77,8 @@ def played(scenario: Scenario, ground: tuple[Terrain, NDArray[np.float32]]) -> R
 def test_the_report_has_every_number_that_was_asked_for(
     played: Recorder, ground: tuple[Terrain, NDArray[np.float32]], tmp_path: Path
 ) -> None:
-    returned = write_report(
-        tmp_path,
-        played,
-        ground[0],
-        truth=ground[1],
-        run_id="r1",
-        startup_s=1.5,
-        restarts=2,
-    )
+    returned = make_report(played, ground[0], run_id="r1", startup_s=1.5, restarts=2)
+    write_report(tmp_path, returned, played, ground[0], truth=ground[1])
     report = json.loads((tmp_path / "report.json").read_text())
     assert report == returned
     assert [name for name in ASKED_FOR if report.get(name) is None] == []
@@ -106,7 +99,7 @@ def test_the_report_has_every_number_that_was_asked_for(
 def test_vehicles_are_green_targets_red_and_marks_violet_on_the_map(
     played: Recorder, ground: tuple[Terrain, NDArray[np.float32]], tmp_path: Path
 ) -> None:
-    write_report(tmp_path, played, ground[0])
+    write_report(tmp_path, make_report(played, ground[0]), played, ground[0])
     pixels = (imread(tmp_path / "report.png")[150:1250, 50:1150, :3] * 255).round().reshape(-1, 3)
     for name, colour in {"vehicle": "#009E73", "target": "#D1330A", "lethal mark": "#4a1486"}.items():
         wanted = np.array([int(colour[n : n + 2], 16) for n in (1, 3, 5)])
@@ -141,15 +134,19 @@ def test_no_label_is_cut_off_or_laid_over_another_in_the_head(
 
 def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(scenario: Scenario, tmp_path: Path) -> None:
     terrain = terrain_of_pace(np.ones((1, 1), np.float32))
-    report = write_report(tmp_path, Recorder(scenario, GridSpec(1, 1, 10.0)), terrain)
+    recorder = Recorder(scenario, GridSpec(1, 1, 10.0))
+    report = make_report(recorder, terrain)
+    write_report(tmp_path, report, recorder, terrain)
     assert report["captures"] is None
     assert (tmp_path / "report.png").stat().st_size > 10_000
 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenario, tmp_path: Path) -> None:
     terrain = terrain_of_pace(np.ones((4, 4), np.float32))
+    recorder = Recorder(scenario, terrain.grid)
+    report = make_report(recorder, terrain)
     with pytest.raises(StoreError, match=r"cannot write .*nowhere/report\.json: No such file"):
-        write_report(tmp_path / "nowhere", Recorder(scenario, terrain.grid), terrain)
+        write_report(tmp_path / "nowhere", report, recorder, terrain)
 
 
 def test_a_slope_that_faces_the_sun_is_brighter_than_one_that_does_not() -> None:

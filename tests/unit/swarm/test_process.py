@@ -167,7 +167,7 @@ def test_late_ticks_are_taken_once_and_the_missed_ones_counted():
     process = Process(service, inbox, clock, tick_hz=10)
     process.run()
     assert [tick // 10**6 for tick in service.ticks] == [0, 100, 450, 550]
-    assert service.counters.counts == {"ticks_dropped": 2}
+    assert service.counters.counts == {"ticks_dropped": 2, "events_dropped": 0, "asks_expired": 0}
     assert service.log == ["start", "stop"]
 
 
@@ -237,6 +237,54 @@ def test_a_worker_gives_its_result_back_as_an_event():
     with pytest.raises(ZeroDivisionError):
         inbox.take(5.0)
     worker.close()
+
+
+def test_closing_a_worker_waits_for_its_job_but_not_for_long(monkeypatch):
+    monkeypatch.setattr("swarm.runtime.process.WORK_GRACE_S", 0.2)
+    inbox, began, release = Inbox(), threading.Event(), threading.Event()
+    worker = ThreadWorker("w", inbox, MonotonicClock())
+    worker.submit("kernel", lambda: (began.set(), release.wait(10.0)), inbox.post)
+    worker.submit("forgotten", lambda: 1 // 0, inbox.post)
+    assert began.wait(5.0)
+    began_s = time.monotonic()
+    worker.close()
+    assert 0.1 < time.monotonic() - began_s < 2.0
+    release.set()
+    assert isinstance(inbox.take(5.0), WorkDone)
+    assert inbox.take(0.1) is None
+
+    quick = ThreadWorker("w", inbox, MonotonicClock())
+    began.clear()
+    quick.submit("job", lambda: (began.set(), time.sleep(0.05)), inbox.post)
+    assert began.wait(5.0)
+    quick.close()
+    assert isinstance(inbox.take(0), WorkDone)
+
+
+def test_a_thread_that_dies_ends_the_process_with_its_error(caplog):
+    def on_tick(ticks: list[int]) -> None:
+        if len(ticks) == 2:
+            threading.Thread(target=lambda: [][1], name="reader").start()
+
+    service, before = Recording(on_tick), threading.excepthook
+    with pytest.raises(IndexError, match="out of range"):
+        Process(service, Inbox(), MonotonicClock(), tick_hz=50).run()
+    assert service.log == ["start", "stop"]
+    assert "thread reader ended by IndexError: list index out of range" in caplog.text
+    assert threading.excepthook is before
+
+
+def test_a_thread_that_leaves_by_sys_exit_ends_nothing():
+    def on_tick(ticks: list[int]) -> None:
+        if len(ticks) == 2:
+            threading.Thread(target=sys.exit).start()
+        if len(ticks) == 6:
+            process.stop()
+
+    service = Recording(on_tick)
+    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50)
+    process.run()
+    assert len(service.ticks) == 6
 
 
 def test_the_clock_never_runs_backwards():

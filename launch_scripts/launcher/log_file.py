@@ -1,0 +1,57 @@
+"""Logs of bounded size, with dates, which a full disk cannot harm."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
+
+MAX_BYTES = 16 << 20
+"""A log that is longer is renamed to NAME.1, in the place of the one before, and begun anew."""
+_FORMAT = logging.Formatter(
+    "%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s", datefmt="%Y-%m-%d %H:%M:%S"
+)
+
+
+class LogFile(RotatingFileHandler):
+    """Appends to a file, which is opened at the first line. Lines that cannot be written are counted, and told
+    when there is space again.
+
+    takes_output  standard output and error of this process, that of native libraries included, go to the file too
+    """
+
+    def __init__(self, path: Path, *, takes_output: bool = False) -> None:
+        self._takes_output = takes_output
+        self._lost = 0
+        """Lines that could not be written, since one could."""
+        super().__init__(path, maxBytes=MAX_BYTES, backupCount=1, encoding="utf-8", delay=True)
+
+    def _open(self):  # type: ignore[no-untyped-def]  # the type of the stream is the library's own
+        stream = super()._open()
+        if self._takes_output:
+            os.dup2(stream.fileno(), 1)
+            os.dup2(stream.fileno(), 2)
+        return stream
+
+    def emit(self, record: logging.LogRecord) -> None:
+        before = self._lost
+        super().emit(record)
+        if before and self._lost == before:
+            self._lost = 0
+            told = logging.LogRecord(__name__, logging.WARNING, "", 0, "%d lines were lost", (before,), None)
+            super().emit(told)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (the library calls it so)
+        if isinstance(sys.exc_info()[1], OSError):
+            self._lost += 1
+        else:
+            super().handleError(record)
+
+
+def log_to(path: Path | None, *, takes_output: bool = False) -> None:
+    """Log to a file, or to standard error if there is none."""
+    handler = logging.StreamHandler(sys.stderr) if path is None else LogFile(path, takes_output=takes_output)
+    handler.setFormatter(_FORMAT)
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)

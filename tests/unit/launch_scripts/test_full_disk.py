@@ -1,0 +1,46 @@
+"""A full disk stops nobody but what needs it, and that says so.
+
+/dev/full, which takes no byte, and a limit of the size of files stand for it.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from launch_scripts.simulation.event_log import EventLog
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
+
+
+def test_an_event_log_is_cut_and_the_counting_goes_on() -> None:
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        log = EventLog(0, full)
+        for n in range(10_000):
+            log.delivery(n, "a", "b", "pose", b"x")
+        log.flush()
+    assert log.deliveries == 10_000
+    assert log.cut == "No space left on device"
+
+
+def test_an_event_log_that_fits_is_whole(tmp_path: Path) -> None:
+    with (tmp_path / "events.log").open("w", encoding="utf-8") as out:
+        log = EventLog(0, out)
+        log.event(1, "crash", "a")
+        log.flush()
+    assert log.cut is None
+    assert (tmp_path / "events.log").read_text() == "0.000000001 crash a\n"
+
+
+def test_a_simulation_whose_trace_finds_no_space_prints_its_figures_and_says_so() -> None:
+    command = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
+    command += ["simulate", "jacksboro", "--seconds", "1", "--trace", "/dev/full"]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert told.returncode == 6, told.stderr
+    assert "vehicles that had a route" in told.stdout
+    assert "times real time" in told.stdout
+    assert told.stderr.splitlines()[-1] == "swarm: the event log /dev/full has no end: No space left on device"
+    assert "Traceback" not in told.stderr

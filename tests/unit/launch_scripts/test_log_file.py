@@ -1,0 +1,78 @@
+"""Logs carry dates, are bounded in size, and a full disk harms nobody who writes one."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+WRITER = """
+import logging, os, resource, signal, sys
+from pathlib import Path
+from launch_scripts.launcher import log_file
+
+log_file.MAX_BYTES = int(sys.argv[2])
+log_file.log_to(Path(sys.argv[1]), takes_output=sys.argv[3] == "all")
+log = logging.getLogger("writer")
+exec(sys.argv[4])
+"""
+
+
+def write(
+    path: Path, what: str, *, max_bytes: int = 1 << 20, takes: str = "log"
+) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", WRITER, str(path), str(max_bytes), takes, what]
+    return subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+
+
+def test_a_line_begins_with_its_date(tmp_path: Path) -> None:
+    write(tmp_path / "a.log", "log.info('hello')")
+    line = (tmp_path / "a.log").read_text()
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} INFO    writer: hello\n", line)
+
+
+def test_a_log_and_what_is_printed_into_it_stay_within_twice_the_bound(tmp_path: Path) -> None:
+    """File descriptors 1 and 2, which native libraries write to, follow the file when it is begun anew."""
+    what = "for n in range(1000):\n log.info('line %d', n)\n os.write(1 + n % 2, b'native %d\\n' % n)"
+    told = write(tmp_path / "a.log", what, max_bytes=10_000, takes="all")
+    assert (told.stdout, told.stderr) == ("", "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.log", "a.log.1"]
+    assert all(path.stat().st_size < 10_100 for path in tmp_path.iterdir())
+    text = (tmp_path / "a.log.1").read_text() + (tmp_path / "a.log").read_text()
+    assert re.findall(r"line (\d+)", text)[-5:] == ["995", "996", "997", "998", "999"]
+    assert re.findall(r"native (\d+)", text)[-5:] == ["995", "996", "997", "998", "999"]
+
+
+def test_a_later_life_of_the_process_appends(tmp_path: Path) -> None:
+    for life in ("first", "second"):
+        write(tmp_path / "a.log", f"log.info('{life}')")
+    assert [line.split()[-1] for line in (tmp_path / "a.log").read_text().splitlines()] == ["first", "second"]
+
+
+def test_a_full_disk_stops_no_writer_and_is_told_when_there_is_space_again(tmp_path: Path) -> None:
+    """A limit of the file's size stands for the full disk: a write beyond it fails with an OSError, too."""
+    what = """
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+log.info("before")
+resource.setrlimit(resource.RLIMIT_FSIZE, (200, hard))
+for n in range(500): log.info("meanwhile %d", n)
+resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+log.info("after")
+"""
+    told = write(tmp_path / "a.log", what)
+    assert told.stderr == ""
+    text = (tmp_path / "a.log").read_text()
+    lost = re.search(r"(\d+) lines were lost", text)
+    assert lost is not None
+    assert 400 < int(lost.group(1)) <= 500
+    assert "before\n" in text
+    assert "after\n" in text
+
+
+def test_a_log_that_cannot_be_opened_is_opened_as_soon_as_it_can(tmp_path: Path) -> None:
+    write(tmp_path / "later" / "a.log", "log.info('lost')\nPath(sys.argv[1]).parent.mkdir()\nlog.info('kept')")
+    text = (tmp_path / "later" / "a.log").read_text()
+    assert "kept" in text
+    assert "1 lines were lost" in text

@@ -1,0 +1,169 @@
+"""An inbox under overload: bounded, fair, and its answers go to those who still wait."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Event, Heard, LinkChanged, Replied, WorkDone
+from swarm.liveness import Peer
+from swarm.runtime.inbox import CAPACITY, Inbox
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.processes import Note
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.topics import COST, NOTE, POSE, ROUTE, RUN, Topic
+
+
+class Time:
+    now_s = 0.0
+
+
+@dataclass(eq=False)
+class Asker:
+    """One that asks at a time and leaves when its timeout is over; writes down what it is told, and when."""
+
+    time: Time
+    timeout_s: float = 2.0
+    topic: Topic = COST
+    refusals: list[str] = field(default_factory=list)
+    ended_s: float | None = None
+
+    def __post_init__(self) -> None:
+        self.asked_s = self.time.now_s
+        self.question = Asked(self.topic, {}, Nothing(), self)
+
+    def waited_s(self) -> float:
+        return self.time.now_s - self.asked_s
+
+    def answer(self, message: object, fields: object) -> None:
+        raise AssertionError("nothing is answered here")
+
+    def refuse(self, reason: str) -> None:
+        self.refusals.append(reason)
+
+    def end(self) -> None:
+        self.ended_s = self.time.now_s
+
+
+def note(n: int) -> Heard:
+    return Heard(NOTE, {"role": "agent", "id": "a0"}, Note(role="agent", id="a0", stamp_ns=n, kind="k", text=""))
+
+
+def pose(target: str, seq: int) -> Heard:
+    message = TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
+    return Heard(POSE, {"target": target}, message)
+
+
+def drain(inbox: Inbox) -> list[Event]:
+    taken = []
+    while (event := inbox.take(0)) is not None:
+        taken.append(event)
+    return taken
+
+
+def test_of_a_topics_samples_the_oldest_go_beyond_the_capacity_and_no_other_topics():
+    inbox = Inbox()
+    inbox.post(pose("t0", 1))
+    for n in range(CAPACITY + 100):
+        inbox.post(note(n))
+    assert len(inbox) == CAPACITY + 1
+    assert inbox.counts["events_dropped"] == 100
+    assert drain(inbox) == [pose("t0", 1), *(note(n) for n in range(100, CAPACITY + 100))]
+
+
+def test_the_keys_of_which_the_newest_is_kept_are_bounded_too():
+    inbox = Inbox()
+    for seq in range(2):
+        for n in range(CAPACITY):
+            inbox.post(pose(f"t{n}", seq))
+    assert inbox.counts["events_dropped"] == 0
+    for n in range(5):
+        inbox.post(pose(f"more{n}", 1))
+    assert len(inbox) == CAPACITY
+    assert inbox.counts["events_dropped"] == 5
+    assert {event.message.seq for event in drain(inbox)} == {1}
+
+
+def test_replies_tokens_links_and_results_are_never_dropped():
+    peer = Peer("agent", "a0", 7)
+    kept: list[Event] = [
+        *(Replied("q", RUN, {}, Nothing()) for _ in range(CAPACITY)), AskEnded("q", RUN, CAPACITY, None),
+        *(Appeared(peer), Disappeared(peer), LinkChanged(up=True), WorkDone("grow", 1, 1)),
+    ]  # fmt: skip
+    inbox = Inbox()
+    for event in kept:
+        inbox.post(event)
+    for n in range(2 * CAPACITY):
+        inbox.post(note(n))
+    assert drain(inbox)[: len(kept)] == kept
+
+
+def test_a_question_too_many_refuses_the_oldest_in_words():
+    inbox, time = Inbox(), Time()
+    askers = [Asker(time) for _ in range(CAPACITY + 1)]
+    for asker in askers:
+        inbox.post(asker.question)
+    assert askers[0].refusals == ["cost: too many questions wait"]
+    assert askers[0].ended_s is not None
+    assert inbox.counts == {"events_dropped": 1, "asks_expired": 0}
+    assert drain(inbox) == [asker.question for asker in askers[1:]]
+
+
+def test_a_question_whose_asker_has_left_is_refused_and_never_taken():
+    inbox, time = Inbox(), Time()
+    short, long = Asker(time, timeout_s=1.0), Asker(time, timeout_s=5.0)
+    newest_but_short = Asker(time, timeout_s=1.5)
+    for asker in (short, long, newest_but_short):
+        inbox.post(asker.question)
+    time.now_s = 3.0
+    assert drain(inbox) == [long.question]
+    assert [asker.ended_s for asker in (short, long, newest_but_short)] == [3.0, None, 3.0]
+    assert short.refusals == ["cost: no answer within the 1 s of its asker: too many questions"]
+    assert inbox.counts == {"events_dropped": 0, "asks_expired": 2}
+    assert len(inbox) == 0
+
+
+def test_without_overload_questions_and_samples_come_in_the_order_of_their_arrival():
+    inbox, time = Inbox(), Time()
+    events = [Asker(time).question, note(1), Asker(time, topic=ROUTE).question, note(2), Asker(time).question]
+    for event in events:
+        inbox.post(event)
+    time.now_s = 0.4
+    assert drain(inbox) == events
+
+
+@pytest.mark.parametrize("load", [2.0, 2.5, 10.0])
+def test_under_overload_what_is_answered_goes_to_those_who_still_wait(load):
+    """Ten seconds, 5 ms for each answer: 200 a second are answered, all but the first few at once."""
+    inbox, time = Inbox(), Time()
+    askers: list[Asker] = []
+    waits: list[float] = []
+    while time.now_s < 10.0:
+        while len(askers) < time.now_s * 200 * load:
+            askers.append(Asker(time))
+            inbox.post(askers[-1].question)
+        event = inbox.take(0)
+        time.now_s += 0.005
+        if event is not None:
+            waits.append(event.waited_s)
+    assert len(waits) > 1990
+    in_time = sum(waited_s < 1.9 for waited_s in waits)
+    assert in_time >= 0.9 * len(waits)
+    assert sorted(waits)[len(waits) // 2] < 0.1
+    assert inbox.counts["asks_expired"] + inbox.counts["events_dropped"] + len(inbox) == len(askers) - len(waits)
+    assert len(inbox) <= 2.1 * 200 * load  # no question stays longer than its asker
+
+
+def test_while_questions_come_late_samples_and_other_questions_take_turns_with_them():
+    inbox, time = Inbox(), Time()
+    for _ in range(100):
+        inbox.post(Asker(time).question)
+    time.now_s = 1.0
+    route = Asker(time, topic=ROUTE)
+    inbox.post(route.question)
+    for n in range(3):
+        inbox.post(note(n))
+    taken = [inbox.take(0) for _ in range(10)]
+    assert route.question in taken[:3]
+    assert [event for event in taken if isinstance(event, Heard)] == [note(n) for n in range(3)]
