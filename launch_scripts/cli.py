@@ -92,6 +92,10 @@ def up(
         str | None,
         typer.Option(help="Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here."),
     ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(help="Where the router listens too, for other machines, such as tls/0.0.0.0:7448."),
+    ] = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Start only this role; may be given several times.")
     ] = None,
@@ -108,7 +112,7 @@ def up(
 
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
-    _up(scenario, run, tls, connect=connect, namespace=namespace, only=only, run_id=run_id)
+    _up(scenario, run, tls, connect=connect, listen=listen, namespace=namespace, only=only, run_id=run_id)
 
 
 def _up(
@@ -117,6 +121,7 @@ def _up(
     tls: Tls | None = None,
     *,
     connect: str | None = None,
+    listen: str | None = None,
     namespace: str | None = None,
     only: list[str] | None = None,
     run_id: str | None = None,
@@ -128,11 +133,16 @@ def _up(
     from launch_scripts.process_table import ROLES
     from swarm.errors import ConfigError
 
-    scenario = options.with_network(
-        options.find_scenario(name), connect=connect, namespace=namespace, tls=None if tls is None else tls.config()
-    )
+    scenario = options.find_scenario(name)
     if run.port is not None:
         scenario = options.with_port(scenario, run.port)
+    scenario = options.with_network(
+        scenario,
+        connect=connect,
+        also_listen=listen,
+        namespace=namespace,
+        tls=None if tls is None else tls.config(),
+    )
     monitor = msgspec.structs.replace(scenario.monitor, live=scenario.monitor.live and not run.no_live)
     scenario = msgspec.structs.replace(
         scenario,

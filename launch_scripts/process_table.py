@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from swarm.config.scenario import Scenario, plan_agents
+import msgspec
+
+from swarm.config.scenario import Scenario, ids_of, plan_agents
 
 Restart = Literal["always", "never"]
 
@@ -58,3 +60,32 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES) -> list[Pro
         "agent": [plan.id for plan in plan_agents(scenario)],
     }
     return [ProcessSpec(role, id, ENTRIES[role]) for role in ROLES if role in roles for id in ids[role]]
+
+
+LAUNCHER = "launcher"
+OPERATOR = "operator.0"
+"""The name in the certificate of a launcher, and of the tools beside it."""
+
+
+def certificate_name(scenario: Scenario, role: str, id: str) -> str:
+    """The name in a process's certificate, by which a router knows it. An agent's contains its group, as what it
+    writes does."""
+    if role == LAUNCHER:
+        return OPERATOR
+    groups = {plan.id: plan.group.name for plan in plan_agents(scenario)} if role == "agent" else {}
+    return f"{role}.{groups[id]}.{id}" if id in groups else f"{role}.{id}"
+
+
+def certificate_names(scenario: Scenario) -> list[str]:
+    """Every name that may take part in a run: its processes, the trackers of external targets, an operator, and
+    those that the scenario admits beside them."""
+    names = [certificate_name(scenario, spec.role, spec.id) for spec in processes_of(scenario)]
+    external = [target for target in scenario.targets if target.walk == "external"]
+    trackers = [f"tracker.{id}" for target in external for id in ids_of(target)]
+    return list(dict.fromkeys([*names, *trackers, OPERATOR, *scenario.network.admit]))
+
+
+def admitting_all(scenario: Scenario) -> Scenario:
+    """The scenario whose router admits every name that may take part."""
+    network = msgspec.structs.replace(scenario.network, admit=tuple(certificate_names(scenario)))
+    return msgspec.structs.replace(scenario, network=network)

@@ -11,6 +11,9 @@ import typer
 from launch_scripts.commands.shared_options import Namespace, Tls, spread
 from swarm.errors import ConfigError, StoreError
 
+_THIS_MACHINE = ("localhost", "127.0.0.1")
+"""Hosts in every router's certificate, for the processes beside it."""
+
 app = typer.Typer(help="Certificates and configurations for a swarm on several machines.", no_args_is_help=True)
 
 
@@ -18,35 +21,52 @@ app = typer.Typer(help="Certificates and configurations for a swarm on several m
 def certs(
     folder: Annotated[Path, typer.Argument(help="Folder of the authority and of all certificates.")],
     names: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(
-            metavar="NAME[=HOST,...]...",
+            metavar="[NAME[=HOST,...]...]",
             help="Names to make certificates for. A router needs the hosts that others connect to.",
         ),
-    ],
+    ] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="Make those that its processes lack, too, and number anew what it revokes."),
+    ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="Days until they expire.")] = 365,
-    renew: Annotated[bool, typer.Option(help="Replace existing certificates.")] = False,
+    renew: Annotated[bool, typer.Option(help="Replace existing certificates of the names given.")] = False,
 ) -> None:
     """Make certificates for mutual TLS, signed by the folder's own authority, which is made if missing.
 
-    swarm deploy certs certs router=10.0.0.1,base.local car1 car2
+    swarm deploy certs certs --scenario my.toml router.0=10.0.0.1,base.local
 
-    On the router's machine, with the three files as --tls-ca, --tls-cert and --tls-key:
+    makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its name
+    allows. operator.0 is for the launcher and for tools. On the router's machine, and on another:
 
-    swarm router my.toml --listen tls/0.0.0.0:7447 --tls-ca ca.pem --tls-cert router.pem --tls-key router.key
+    swarm router my.toml --listen tls/0.0.0.0:7447 --tls-ca certs/ca.pem --tls-cert certs --tls-key certs
 
-    On another:
+    swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert certs --tls-key certs
 
-    swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert car1.pem --tls-key car1.key
-
-    Copy ca.pem and its own two files to each machine. ca.key stays where it is: who has it can let anybody in.
+    Copy ca.pem and the two files of a name to where it runs. ca.key stays here: who has it can let anybody in.
     """
     from launch_scripts.deploy.certificates import issue
+    from launch_scripts.launcher.options import find_scenario
+    from launch_scripts.process_table import certificate_names
+    from swarm.bus.access_control import ROUTER, bearer, common_name
+    from swarm.config.scenario import Scenario
 
-    for each in names:
-        name, _, hosts = each.partition("=")
-        path = issue(folder, name, [host for host in hosts.split(",") if host], days, renew=renew)
-        print(f"{path}, {path.with_suffix('.key')}: good for {days} days")
+    chosen = Scenario() if scenario is None else find_scenario(scenario)
+    given = {name: hosts for name, _, hosts in (each.partition("=") for each in names or ())}
+    wanted = [*given, *(() if scenario is None else certificate_names(chosen))]
+    for name in wanted:
+        bearer(name)
+    for name in dict.fromkeys(wanted):
+        if name not in given and (folder / f"{name}.pem").exists():
+            continue
+        hosts = [host for host in given.get(name, "").split(",") if host]
+        if bearer(name).role == ROUTER:
+            hosts += _THIS_MACHINE
+        called = common_name(name, chosen.network.revoked)
+        path = issue(folder, name, hosts, days, renew=renew and name in given, called=called)
+        print(f"{path}, {path.with_suffix('.key')}: {called}, good for {days} days")
     print(f"authority: {folder / 'ca.pem'}; keep {folder / 'ca.key'} to yourself")
 
 
@@ -60,15 +80,8 @@ def zenohd(
     ] = None,
     peer: Annotated[list[str] | None, typer.Option(help="Another router to connect to.")] = None,
     namespace: Namespace = None,
-    trust: Annotated[
-        list[str] | None,
-        typer.Option(help="Name of a certificate which allows everything in the namespace."),
-    ] = None,
-    agent: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Agent, as GROUP.ID (all.a0), with a certificate of that name: writes only what is its own."
-        ),
+    scenario: Annotated[
+        str | None, typer.Option(help="Whose processes may take part: needed with certificates.")
     ] = None,
     plugins: Annotated[
         Path | None, typer.Option(help="Folder with libzenoh_plugin_storage_manager.so, to store marks, too.")
@@ -84,19 +97,24 @@ def zenohd(
     import msgspec
 
     from launch_scripts.deploy.zenohd import zenohd_config
-    from launch_scripts.launcher.options import with_network
+    from launch_scripts.launcher.options import find_scenario, own_certificate, with_network
+    from launch_scripts.process_table import admitting_all
     from swarm.config.load import check_endpoint
     from swarm.config.scenario import Scenario
 
-    if (trust or agent) and tls.tls_ca is None:
-        raise ConfigError(
-            "--trust and --agent go by the names in certificates: give --tls-ca, --tls-cert, --tls-key"
-        )
-    network = with_network(Scenario(), namespace=namespace, tls=tls.config()).network
+    if scenario is None and tls.tls_ca is not None:
+        raise ConfigError("certificates are for access control, by the names of a scenario's processes: --scenario")
+    chosen = Scenario() if scenario is None else admitting_all(find_scenario(scenario))
+    network = with_network(chosen, namespace=namespace, tls=tls.config()).network
     for option, endpoints in (("--listen", listen), ("--peer", peer)):
         for endpoint in endpoints or ():
             check_endpoint(endpoint, network.tls is not None, option)
-    network = msgspec.structs.replace(network, listen=tuple(listen or network.listen), peers=tuple(peer or ()))
+    network = msgspec.structs.replace(
+        network,
+        listen=tuple(listen or network.listen),
+        peers=tuple(peer or network.peers),
+        tls=own_certificate(network.tls, "router.0"),
+    )
     if network.tls is not None:  # zenohd may run elsewhere than here
         files = (network.tls.ca, network.tls.certificate, network.tls.key)
         ca, certificate, key = (str(Path(file).resolve()) for file in files)
@@ -104,8 +122,6 @@ def zenohd(
         network = msgspec.structs.replace(network, tls=absolute)
     config = zenohd_config(
         network,
-        trusted=trust or (),
-        agents=agent or (),
         plugins=None if plugins is None else str(plugins.resolve()),
         volume=volume,
     )

@@ -37,10 +37,12 @@ class Where:
     def network(self, tls: Tls) -> NetworkConfig:
         import msgspec
 
-        from launch_scripts.launcher.options import with_network
+        from launch_scripts.launcher.options import as_process, with_network
+        from launch_scripts.process_table import LAUNCHER
         from swarm.config.scenario import Scenario
 
-        chosen = with_network(Scenario(), connect=self.connect, namespace=self.namespace, tls=tls.config()).network
+        chosen = with_network(Scenario(), connect=self.connect, namespace=self.namespace, tls=tls.config())
+        chosen = as_process(chosen, LAUNCHER, "0").network
         return msgspec.structs.replace(chosen, connect_timeout_s=_CONNECT_S)
 
     def __str__(self) -> str:

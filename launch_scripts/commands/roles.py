@@ -45,7 +45,10 @@ def router(
     tls: Tls,
     listen: Annotated[str | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447.")] = None,
 ) -> None:
-    """Pass everybody's messages on: the process that all others connect to. --connect names another router."""
+    """Pass everybody's messages on: the process that all others connect to. --connect names another router.
+
+    With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
+    """
     _run("router", "0", part, tls, listen=listen)
 
 
@@ -139,6 +142,7 @@ def _run(role: str, id: str, part: Part, tls: Tls, *, listen: str | None = None,
         _check_id(id)
     elif id not in ids:
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
+    scenario = options.as_process(scenario, role, id)
     log_to(None)
     found: list[RunInfo] = []
     run_id = part.run_id

@@ -60,11 +60,14 @@ def authority(folder: Path) -> Authority:
     return made
 
 
-def issue(folder: Path, name: str, hosts: Sequence[str], days: int, *, renew: bool = False) -> Path:
+def issue(
+    folder: Path, name: str, hosts: Sequence[str], days: int, *, renew: bool = False, called: str | None = None
+) -> Path:
     """Writes `NAME.pem`, and `NAME.key` readable by its owner only. Returns the certificate's path.
 
-    name   what access control knows its bearer by (the common name): a machine, or an agent such as all.a0
-    hosts  names and addresses under which others connect to it; none for those that only connect
+    name    of the files, and if `called` is None what access control knows its bearer by: keeper.0, agent.all.a0
+    hosts   names and addresses under which others connect to it; none for those that only connect
+    called  the common name, where it is another: agent.all.a0~2 after the first was revoked
     Raises ConfigError on a name that cannot be one, StoreError where files cannot be written or are there already.
     """
     try:
@@ -78,7 +81,7 @@ def issue(folder: Path, name: str, hosts: Sequence[str], days: int, *, renew: bo
         raise StoreError(f"{path} is there already; --renew replaces it")
     signer = authority(folder)
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, called or name)])
     usages = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
     public_key = signer.key.public_key()
     certificate = (

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 
+from launch_scripts.process_table import certificate_name
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
@@ -40,10 +41,14 @@ def with_network(
     *,
     connect: str | None = None,
     listen: str | None = None,
+    also_listen: str | None = None,
     namespace: str | None = None,
     tls: TlsConfig | None = None,
 ) -> Scenario:
-    """The scenario with other endpoints. Raises ConfigError where they would leave the machine unencrypted."""
+    """The scenario with other endpoints. Raises ConfigError where they would leave the machine unencrypted.
+
+    also_listen  an endpoint of the router beside those of the scenario
+    """
     network = scenario.network
     tls = tls or network.tls
     changes: dict[str, object] = {"tls": tls}
@@ -51,6 +56,9 @@ def with_network(
         if endpoint is not None:
             check_endpoint(endpoint, tls is not None, option)
             changes[option[2:]] = (endpoint,)
+    if also_listen is not None:
+        check_endpoint(also_listen, tls is not None, "--listen")
+        changes["listen"] = (*network.listen, also_listen)
     if namespace is not None:
         changes["namespace"] = namespace
     return msgspec.structs.replace(scenario, network=_replaced(network, changes))
@@ -71,9 +79,29 @@ def tls_of(ca: str | None, certificate: str | None, key: str | None) -> TlsConfi
     if ca is None or certificate is None or key is None:
         raise ConfigError("--tls-ca, --tls-cert and --tls-key belong together: give all three")
     for option, file in (("--tls-ca", ca), ("--tls-cert", certificate), ("--tls-key", key)):
-        if not Path(file).is_file():
+        if not Path(file).is_file() and (file == ca or not Path(file).is_dir()):
             raise ConfigError(f"{option}: no file {file}")
     return TlsConfig(ca=ca, certificate=certificate, key=key)
+
+
+def as_process(scenario: Scenario, role: str, id: str) -> Scenario:
+    """The scenario as one process needs it: with its own certificate, where `network.tls` names a folder of them.
+    Raises ConfigError where the folder has none for it."""
+    tls = own_certificate(scenario.network.tls, certificate_name(scenario, role, id))
+    return msgspec.structs.replace(scenario, network=msgspec.structs.replace(scenario.network, tls=tls))
+
+
+def own_certificate(tls: TlsConfig | None, name: str) -> TlsConfig | None:
+    """`tls` with the files of a name in place of folders. Raises ConfigError where there are none."""
+    if tls is None:
+        return None
+    files = []
+    for file, suffix in ((Path(tls.certificate), "pem"), (Path(tls.key), "key")):
+        own = file / f"{name}.{suffix}" if file.is_dir() else file
+        if not own.is_file():
+            raise ConfigError(f"no file {own}, which {name} needs: `swarm deploy certs` makes it")
+        files.append(str(own))
+    return TlsConfig(ca=tls.ca, certificate=files[0], key=files[1])
 
 
 def with_port(scenario: Scenario, port: int) -> Scenario:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from launch_scripts.process_table import admitting_all
 from swarm.bus.bus import Bus, Event, Post
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -45,7 +46,7 @@ class RouterService:
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
     clock, inbox = MonotonicClock(), Inbox()
-    with open_bus(setup.scenario.network, mode="router") as bus:
+    with open_bus(admitting_all(setup.scenario).network, mode="router") as bus:
         service = RouterService(Peer(setup.role, setup.id, setup.incarnation), bus, inbox.post)
         process = Process(service, inbox, clock, tick_hz=2.0)
         process.stop_on_signals()

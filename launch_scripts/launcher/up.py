@@ -15,12 +15,19 @@ from pathlib import Path
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.launcher.log_file import log_to
-from launch_scripts.launcher.options import check_ports, common_run_id, listening, make_run_dir, new_run_id
+from launch_scripts.launcher.options import (
+    as_process,
+    check_ports,
+    common_run_id,
+    listening,
+    make_run_dir,
+    new_run_id,
+)
 from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
-from launch_scripts.process_table import ROLES, ProcessSpec, processes_of
+from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
@@ -124,7 +131,7 @@ def _run_id(options: UpOptions) -> str:
     if set(ROLES[1:]) <= set(options.roles):
         return new_run_id()
     if options.joins:
-        with open_bus(options.scenario.network) as bus:
+        with open_bus(as_process(options.scenario, LAUNCHER, "0").network) as bus:
             found = ask_run(bus)
         if found:
             return found[0].run_id
@@ -136,13 +143,15 @@ class _Run:
 
     def __init__(self, options: UpOptions, run_id: str, run_dir: Path) -> None:
         self._options = options
-        self._scenario = options.scenario
+        self._scenario = as_process(options.scenario, LAUNCHER, "0")
         self._run_dir = run_dir
         self._run_id = run_id
         self._started_ns = time.time_ns()
         self._terminal = Terminal(options.as_json, options.plain)
         self._stop_asked = _StopAsked()
         specs = list(options.table or processes_of(self._scenario, options.roles))
+        for spec in specs:
+            self._setup_of(spec)  # a certificate that is missing is told of before anything starts
         self._swarm = LocalSwarm(specs, self._setup_of, run_dir)
         self._startup_s: float | None = None
 
@@ -201,14 +210,14 @@ class _Run:
                 found = ask_run(bus)
             with progress() as tell:
                 fetch_if_missing(self._scenario, self._run_dir, found, roles=self._options.roles, progress=tell)
-            setup = self._setup_of(ProcessSpec("launcher", "0", ""))
+            setup = self._setup_of(ProcessSpec(LAUNCHER, "0", ""))
             terrain = load_terrain(setup)
             return terrain, load_truth(setup, terrain)
         return prepare(self._run_dir, self._scenario)
 
     def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
         return RoleSetup(
-            scenario=self._scenario,
+            scenario=as_process(self._options.scenario, spec.role, spec.id),
             run_id=self._run_id,
             role=spec.role,
             id=spec.id,
@@ -241,7 +250,7 @@ class _Run:
         if not self._options.joins:
             return
         found = ask_run(bus)
-        mine = self._setup_of(ProcessSpec("launcher", "0", "")).info(self._terrain.grid, self._terrain.digest)
+        mine = self._setup_of(ProcessSpec(LAUNCHER, "0", "")).info(self._terrain.grid, self._terrain.digest)
         check_belongs(mine, found)
         for running in self._swarm.running:
             check_vacant(found, running.spec.role, running.spec.id)

@@ -14,6 +14,7 @@ import msgspec
 
 from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
 from swarm.grid import REGION_TILES, TILE_CELLS
+from swarm.wire.access import OPERATOR, Grant
 from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES
 from swarm.wire.messages.base import WIRE_VERSION, Message
 from swarm.wire.messages.vehicles import VehicleState
@@ -44,7 +45,7 @@ Any Zenoh session may ask, with parameters instead of a payload and JSON as the 
 
     session.get("swarm/target/t3/route?row=40;col=200;format=json")
     session.get("swarm/target/*/cost?row=40;col=200;format=json")
-    session.get("swarm/run/**?format=json")
+    session.get("swarm/run/*/*?format=json")
 
 A query says how long its asker waits, in seconds, by a parameter such as `?{TIMEOUT_PARAMETER}=2.5`; without it
 {USUAL_TIMEOUT_S:g} are assumed, and never more than {LONGEST_TIMEOUT_S:g}. The time counts from the arrival at the
@@ -54,7 +55,7 @@ process that answers, by its own clock. A query that was not begun by then is re
 
 def document() -> str:
     """The page."""
-    return "\n".join([_INTRO, *_keys(), *_messages(), *_enums()])
+    return "\n".join([_INTRO, *_keys(), *_access(), *_messages(), *_enums()])
 
 
 def _keys() -> Iterator[str]:
@@ -69,6 +70,28 @@ def _keys() -> Iterator[str]:
         )
     yield f"| `{ALIVE_KEY}` | liveliness token | | while the process lives | | who is there |"
     yield ""
+
+
+def _access() -> Iterator[str]:
+    yield "## Who may do what\n"
+    yield (
+        "A router with certificates grants this and nothing else ([several machines](deploy.md)). In brackets "
+        "stand fields of the key that must be the process's own: its role, its id, or as an author `GROUP.ID.` "
+        "and its incarnation (`ID.` for a keeper). Nobody may delete. A router may do everything, as it passes on "
+        f"what others say. The role `{OPERATOR}` is that of people's tools and of the launcher.\n"
+    )
+    yield "| key | put | serve | ask | hear |"
+    yield "|---|---|---|---|---|"
+    for topic in TOPICS:
+        access = topic.access
+        columns = (access.put, access.serve, access.ask, access.hear)
+        yield f"| `{topic.key}` | {' | '.join(_granted(grants) for grants in columns)} |"
+    yield f"| `{ALIVE_KEY}` | each its own token | | | all |"
+    yield ""
+
+
+def _granted(grants: tuple[Grant, ...]) -> str:
+    return ", ".join(grant.role + (f" ({', '.join(grant.own)})" if grant.own else "") for grant in grants)
 
 
 def _how(topic: Topic) -> str:

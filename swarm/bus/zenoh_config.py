@@ -7,6 +7,7 @@ from typing import Any
 
 import zenoh
 
+from swarm.bus.access_control import access_control
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.wire.codec import MAX_PAYLOAD_BYTES
 
@@ -14,7 +15,8 @@ from swarm.wire.codec import MAX_PAYLOAD_BYTES
 def session_config(network: NetworkConfig, mode: str) -> zenoh.Config:
     """What `zenoh.open` is given. Nothing is discovered: sessions meet at the endpoints of the scenario only.
 
-    mode  "client" or "router"
+    mode  "client" or "router"; a router with certificates lets `network.admit` take part, and nobody else
+    Raises ConfigError on a name that no process can have.
     """
     settings: dict[str, Any] = {
         "mode": mode,
@@ -33,6 +35,8 @@ def session_config(network: NetworkConfig, mode: str) -> zenoh.Config:
         settings["listen/exit_on_failure"] = True
         settings["connect/endpoints"] = list(network.peers)
         settings["connect/exit_on_failure"] = False
+        if network.tls is not None:
+            settings["access_control"] = access_control(network.namespace, network.admit, network.revoked)
     else:
         settings["listen/endpoints"] = []
         settings["connect/endpoints"] = list(network.connect)

@@ -18,6 +18,8 @@ Count = Annotated[int, Meta(ge=1, le=100_000)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
 GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
+ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}$")]
+CommonName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}(~[0-9]{1,4})?$")]
 Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Point = tuple[Metres, Metres]
 
@@ -248,8 +250,8 @@ class TlsConfig(Section, frozen=True, kw_only=True):
     """Mutual TLS: files in PEM, relative to the scenario.
 
     ca           certificate of the authority that signed all others
-    certificate  certificate of this process
-    key          private key of this process
+    certificate  certificate of this process, or the folder in which each process finds the one of its name
+    key          private key of this process, or the same folder
     """
 
     ca: str
@@ -267,6 +269,9 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
     lease_s            a peer that is silent for this long counts as gone
     connect_timeout_s  a process that reaches no router for this long ends
     tls                certificates, for endpoints beyond loopback
+    admit              names in certificates that a router lets take part, beside those of the scenario's processes:
+                       router.north, keeper.east, operator.anna
+    revoked            names in certificates that a router denies everything
     """
 
     namespace: Name = "swarm"
@@ -276,6 +281,8 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
     lease_s: Annotated[float, Meta(ge=0.5, le=60)] = 2.0
     connect_timeout_s: Positive = 10.0
     tls: TlsConfig | None = None
+    admit: tuple[ProcessName, ...] = ()
+    revoked: tuple[CommonName, ...] = ()
 
 
 class MonitorConfig(Section, frozen=True, kw_only=True):

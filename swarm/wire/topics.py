@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from swarm.errors import ProtocolError
+from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, access
 from swarm.wire.codec import prime
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
@@ -42,6 +43,7 @@ class Topic:
     message    what is put, or what a query is answered with
     what       its meaning, for `docs/wire.md`
     rate       how often it is put or asked, for `docs/wire.md`
+    access     which roles may put, serve, ask and hear it
     request    for a queryable: what is asked; None for a topic that is only published
     bulk       for a queryable: a message that carries many values, if the request asks for it
     published  whether values are put, not only answered
@@ -55,6 +57,7 @@ class Topic:
     message: type[Message]
     what: str
     rate: str
+    access: Access
     request: type[Message] | None = None
     bulk: type[Message] | None = None
     published: bool = True
@@ -130,74 +133,103 @@ def _chunk(value: str | int) -> str:
     return chunk
 
 
+_REPLICAS = "agent keeper planner monitor"
+"""Roles which hold a replica of the map."""
+
 RUN = Topic(
     "run", "run/{role}/{id}", RunInfo, "which run and terrain a process belongs to", "asked at every start",
+    access(serve=MEMBERS_OWN, ask=MEMBERS),
     request=Nothing, published=False,
 )  # fmt: skip
 MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", MarkSet,
     "an author's whole set for a tile; the author and the keeper answer for it",
-    "on change, at most 10 Hz a tile", request=MarksRequest, bulk=MarkSets, buffer=8192,
+    "on change, at most 10 Hz a tile",
+    access(put="agent:author keeper planner", serve="agent:author keeper", ask=_REPLICAS, hear=_REPLICAS),
+    request=MarksRequest, bulk=MarkSets, buffer=8192,
 )  # fmt: skip
 DIGEST = Topic(
     "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",
+    access(put="agent:author keeper:author", hear=_REPLICAS),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 BASE_MAP = Topic(
     "base-map", "base/{keeper}", BaseMap, "what a keeper has of the terrain, for those who lack its files",
-    "asked at a start", request=Nothing, published=False, priority=Priority.BACKGROUND,
+    "asked at a start",
+    access(serve="keeper:keeper", ask=MEMBERS),
+    request=Nothing, published=False, priority=Priority.BACKGROUND,
 )  # fmt: skip
 BASE_TILES = Topic(
     "base-tiles", "base/{keeper}/tiles", BaseMapTile, "the terrain itself, by layer and region",
-    "asked at a start", request=BaseMapRequest, published=False, priority=Priority.BACKGROUND,
+    "asked at a start",
+    access(serve="keeper:keeper", ask=MEMBERS),
+    request=BaseMapRequest, published=False, priority=Priority.BACKGROUND,
 )  # fmt: skip
 FLEET = Topic(
     "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
+    access(put="agent:author", hear="agent planner targets monitor"),
 )  # fmt: skip
 RESERVATIONS = Topic(
     "reservations", "reservations/{agent}", Reservations,
     "which cells vehicles hold and request; an agent answers with its own and the newest of those that died",
-    "every tick, on change", request=Nothing, priority=Priority.INTERACTIVE,
+    "every tick, on change",
+    access(put="agent:agent", serve="agent", ask="agent", hear="agent"),
+    request=Nothing, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TERRITORY = Topic(
     "territory", "territory/{agent}", TerritoryReply,
     "in which plots agents reserve cells: asked of all before one is entered", "on change",
+    access(serve="agent:agent", ask="agent"),
     request=TerritoryRequest, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
-    "per new route", newest=False, priority=Priority.BACKGROUND,
+    "per new route",
+    access(put="agent:agent", hear="monitor"),
+    newest=False, priority=Priority.BACKGROUND,
 )  # fmt: skip
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,
     "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
+    access(put="planner", hear="agent:agent"),
 )  # fmt: skip
-POSE = Topic("pose", "target/{target}/pose", TargetPose, "where a target is", "every tick")
+POSE = Topic(
+    "pose", "target/{target}/pose", TargetPose, "where a target is", "every tick",
+    access(put="targets tracker:target", hear="agent planner targets monitor"),
+)  # fmt: skip
 TRUE_POSE = Topic(
     "true-pose", "world/target/{target}/pose", TargetPose,
     "where a target is that nobody tracks: for simulated sensors, not for planners", "every tick",
+    access(put="targets", hear="agent"),
 )  # fmt: skip
 SIGHTED = Topic(
     "sighted", "sighted/{target}/{author}", Sighted, "where a vehicle of this author saw a target",
     "while it is in sight, at most 2 Hz",
+    access(put="agent:author", hear="agent planner keeper monitor"),
 )  # fmt: skip
 ROUTE = Topic(
     "route", "target/{target}/route", RouteReply, "routes from cells to the target", "asked",
+    access(serve="planner:target", ask="agent"),
     request=RouteRequest, published=False,
 )  # fmt: skip
 COST = Topic(
     "cost", "target/{target}/cost", CostReply, "cost-to-go of a batch of cells", "asked",
+    access(serve="planner:target", ask="agent targets"),
     request=CostRequest, published=False,
 )  # fmt: skip
 STATUS = Topic(
     "status", "target/{target}/status", PlannerStatus, "how a planner is doing", "2 Hz",
+    access(put="planner:target", hear="targets monitor"),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 STATS = Topic(
-    "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz", priority=Priority.BACKGROUND,
+    "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz",
+    access(put=MEMBERS_OWN, hear="monitor"),
+    priority=Priority.BACKGROUND,
 )  # fmt: skip
 NOTE = Topic(
     "note", "note/{role}/{id}", Note, "something worth telling a person", "as it happens",
+    access(put=MEMBERS_OWN, hear="monitor"),
     newest=False, priority=Priority.BACKGROUND,
 )  # fmt: skip
 
@@ -207,4 +239,4 @@ TOPICS = (
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
-"""Liveliness tokens, one per process."""
+"""Liveliness tokens, one per process, which raises no other than its own. All roles may watch them."""

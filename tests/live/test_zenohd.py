@@ -3,10 +3,6 @@ zenohd on PATH with the plugin beside it; `docs/deploy.md` says how to install t
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,10 +11,10 @@ import msgspec
 import numpy as np
 import pytest
 from support.processes import eventually
+from support.zenohd import Zenohd, plugins
 
 from launch_scripts.deploy.certificates import issue
-from launch_scripts.deploy.zenohd import zenohd_config
-from launch_scripts.launcher.options import free_ports, listening
+from launch_scripts.launcher.options import free_ports
 from shared_map.replication.marks import mark_set, statements
 from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.sync import MapSync
@@ -38,38 +34,7 @@ from swarm.wire.topics import DIGEST, MARKS, RESERVATIONS, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.zenohd]
 
-PLUGIN = "libzenoh_plugin_storage_manager.so"
 GRID = GridSpec(256, 256, 10.0)
-
-
-def installed() -> tuple[str, str]:
-    """(zenohd, folder of the plugin); skips where there is none."""
-    root = os.environ.get("ZENOHD")
-    found = shutil.which("zenohd", path=None if root is None else str(Path(root) / "bin"))
-    if found is None:
-        pytest.skip("there is no zenohd on PATH, and ZENOHD names no folder with bin/zenohd")
-    for folder in (Path(found).parent, Path(found).parents[1] / "lib"):
-        if (folder / PLUGIN).is_file():
-            return found, str(folder)
-    pytest.skip(f"there is a zenohd, but no {PLUGIN} beside it or in ../lib")
-
-
-class Router:
-    """zenohd, under way."""
-
-    def __init__(self, folder: Path, network: NetworkConfig, **names: list[str]) -> None:
-        zenohd, plugins = installed()
-        self.network = network
-        config = folder / "zenohd.json5"
-        config.write_text(json.dumps(zenohd_config(network, plugins=plugins, **names)))
-        self.log = folder / "zenohd.log"
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen([zenohd, "-c", str(config)], stdout=log, stderr=log)
-        eventually(lambda: listening(network.listen[0]), 20, "zenohd to listen")
-
-    def stop(self) -> None:
-        self.process.kill()
-        self.process.wait(10)
 
 
 class Participant:
@@ -96,14 +61,13 @@ class Participant:
 
 
 @pytest.fixture
-def router(tmp_path: Path) -> Iterator[Router]:
+def router(tmp_path: Path) -> Iterator[Zenohd]:
     endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    router = Router(tmp_path, NetworkConfig(listen=(endpoint,), connect=(endpoint,)))
-    yield router
-    router.stop()
+    with Zenohd(tmp_path, NetworkConfig(listen=(endpoint,), connect=(endpoint,)), plugins()) as router:
+        yield router
 
 
-def test_who_comes_late_gets_everything_from_the_storages_of_zenohd_alone(router: Router) -> None:
+def test_who_comes_late_gets_everything_from_the_storages_of_zenohd_alone(router: Zenohd) -> None:
     authors = {}
     for name in ("a0.1", "red.a1.1"):
         with open_bus(router.network) as bus:
@@ -136,7 +100,7 @@ def test_who_comes_late_gets_everything_from_the_storages_of_zenohd_alone(router
                         )
 
 
-def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_is_applied(router: Router) -> None:
+def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_is_applied(router: Zenohd) -> None:
     """The storage goes by the time of arrival; replicas go by (epoch, seq)."""
     everything = statements(mark_set("a0.1", "all", 0, 1, 0, MapReplica(GRID).winners(0)))
     newer, older = (mark_set("a0.1", "all", 0, 1, n * SEQ_STEP, everything) for n in (5, 2))
@@ -158,11 +122,11 @@ def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_
 def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_nothing(tmp_path: Path) -> None:
     certs = tmp_path / "certs"
     for name, hosts in (
-        ("router", ["127.0.0.1", "localhost"]),
-        ("keeper", []),
-        ("blue.a0", []),
-        ("red.a1", []),
-        ("x", []),
+        ("router.0", ["127.0.0.1", "localhost"]),
+        ("keeper.0", []),
+        ("agent.blue.a0", []),
+        ("agent.red.a1", []),
+        ("agent.blue.x", []),
     ):
         issue(certs, name, hosts, 2)
     endpoint = f"tls/localhost:{free_ports(1)[0]}"
@@ -171,14 +135,15 @@ def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_not
         files = TlsConfig(
             ca=str(certs / "ca.pem"), certificate=str(certs / f"{name}.pem"), key=str(certs / f"{name}.key")
         )
-        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=files)
+        admit = ("router.0", "keeper.0", "agent.blue.a0", "agent.red.a1")
+        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=files, admit=admit)
 
-    router = Router(tmp_path, network("router"), trusted=["keeper", "router"], agents=["blue.a0", "red.a1"])
+    router = Zenohd(tmp_path, network("router.0"), plugins())
     try:
         with (
-            open_bus(network("keeper")) as trusted,
-            open_bus(network("blue.a0")) as own,
-            open_bus(network("x")) as stranger,
+            open_bus(network("keeper.0")) as trusted,
+            open_bus(network("agent.blue.a0")) as own,
+            open_bus(network("agent.blue.x")) as stranger,
         ):
             heard: list[str] = []
             trusted.subscribe(DIGEST, lambda event: heard.append(event.message.author))  # type: ignore[union-attr]
@@ -200,7 +165,7 @@ def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_not
             spy = Participant(stranger)
             spy.run(1.5)
             assert spy.replica.held.ledger.held() == {}
-        with open_bus(network("keeper")) as trusted:
+        with open_bus(network("keeper.0")) as trusted:
             late = Participant(trusted)
             eventually(lambda: late.run(0.2) or late.replica.held.ledger.held(), 10, "the storage's answer")
             assert list(late.replica.held.ledger.held()) == ["blue.a0.1"]
@@ -210,14 +175,15 @@ def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_not
 
 def test_with_certificates_an_agent_that_starts_again_is_told_where_its_vehicles_stood(tmp_path: Path) -> None:
     certs = tmp_path / "certs"
-    for name, hosts in (("router", ["127.0.0.1", "localhost"]), ("all.a0", []), ("all.a1", [])):
+    for name, hosts in (("router.0", ["localhost"]), ("agent.all.a0", []), ("agent.all.a1", [])):
         issue(certs, name, hosts, 2)
     endpoint = f"tls/localhost:{free_ports(1)[0]}"
 
     def network(name: str) -> NetworkConfig:
         files = (str(certs / file) for file in ("ca.pem", f"{name}.pem", f"{name}.key"))
         tls = TlsConfig(**dict(zip(("ca", "certificate", "key"), files, strict=True)))
-        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=tls)
+        admit = ("router.0", "agent.all.a0", "agent.all.a1")
+        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=tls, admit=admit)
 
     def reservations(agent: str) -> Reservations:
         return Reservations(
@@ -230,9 +196,9 @@ def test_with_certificates_an_agent_that_starts_again_is_told_where_its_vehicles
             event.answer(reservations(agent), agent=agent)
         event.end()
 
-    router = Router(tmp_path, network("router"), trusted=["router"], agents=["all.a0", "all.a1"])
+    router = Zenohd(tmp_path, network("router.0"), plugins())
     try:
-        with open_bus(network("all.a0")) as neighbour, open_bus(network("all.a1")) as starting:
+        with open_bus(network("agent.all.a0")) as neighbour, open_bus(network("agent.all.a1")) as starting:
             neighbour.serve(RESERVATIONS, answer)
             heard: list[Event] = []
 
@@ -257,7 +223,7 @@ def test_without_a_certificate_of_the_swarms_nobody_gets_in(tmp_path: Path) -> N
         files = TlsConfig(**dict(zip(("ca", "certificate", "key"), names, strict=True)))
         return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=files, connect_timeout_s=2.0)
 
-    router = Router(tmp_path, network(certs))
+    router = Zenohd(tmp_path, network(certs), plugins())
     try:
         with open_bus(network(certs)):
             pass

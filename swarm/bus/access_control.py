@@ -1,0 +1,137 @@
+"""Zenoh's access control for a router, from the table of topics.
+
+Zenoh allows a message where a rule's key expression includes the whole of the message's, and knows whoever is at
+the other end of a link by the common name of its certificate, which it compares as a whole: so there are rules for
+each name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from swarm.errors import ConfigError
+from swarm.wire.access import MEMBERS, ROLES, Grant
+from swarm.wire.fields import check_id
+from swarm.wire.topics import ALIVE_KEY, TOPICS
+
+ROUTER = "router"
+_EVERYTHING = (
+    "put", "delete", "declare_subscriber", "query", "declare_queryable", "reply", "liveliness_token",
+    "declare_liveliness_subscriber", "liveliness_query",
+)  # fmt: skip
+_LOOPBACK = "loopback"
+
+
+@dataclass(frozen=True, slots=True)
+class Bearer:
+    """Who a certificate was issued to.
+
+    name    `ROLE.ID`, for an agent `agent.GROUP.ID`
+    author  what its ids as an author begin with: the group and id of an agent, else the id
+    """
+
+    name: str
+    role: str
+    id: str
+    author: str
+
+    def own(self, field: str) -> str:
+        """What a field of a key must be where it must be the bearer's own."""
+        return {"role": self.role, "author": f"{self.author}.$*"}.get(field, self.id)
+
+
+def bearer(name: str) -> Bearer:
+    """The bearer of a name such as keeper.0, planner.t3 or agent.all.a0. Raises ConfigError on another form."""
+    role, _, author = name.partition(".")
+    group, _, id = author.rpartition(".")
+    try:
+        check_id("name", name)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    if role not in (*ROLES, ROUTER) or not author or (role == "agent" and not (group and id)):
+        roles = ", ".join((ROUTER, *ROLES))
+        raise ConfigError(f"{name!r} is no name of a process: ROLE.ID or agent.GROUP.ID; the roles are {roles}")
+    return Bearer(name, role, id if role == "agent" else author, author)
+
+
+def common_name(name: str, revoked: Collection[str]) -> str:
+    """What stands in the certificate of a name: itself, or if that was revoked `NAME~2`, and so on. So a process
+    whose certificate is lost gets another one under the same name."""
+    candidate, issue = name, 1
+    while candidate in revoked:
+        issue += 1
+        candidate = f"{name}~{issue}"
+    return candidate
+
+
+def access_control(namespace: str, names: Iterable[str], revoked: Collection[str] = ()) -> dict[str, Any]:
+    """What a router's `access_control` is set to: each name may do what the table of topics grants its role, and
+    whoever has another name may do nothing. Links over tcp/ have no names; they stay open, as `check_endpoint` lets
+    them be on loopback only. Raises ConfigError on a name that no process can have.
+
+    revoked  common names that are denied everything from now on
+    """
+    rules = [_rule("everything", flow, _EVERYTHING, [f"{namespace}/**"]) for flow in ("ingress", "egress")]
+    everything = [rule["id"] for rule in rules]
+    subjects: list[dict[str, Any]] = [{"id": _LOOPBACK, "link_protocols": ["tcp"]}]
+    policies = [{"rules": everything, "subjects": [_LOOPBACK]}]
+    for name in dict.fromkeys(names):
+        who = bearer(name)
+        own = [] if who.role == ROUTER else _rules(namespace, who)
+        rules += own
+        subjects.append({"id": name, "cert_common_names": [common_name(name, revoked)]})
+        policies.append({"rules": [rule["id"] for rule in own] or everything, "subjects": [name]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _rules(namespace: str, who: Bearer) -> list[dict[str, Any]]:
+    """What comes from a bearer is limited to its own keys. Queries that go to it are limited to topics: one may
+    name many keys, and reaches a process only where that was allowed to serve one of them."""
+    token = f"{namespace}/{ALIVE_KEY.format(role=who.role, id=who.id, incarnation='*')}"
+    tokens = f"{namespace}/{ALIVE_KEY.format(role='*', id='*', incarnation='*')}"
+    table = {name: list(_keys(namespace, who, name)) for name in ("put", "serve", "ask", "hear")}
+    wide = {name: list(_keys(namespace, who, name, own=False)) for name in ("serve", "ask")}
+    rows = (
+        ("ingress", ("put",), table["put"]),
+        ("ingress", ("declare_queryable", "reply"), table["serve"]),
+        ("ingress", ("query",), table["ask"]),
+        ("ingress", ("declare_subscriber",), table["hear"]),
+        ("ingress", ("liveliness_token",), [token] if who.role in MEMBERS.split() else []),
+        ("ingress", ("declare_liveliness_subscriber", "liveliness_query"), [tokens]),
+        ("egress", ("put",), table["hear"]),
+        ("egress", ("query",), wide["serve"]),
+        ("egress", ("reply",), wide["ask"]),
+        ("egress", ("liveliness_token",), [tokens]),
+    )
+    return [_rule(who.name, flow, messages, keys) for flow, messages, keys in rows if keys]
+
+
+def _keys(namespace: str, who: Bearer, operation: str, *, own: bool = True) -> Iterator[str]:
+    """Key expressions on which a bearer may do something; with `own` limited to what must be its own."""
+    for topic in TOPICS:
+        grants: tuple[Grant, ...] = getattr(topic.access, operation)
+        for grant in grants:
+            if grant.role == who.role:
+                fields = dict.fromkeys(topic.fields, "*")
+                if own:
+                    fields |= {field: who.own(field) for field in grant.own}
+                yield f"{namespace}/{topic.key.format(**fields)}"
+
+
+def _rule(name: str, flow: str, messages: Iterable[str], keys: list[str]) -> dict[str, Any]:
+    messages = list(messages)
+    return {
+        "id": f"{name} {flow} {messages[0]}",
+        "permission": "allow",
+        "flows": [flow],
+        "messages": messages,
+        "key_exprs": keys,
+    }

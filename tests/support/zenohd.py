@@ -1,0 +1,59 @@
+"""zenohd as a process of a test, where it is installed: in the folder that ZENOHD names, or on PATH."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from support.processes import eventually
+
+from launch_scripts.deploy.zenohd import zenohd_config
+from launch_scripts.launcher.options import listening
+from swarm.config.scenario import NetworkConfig
+
+PLUGIN = "libzenoh_plugin_storage_manager.so"
+
+
+def zenohd() -> str:
+    """Its path; skips where there is none."""
+    root = os.environ.get("ZENOHD")
+    found = shutil.which("zenohd", path=None if root is None else str(Path(root) / "bin"))
+    if found is None:
+        pytest.skip("there is no zenohd on PATH, and ZENOHD names no folder with bin/zenohd")
+    return found
+
+
+def plugins() -> str:
+    """The folder of its storage-manager plugin; skips where there is none."""
+    found = Path(zenohd())
+    for folder in (found.parent, found.parents[1] / "lib"):
+        if (folder / PLUGIN).is_file():
+            return str(folder)
+    pytest.skip(f"there is a zenohd, but no {PLUGIN} beside it or in ../lib")
+
+
+class Zenohd:
+    """zenohd, under way, as `swarm deploy zenohd` configures it."""
+
+    def __init__(self, folder: Path, network: NetworkConfig, plugins: str | None = None) -> None:
+        command = [zenohd(), "-c", str(folder / "zenohd.json5")]
+        self.network = network
+        (folder / "zenohd.json5").write_text(json.dumps(zenohd_config(network, plugins=plugins)))
+        self.log = folder / "zenohd.log"
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(command, stdout=log, stderr=log)
+        eventually(lambda: listening(network.listen[0]), 20, "zenohd to listen")
+
+    def __enter__(self) -> Zenohd:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.wait(10)
