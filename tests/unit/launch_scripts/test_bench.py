@@ -317,10 +317,10 @@ def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
 # --- the map and its fleets --------------------------------------------------------------------------------------
 
 
-def test_folding_leaves_the_marked_cells_and_drops_what_was_said_twice() -> None:
-    without, folded = bench("compaction", "--lives", "8")["rows"]
-    assert (without["compaction"], folded["compaction"]) == ("without", "with")
-    assert folded["cells_marked"] == without["cells_marked"] == folded["marks"] < without["marks"]
+def test_compaction_leaves_the_marked_cells_and_drops_what_was_said_twice() -> None:
+    without, compacted = bench("compaction", "--lives", "8")["rows"]
+    assert (without["compact"], compacted["compact"]) == ("no", "yes")
+    assert compacted["cells_marked"] == without["cells_marked"] == compacted["marks"] < without["marks"]
     assert_fits(words_of("compaction", "--lives", "2"))
 
 
