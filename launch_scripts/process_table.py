@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from swarm.config.scenario import Scenario, plan_agents
+from swarm.config.agents import plan_agents
+from swarm.config.scenario import Scenario
 
 Restart = Literal["always", "never"]
 
@@ -51,7 +52,7 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES) -> list[Pro
         "keeper": ["0"],
         "monitor": ["0"],
         "planner": scenario.target_ids,
-        "targets": ["0"] if any(target.walk != "external" for target in scenario.targets) else [],
+        "targets": ["0"] if any(target.is_simulated for target in scenario.targets) else [],
         "agent": [plan.id for plan in plan_agents(scenario)],
     }
     return [ProcessSpec(role, id, ENTRIES[role]) for role in ROLES if role in roles for id in ids[role]]

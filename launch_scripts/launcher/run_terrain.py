@@ -55,8 +55,8 @@ def fetch_if_missing(
     if not found:
         namespace = scenario.network.namespace
         raise TerrainError(
-            f"{why}, and the base map cannot be fetched: no keeper in namespace {namespace} answered; start one where"
-            " the file is"
+            f"{why}, and the base map cannot be fetched: no keeper in namespace {namespace} answered; start one"
+            " where the file is"
         )
     key = scenario_key(scenario)
     looks = not _LOOK.isdisjoint(roles)

@@ -6,9 +6,10 @@ from typing import get_args, get_type_hints
 
 import pytest
 
+from swarm.config.agents import plan_agents
 from swarm.config.describe import meanings
 from swarm.config.load import load_scenario, parse_scenario
-from swarm.config.scenario import Scenario, Section, plan_agents
+from swarm.config.scenario import Scenario, Section
 from swarm.errors import ConfigError
 
 
