@@ -15,7 +15,7 @@ from rich.table import Table
 from launch_scripts.bench.isolated import measure
 from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.fields import Field, make_field
-from launch_scripts.bench.planning.libraries import (
+from launch_scripts.bench.planning.library_adapters import (
     MAKERS,
     PEERS,
     Costs,
@@ -24,6 +24,7 @@ from launch_scripts.bench.planning.libraries import (
     present_peers,
     versions,
 )
+from launch_scripts.bench.planning.tree_process import MODULE
 from launch_scripts.bench.tables import Progress, number, table
 
 
@@ -41,22 +42,22 @@ def run(
     agreement  largest relative difference of any cell's cost to ours, over all roots
     memory_mb  peak increase of the resident memory of a process of its own; None if not measured
     """
-    ground = Field(make_field(field, size, seed))
-    names = ["ours", "floor", *present_peers(edge)]
-    roots = ground.draw(repeats + 1, np.random.default_rng(seed + 1)).tolist()
+    stage = Field(make_field(field, size, seed))
+    names = ["ours", "breadth_first", *present_peers(edge)]
+    roots = stage.draw(repeats + 1, np.random.default_rng(seed + 1)).tolist()
     total = len(roots) + (len(names) if with_memory else 0)
     tell = progress or (lambda done, total: None)
     memory_mb = {}
     if with_memory:
         with tempfile.TemporaryDirectory() as folder:
             saved = Path(folder) / "field.npy"
-            np.save(saved, ground.pace)
+            np.save(saved, stage.pace)
             for name in names:
-                memory_mb[name] = measure("memory", str(saved), name, str(roots[0]), edge)["mb"]
+                memory_mb[name] = measure(MODULE, "memory", str(saved), name, str(roots[0]), edge)["mb"]
                 tell(len(memory_mb), total)
     took: dict[str, list[float]] = {name: [] for name in names}
     agreement: dict[str, float] = {}
-    tools = {name: MAKERS[name](ground.pace, edge) for name in names}
+    tools = {name: MAKERS[name](stage.pace, edge) for name in names}
     for turn, root in enumerate(roots):
         grown: Costs | None = None
         for name, tool in tools.items():
@@ -72,20 +73,20 @@ def run(
                 agreement[name] = max(agreement.get(name, 0.0), _difference(grown, costs))
         tell(len(memory_mb) + turn + 1, total)
     medians = {name: statistics.median(values) for name, values in took.items()}
-    peers = {name: round(ms, 3) for name, ms in medians.items() if name not in ("ours", "floor")}
+    peers = {name: round(ms, 3) for name, ms in medians.items() if name not in ("ours", "breadth_first")}
     return {
-        "size": ground.pace.shape[0],
+        "size": stage.pace.shape[0],
         "field": field,
         "ours_ms": round(medians["ours"], 3),
-        "floor_ms": round(medians["floor"], 3),
+        "breadth_first_ms": round(medians["breadth_first"], 3),
         "peers": peers,
         "ratios": {name: round(medians[name] / medians["ours"], 2) for name in peers},
         "agreement": agreement,
         "memory_mb": memory_mb or None,
-        "shape": list(ground.pace.shape),
+        "shape": list(stage.pace.shape),
         "edge": edge,
         "repeats": repeats,
-        "over_floor": round(medians["ours"] / medians["floor"], 2),
+        "over_breadth_first": round(medians["ours"] / medians["breadth_first"], 2),
         "missing": missing_packages(),
         "versions": versions(),
         **machine(),
@@ -113,12 +114,12 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
         "A full tree",
         *("<", "<version", "CPU\nms", "over\nours", "peak\nMB", "differs\nfrom ours"),
     )
-    times_ms = {"ours": report["ours_ms"], **report["peers"], "floor": report["floor_ms"]}
+    times_ms = {"ours": report["ours_ms"], **report["peers"], "breadth_first": report["breadth_first_ms"]}
     for name, ms in times_ms.items():
         package = PEERS[name][0] if name in PEERS else ""
         differs = report["agreement"].get(name)
         shown.add_row(
-            {"floor": "breadth-first search"}.get(name, name),
+            name.replace("breadth_first", "breadth-first search"),
             report["versions"].get(package, ""),
             number(ms),
             "" if name == "ours" else f"{ms / report['ours_ms']:.2f} x",
