@@ -190,6 +190,10 @@ app.add_typer(roles.app)
 app.add_typer(query.app)
 
 
+MOUNTED: dict[str, str] = {}
+"""Name -> module of each sub-command which has sub-commands of its own."""
+
+
 def _mount(name: str, module: str, help: str) -> None:
     """Adds a sub-command whose own typer app is imported when it is called."""
 
@@ -198,6 +202,7 @@ def _mount(name: str, module: str, help: str) -> None:
         sub_app(args=ctx.args, prog_name=f"swarm {name}")
 
     forward.__doc__ = help
+    MOUNTED[name] = module
     app.command(
         name,
         context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},

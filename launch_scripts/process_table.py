@@ -7,7 +7,8 @@ from typing import Literal
 
 import msgspec
 
-from swarm.config.scenario import Scenario, ids_of, plan_agents
+from swarm.config.agents import plan_agents
+from swarm.config.scenario import Scenario, ids_of
 
 Restart = Literal["always", "never"]
 
@@ -56,7 +57,7 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES) -> list[Pro
         "keeper": ["0"],
         "monitor": ["0"],
         "planner": scenario.target_ids,
-        "targets": ["0"] if any(target.walk != "external" for target in scenario.targets) else [],
+        "targets": ["0"] if any(target.is_simulated for target in scenario.targets) else [],
         "agent": [plan.id for plan in plan_agents(scenario)],
     }
     return [ProcessSpec(role, id, ENTRIES[role]) for role in ROLES if role in roles for id in ids[role]]

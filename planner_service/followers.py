@@ -68,9 +68,6 @@ class Followers:
     def __len__(self) -> int:
         return len(self._by_id)
 
-    def get(self, vehicle: str) -> Follower | None:
-        return self._by_id.get(vehicle)
-
     def all(self) -> Iterable[Follower]:
         return self._by_id.values()
 
@@ -153,7 +150,7 @@ class Followers:
         if not len(at):
             return True
         rest = old.directions[int(at[0]) :]
-        # Of a route cut off after some steps, more of the same is no news before it nears its end.
+        # An extension of the same route is not pushed until half of the old one is driven.
         if old.remaining_s > 0 and route.remaining_s > 0 and 2 * len(rest) >= len(route.directions):
             return not route.directions.startswith(rest)
         return rest != route.directions

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from planner_service.followers import Follower, Followers
 from planner_service.target_tree import TargetTree
-from shared_map.terrain.climb import Climb
+from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec

@@ -15,7 +15,7 @@ from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
-from swarm.config.scenario import agent_of
+from swarm.config.agents import agent_of
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest

@@ -53,7 +53,7 @@ class StrategyRow:
 
     thins_far_cells     section 3.3.3, multi-resolution: far from the target only cells that carry traffic are
                         grown. The paper takes every second, fourth, ... cell instead, and so jumps over walls
-    renews_loose_bounds a served route whose certified gap exceeds `planner.max_gap` asks for a full growth; the
+    renews_loose_bounds a served route whose certified gap exceeds `planner.MAX_GAP` asks for a full growth; the
                         strategies of the paper never do
     """
 
@@ -62,6 +62,15 @@ class StrategyRow:
     thins_far_cells: bool = False
     widest_window: WidestWindow = WidestWindow.WHILE_CHEAPER
     renews_loose_bounds: bool = False
+
+    @property
+    def grows_whole_trees(self) -> bool:
+        """Whether whole trees are grown without a vehicle's asking: with every move, in turn, or for corridors."""
+        return (
+            self.on_move is OnMove.WHOLE_TREE
+            or self.full_growth is not FullGrowth.WHEN_FORCED
+            or self.thins_far_cells
+        )
 
 
 STRATEGIES: Mapping[Strategy, StrategyRow] = {

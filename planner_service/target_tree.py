@@ -26,7 +26,7 @@ from planner_service.tree.directed_cost_grid import cost_grid_of
 from planner_service.tree.route_reading import read_routes
 from planner_service.tree.windows import AHEAD, WindowSchedule, block_half
 from shared_map.arrays import Floats
-from shared_map.terrain.climb import Climb
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import NO_TARGET, RouteBatch

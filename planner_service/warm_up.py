@@ -12,11 +12,10 @@ from planner_service.target_tree import TargetTree
 from planner_service.tree.corridors import find_corridors
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.climb import climb_of
+from shared_map.terrain.step_climb import climb_of
 from swarm.config.scenario import CostConfig, PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
 
-STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 RULES: tuple[tuple[Literal["octile", "paper"], Literal[4, 8]], ...] = (("octile", 8), ("paper", 8), ("paper", 4))
 _SIDE = 40
 
@@ -27,11 +26,11 @@ def warm_up() -> None:
     grid = GridSpec(_SIDE, _SIDE, 10.0)
     configs = [
         PlannerConfig(strategy=strategy, edge=edge, neighbours=neighbours, k_min=1, full_every=2)
-        for strategy in STRATEGIES
+        for strategy in get_args(Strategy)
         for edge, neighbours in RULES
     ]
     for config in configs:
-        for dearest in (0.2, 1e4):  # beyond a ratio, another queue is taken
+        for dearest in (0.2, 1e4):  # beyond this ratio of cell costs, growth takes a radix heap
             pace = np.full((_SIDE, _SIDE), 0.1, np.float32)
             pace[0, 0] = dearest
             _live(TargetTree(grid, config), pace)

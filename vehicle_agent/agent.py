@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.presence import Presence
-from shared_map.terrain.climb import Climb
+from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import AgentPlan, Scenario
+from swarm.config.agents import AgentPlan
+from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Succession
 from swarm.wire.messages.planning import PushedRoute, RouteReply

@@ -7,7 +7,8 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.config.scenario import GroupConfig, Scenario, plan_agents
+from swarm.config.agents import plan_agents
+from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 

@@ -16,7 +16,7 @@ from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import AgentPlan, plan_agents
+from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup

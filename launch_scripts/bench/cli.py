@@ -85,8 +85,8 @@ def peers(
     and the largest relative difference of any cell's cost to ours. Memory says
     little on fields much smaller than 512 x 512.
     """
-    from launch_scripts.bench.planning.libraries import missing_packages
-    from launch_scripts.bench.planning.peers import missing_sentence, run, tables
+    from launch_scripts.bench.planning.library_adapters import missing_packages
+    from launch_scripts.bench.planning.library_comparison import missing_sentence, run, tables
 
     if edge != "paper" and edge != "octile":
         raise ConfigError(f"--edge is {edge!r}, expected paper or octile")

@@ -1,10 +1,4 @@
-"""Measurements that need a process of their own: memory of one tree, and a first call.
-
-    python -m launch_scripts.bench.isolated memory FIELD.npy TOOL ROOT EDGE
-    python -m launch_scripts.bench.isolated start WHAT SIZE STARTED_NS
-
-Both print one JSON object. `measure` runs them.
-"""
+"""Measurements in a process of their own, which prints one JSON object, and the memory that a process takes."""
 
 from __future__ import annotations
 
@@ -12,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,12 +13,11 @@ from typing import Any
 from swarm.errors import SwarmError
 
 LONGEST_S = 600
-MB = 1e6
 
 
-def measure(*words: str, module: str = __name__, environment: dict[str, str] | None = None) -> dict[str, Any]:
-    """What such a process prints, or one of another module that prints an object likewise. Raises SwarmError, with
-    the last line that it wrote, if it fails or hangs."""
+def measure(module: str, *words: str, environment: dict[str, str] | None = None) -> dict[str, Any]:
+    """The JSON object that `python -m module words...` prints last. Raises SwarmError, with the last line that the
+    process wrote, if it fails or hangs."""
     command = [sys.executable, "-m", module, *words]
     try:
         done = subprocess.run(
@@ -38,28 +30,6 @@ def measure(*words: str, module: str = __name__, environment: dict[str, str] | N
         raise SwarmError(f"measuring {' '.join(words)} failed with exit code {done.returncode}: {last}")
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
-
-
-def memory(field: Path, name: str, root: int, edge: str) -> dict[str, float | None]:
-    """By how much the resident memory rises at most, from the bare field to a grown tree: what is prepared counts,
-    what a library takes for its code does not. None where the system does not tell the peak."""
-    import numpy as np
-
-    from launch_scripts.bench.planning.libraries import MAKERS
-
-    make = MAKERS[name]
-    small = np.ones((24, 24), np.float32)
-    make(small, edge).grow(5)  # type: ignore[arg-type]  # libraries are loaded, kernels compiled
-    pace = np.load(field)
-
-    def grow() -> object:
-        tool = make(pace, edge)  # type: ignore[arg-type]
-        return tool, tool.grow(root)
-
-    try:
-        return {"mb": round(peak_bytes(grow) / MB, 1)}
-    except OSError:
-        return {"mb": None}
 
 
 def peak_bytes(work: Callable[[], object]) -> int:
@@ -78,40 +48,3 @@ def _status_bytes(key: str) -> int:
         if line.startswith(f"{key}:"):
             return int(line.split()[1]) * 1024
     raise OSError(f"no {key} in /proc/self/status")
-
-
-def start(what: str, size: int, started_ns: int) -> dict[str, float]:
-    """Seconds since the process was begun, on the clock and of CPU: `tree` until a tree of size x size is grown,
-    `kernels` until a planner has called every kernel once, as it does before it takes part."""
-    if what == "tree":
-        import numpy as np
-
-        from planner_service.tree.cost_grid import CostGrid
-        from planner_service.tree.cost_to_go import CostToGoTree
-        from swarm.config.scenario import PlannerConfig
-        from swarm.grid import GridSpec
-
-        ground = CostGrid(GridSpec(size, size, 1.0), PlannerConfig())
-        ground.load(np.ones((size, size), np.float32))
-        CostToGoTree(ground).grow(size * size // 2)
-    else:
-        from planner_service.warm_up import warm_up
-
-        warm_up()
-    now_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
-    return {"seconds": (now_ns - started_ns) / 1e9, "cpu_s": time.process_time()}
-
-
-def main() -> None:
-    match sys.argv[1:]:
-        case ["memory", field, name, root, edge]:
-            report: dict[str, Any] = dict(memory(Path(field), name, int(root), edge))
-        case ["start", what, size, started_ns]:
-            report = dict(start(what, int(size), int(started_ns)))
-        case words:
-            sys.exit(f"expected memory FIELD.npy TOOL ROOT EDGE or start WHAT SIZE STARTED_NS, found {words}")
-    print(json.dumps(report))
-
-
-if __name__ == "__main__":
-    main()

@@ -13,21 +13,21 @@ from swarm.config.scenario import Strategy
 Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""
 
-LABELS: dict[Strategy, str] = {
-    "full": "full",
-    "auto": "auto",
-    "rotation": "rotation",
-    "variable_range": "variable range",
+_LABELS: dict[Strategy, str] = {
     "multi_resolution": "multi-resolution",
     "variable_range+multi_resolution": "both, the paper's",
 }
-"""Strategies in the paper's words, where it has any."""
-NARROW: dict[Strategy, str] = {
-    **LABELS,
-    "variable_range": "variable\nrange",
-    "multi_resolution": "multi-\nresol.",
-    "variable_range+multi_resolution": "both",
-}
+_NARROW: dict[Strategy, str] = {"multi_resolution": "multi-\nresol.", "variable_range+multi_resolution": "both"}
+
+
+def label_of(strategy: Strategy) -> str:
+    """A strategy in the paper's words, where it has any."""
+    return _LABELS.get(strategy) or strategy.replace("_", " ")
+
+
+def narrow_label_of(strategy: Strategy) -> str:
+    """As `label_of`, in two short lines."""
+    return _NARROW.get(strategy) or strategy.replace("_", "\n", 1)
 
 
 def table(title: str, *columns: str) -> Table:

@@ -44,7 +44,7 @@ def run(
         _make(Path(folder), size, degrees)
         for turn in range(repeats):
             for number, (name, results) in enumerate(passes.items(), 1):
-                results.append(measure(name, folder, module="launch_scripts.bench.terrain"))
+                results.append(measure("launch_scripts.bench.terrain", name, folder))
                 progress(turn * len(passes) + number, repeats * len(passes))
     report: dict[str, Any] = {"size": size, "degrees": degrees, **machine()}
     report["passes"] = [

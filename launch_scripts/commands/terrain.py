@@ -87,8 +87,8 @@ def info(
 ) -> None:
     """Say what a terrain file holds, and what was done to bring it onto a metric grid.
 
-    Reads .tif, .hgt, .asc, .npz, MovingAI .map, ROS map_server .yaml, and
-    .png with --resolution-m and --height-scale. The lines after the table say
+    Reads .tif, .tiff, .hgt, .vrt, .asc, .npz, MovingAI .map, ROS map_server
+    .yaml or .yml, and .png with --resolution-m and --height-scale. The lines after the table say
     what was done to the file, and what you should know about it.
 
     swarm terrain info srtm.hgt
@@ -345,11 +345,11 @@ def _compare(terrain: Terrain, path: Path) -> None:
     from shared_map.terrain.importers.labels import read_labels
 
     labels = read_labels(path, terrain.grid)
-    ground = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)
+    inputs = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)
     labelled = labels.classes != TerrainClass.UNKNOWN
-    ruled = by_rules(*ground)
+    ruled = by_rules(*inputs)
     _print_confusion("by rules", confusion(labels.classes[labelled], ruled[labelled]))
-    _print_confusion("learnt, on polygons not seen", confusion(*held_out(*ground, labels.classes, labels.groups)))
+    _print_confusion("learnt, on polygons not seen", confusion(*held_out(*inputs, labels.classes, labels.groups)))
 
 
 def _print_confusion(title: str, counts: Any) -> None:

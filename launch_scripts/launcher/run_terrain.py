@@ -42,10 +42,10 @@ def fetch_if_missing(
     progress: Progress = no_progress,
 ) -> bool:
     """Where files of the terrain are missing, get it from a keeper and leave it prepared in the run's folder, where
-    every process of this machine finds it. True if the run's folder has a terrain so.
+    every process of this machine finds it. True if the run's folder then holds a fetched terrain.
 
-    found  who is in the namespace; the run's terrain is theirs
-    roles  for whom
+    found  processes of runs in the namespace; the run's terrain is theirs
+    roles  roles that this machine is about to start
     Raises TerrainError with one sentence if no keeper gives the run's terrain.
     """
     missing = missing_files(scenario)
@@ -53,7 +53,11 @@ def fetch_if_missing(
         return False
     why = f"there is no file {missing[0]}"
     if not found:
-        raise TerrainError(f"{why}, and nobody in the namespace could send the base map: start the keeper first")
+        namespace = scenario.network.namespace
+        raise TerrainError(
+            f"{why}, and the base map cannot be fetched: no keeper in namespace {namespace} answered; start one"
+            " where the file is"
+        )
     key = scenario_key(scenario)
     looks = not _LOOK.isdisjoint(roles)
     with _locked(run_dir):

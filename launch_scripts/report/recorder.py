@@ -17,7 +17,8 @@ import numpy as np
 from launch_scripts.report.latest_state import MarkedCells, Observed, VehicleNow, count_states
 from launch_scripts.report.tracks import TrackKey, Tracks
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import Scenario, plan_agents
+from swarm.config.agents import plan_agents
+from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.stats import Histogram
@@ -348,7 +349,7 @@ def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
 
 def _expected(scenario: Scenario) -> list[tuple[str, str]]:
     """(role, id) of the processes that a complete run has; "" stands for any id."""
-    driven = any(target.walk != "external" for target in scenario.targets)
+    driven = any(target.is_simulated for target in scenario.targets)
     return [
         ("keeper", ""),
         *([("targets", "")] if driven else []),

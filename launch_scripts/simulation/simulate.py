@@ -18,7 +18,7 @@ from launch_scripts.process_table import STOP_ORDER, ProcessSpec, processes_of
 from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
-from launch_scripts.world.targets import TargetsService
+from launch_scripts.world.service import TargetsService
 from planner_service.service import PlannerService
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from launch_scripts.world.targets import TargetsService
+from launch_scripts.world.service import TargetsService
 from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock

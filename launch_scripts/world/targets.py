@@ -1,7 +1,6 @@
 """The simulated targets: where they are, how they move, and which vehicle captured them.
 
-`TargetWorld` is the core, `TargetsService` puts it on the bus. They know the truth; no planner or vehicle
-does.
+`TargetWorld` is a core; `service` puts it on the bus. It knows the truth; no planner or vehicle does.
 """
 
 from __future__ import annotations
@@ -14,28 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.world.referee import Collision, LethalEntry, Referee
-from launch_scripts.world.walks import Budget, Ground, Walker, far_place, slowness_of
+from launch_scripts.world.walks import Budget, TrueTerrain, Walker, far_place, slowness_of
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
-from swarm.runtime.membership import Member
-from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
-from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
-from swarm.wire.topics import COST, FLEET, POSE, STATUS, TRUE_POSE
 
 LISTEN_NS = NS_PER_S
-"""A starting driver asks the planners where their targets are before it makes places up. So long it waits for a
-planner to turn up."""
+"""A starting process asks planners where their targets are before it places them itself: it waits so long for a
+planner to appear."""
 PATIENCE_NS = 5 * NS_PER_S
-"""So long it waits for one that is alive to answer."""
-_ASK_NS = NS_PER_S // 2
-_ASK = "where"
+"""It waits so long for the answer of a planner that is alive."""
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
@@ -82,10 +74,10 @@ class TargetWorld:
         self, scenario: Scenario, terrain: Terrain, truth_s_per_m: NDArray[np.float32], incarnation: int
     ) -> None:
         self._grid = terrain.grid
-        # A target keeps to where vehicles fit, by the truth and by the prior map: elsewhere nobody could reach it.
+        # A target keeps to cells where a vehicle fits, by the truth and by the prior map: others are out of reach.
         halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
         pace = np.where(terrain.lethal, np.float32(np.inf), inflate(truth_s_per_m, halves))
-        self._ground = Ground(terrain.grid, pace.astype(np.float32))
+        self._terrain = TrueTerrain(terrain.grid, pace.astype(np.float32))
         self._referee = Referee(np.isfinite(truth_s_per_m))
         self._incarnation = incarnation
         self._capture_range_m = scenario.vehicles.capture_range_m
@@ -99,13 +91,13 @@ class TargetWorld:
     def _place(self, id: str, config: TargetConfig, scenario: Scenario) -> _Target:
         chance = random.Random(f"{scenario.seed}/{id}")
         if config.start is None:
-            cell = self._ground.random_home(chance)
+            cell = self._terrain.random_home(chance)
         elif not self._grid.inside(*config.start):
             shape = f"{self._grid.rows} x {self._grid.cols}"
             raise ConfigError(f"target {id}: start {list(config.start)} is outside the terrain of {shape} cells")
         else:
             cell = self._grid.cell(*config.start)
-            if self._ground.lethal(cell):
+            if self._terrain.lethal(cell):
                 raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
         walker = Walker(id, config.walk, slowness_of(config, scenario.cost), chance, cell)
         return _Target(config, walker, *self._grid.centre_m(cell))
@@ -113,9 +105,9 @@ class TargetWorld:
     def hear_planner(self, id: str, cell: int | None) -> None:
         """Places a target where its planner last saw it, once; None if the planner does not know."""
         target = self._targets.get(id)
-        if target is None or target.placed or target.config.walk == "external":
+        if target is None or target.placed or not target.config.is_simulated:
             return
-        if cell is not None and 0 <= cell < self._grid.cells and not self._ground.lethal(cell):
+        if cell is not None and 0 <= cell < self._grid.cells and not self._terrain.lethal(cell):
             target.walker.put(cell)
             target.placed = True
         target.unheard_of = not target.placed
@@ -129,14 +121,12 @@ class TargetWorld:
     @property
     def listening(self) -> bool:
         """Whether a planner may still answer where an unplaced target was."""
-        return any(
-            not t.placed and not t.unheard_of and t.config.walk != "external" for t in self._targets.values()
-        )
+        return any(not t.placed and not t.unheard_of and t.config.is_simulated for t in self._targets.values())
 
     def hear_pose(self, pose: TargetPose) -> None:
         """Takes the pose of an external target."""
         target = self._targets.get(pose.target)
-        if target is not None and target.config.walk == "external" and 0 <= pose.cell < self._grid.cells:
+        if target is not None and not target.config.is_simulated and 0 <= pose.cell < self._grid.cells:
             target.walker.put(pose.cell)
             target.x_m, target.y_m = pose.x_m, pose.y_m
             target.placed = True
@@ -160,16 +150,16 @@ class TargetWorld:
         actions: list[Action] = []
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
-            if target.config.walk == "external" or (waited_ns < patience_ns and not target.placed):
+            if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
                 continue
             if target.placed:
-                target.walker.advance(self._ground, elapsed_s, vehicles, budget)
+                target.walker.advance(self._terrain, elapsed_s, vehicles, budget)
             target.placed = True
             actions.append(Publish(self._pose(id, target, now_ns)))
         return actions
 
     def _pose(self, id: str, target: _Target, now_ns: int) -> TargetPose:
-        target.x_m, target.y_m = target.walker.position_m(self._ground)
+        target.x_m, target.y_m = target.walker.position_m(self._terrain)
         target.seq += 1
         return TargetPose(
             target=id,
@@ -211,7 +201,7 @@ class TargetWorld:
 
     def _reached(self, id: str, target: _Target, vehicle: str, now_ns: int) -> list[Action]:
         calm = now_ns >= target.calm_until_ns
-        jumps = target.config.caught == "jump" and target.config.walk != "external"
+        jumps = target.config.caught == "jump" and target.config.is_simulated
         if calm or not jumps:
             target.calm_until_ns = now_ns + (JUMP_COOL_DOWN_NS if jumps else STAY_COOL_DOWN_NS)
         if not calm:
@@ -223,78 +213,5 @@ class TargetWorld:
         target.jumps += 1
         clear_cells = 1 + int(2 * self._capture_range_m / self._grid.resolution_m)
         walker = target.walker
-        walker.put(far_place(self._ground, walker.cell, self._referee.cells, clear_cells, walker.chance))
+        walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, walker.chance))
         return [captured, Publish(self._pose(id, target, now_ns))]
-
-
-class TargetsService:
-    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`."""
-
-    def __init__(
-        self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
-    ) -> None:
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
-        self._scenario = setup.scenario
-        self._bus = bus
-        self._post = post
-        self._ask_due_ns = 0
-        self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation)
-        self.counters = self._member.counters
-        for name in ("captures", "collisions", "lethal_entries", "poses"):
-            self.counters.count(name, 0)
-
-    def start(self, now_ns: int) -> None:
-        self._member.join()
-        self._bus.subscribe(FLEET, self._post)
-        self._bus.subscribe(STATUS, self._post)
-        self._bus.watch_alive(self._post, role="planner")
-        for target in self._scenario.targets:
-            if target.walk == "external":
-                for id in ids_of(target):
-                    self._bus.subscribe(POSE, self._post, target=id)
-
-    def handle(self, event: Event, now_ns: int) -> None:
-        if self._member.handle(event):
-            return
-        match event:
-            case Heard(message=Fleet() as fleet):
-                self._perform(self._world.hear_fleet(fleet, now_ns), now_ns)
-            case Heard(message=PlannerStatus() as status):
-                self._world.hear_planner(status.target, status.target_cell)
-            case Replied(message=CostReply() as reply):
-                self._world.hear_planner(reply.target, reply.target_cell)
-            case Appeared(peer):
-                self._world.planner_up(peer.id, True)
-            case Disappeared(peer):
-                self._world.planner_up(peer.id, False)
-            case Heard(message=TargetPose() as pose):
-                self._world.hear_pose(pose)
-            case _:
-                pass
-
-    def tick(self, now_ns: int) -> None:
-        if self._world.listening and now_ns >= self._ask_due_ns:
-            self._ask_due_ns = now_ns + _ASK_NS
-            self._bus.ask(COST, CostRequest(), self._post, tag=_ASK)
-        self._perform(self._world.tick(now_ns), now_ns)
-        self._member.tick(now_ns)
-
-    def stop(self, now_ns: int) -> None:
-        self._member.publish_stats(now_ns)
-
-    def _perform(self, actions: list[Action], now_ns: int) -> None:
-        for action in actions:
-            match action:
-                case Publish(pose):
-                    self.counters.count("poses")
-                    topic = TRUE_POSE if pose.target in self._scenario.untracked else POSE
-                    self._bus.publish(topic, pose, target=pose.target)
-                case Captured(target, vehicle, cell):
-                    self.counters.count("captures")
-                    self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell)
-                case Collision(first, second, cell):
-                    self.counters.count("collisions")
-                    self._member.note(now_ns, "collision", f"{first} and {second} on one cell", cell)
-                case LethalEntry(vehicle, cell):
-                    self.counters.count("lethal_entries")
-                    self._member.note(now_ns, "lethal-entry", f"{vehicle} entered a lethal cell", cell)

@@ -1,4 +1,4 @@
-"""How simulated targets move over the true ground. Pure: time and chance are arguments.
+"""How simulated targets move over the true terrain. Pure: time and chance are arguments.
 
 Targets take legal steps only: to one of eight neighbours, never into a lethal cell, never past the corner of one.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,14 @@ from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from swarm.config.scenario import CostConfig, TargetConfig
+from swarm.config.scenario import CostConfig, TargetConfig, Walk
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
-Walk = Literal["still", "random", "waypoints", "evade", "external"]
-
+STANDING: frozenset[Walk] = frozenset(("still", "external"))
+"""Walks by which a simulated target takes no step."""
+FLEEING: frozenset[Walk] = frozenset(("evade",))
+"""Walks that depend on where vehicles are."""
 WAY_HALF_CELLS = 96
 """Waypoints lie in a window which reaches this far to every side: bounds the time to compute a way."""
 _TURN_SHARE = 1 / 20
@@ -29,7 +31,7 @@ _FEAR_CELLS = 40
 _STEPS_PER_TICK = 1000
 
 
-class Ground:
+class TrueTerrain:
     """True pace of every cell, and the steps that are possible."""
 
     def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32]) -> None:
@@ -150,75 +152,75 @@ class Walker:
         self.progress_s = 0.0
         self.way = []
 
-    def advance(self, ground: Ground, elapsed_s: float, vehicles: NDArray[np.int64], budget: Budget) -> None:
+    def advance(self, terrain: TrueTerrain, elapsed_s: float, vehicles: NDArray[np.int64], budget: Budget) -> None:
         """Moves on for some seconds. `vehicles` are the cells that an evader keeps away from."""
         if not math.isfinite(self.slowness):
             return
         for _ in range(_STEPS_PER_TICK):
             if self.towards is None:
-                self.towards = self.choose(ground, vehicles, budget)
+                self.towards = self.choose(terrain, vehicles, budget)
                 if self.towards is None:
                     return
-            step_s = self._step_s(ground)
+            step_s = self._step_s(terrain)
             if self.progress_s + elapsed_s < step_s:
                 self.progress_s += elapsed_s
                 return
             elapsed_s -= step_s - self.progress_s
             self.cell, self.towards, self.progress_s = self.towards, None, 0.0
 
-    def position_m(self, ground: Ground) -> tuple[float, float]:
+    def position_m(self, terrain: TrueTerrain) -> tuple[float, float]:
         """(x_m, y_m); while under way on the line between the centres of two cells."""
-        x_m, y_m = ground.grid.centre_m(self.cell)
+        x_m, y_m = terrain.grid.centre_m(self.cell)
         if self.towards is None:
             return x_m, y_m
-        share = self.progress_s / self._step_s(ground)
-        to_x_m, to_y_m = ground.grid.centre_m(self.towards)
+        share = self.progress_s / self._step_s(terrain)
+        to_x_m, to_y_m = terrain.grid.centre_m(self.towards)
         return x_m + share * (to_x_m - x_m), y_m + share * (to_y_m - y_m)
 
-    def _step_s(self, ground: Ground) -> float:
+    def _step_s(self, terrain: TrueTerrain) -> float:
         assert self.towards is not None
-        pace = float(ground.pace_s_per_m.flat[self.towards])
-        return ground.length_m(self.cell, self.towards) * pace * self.slowness
+        pace = float(terrain.pace_s_per_m.flat[self.towards])
+        return terrain.length_m(self.cell, self.towards) * pace * self.slowness
 
-    def choose(self, ground: Ground, vehicles: NDArray[np.int64], budget: Budget) -> int | None:
+    def choose(self, terrain: TrueTerrain, vehicles: NDArray[np.int64], budget: Budget) -> int | None:
         """The cell of the next step; None while the target stands still or waits for the budget."""
         match self.walk:
             case "random":
-                return self._wander(ground)
+                return self._wander(terrain)
             case "waypoints":
                 if not self.way and budget.take():
-                    self.way = ground.way(self.cell, self.chance)[::-1]
+                    self.way = terrain.way(self.cell, self.chance)[::-1]
                 return self.way.pop() if self.way else None
             case "evade":
-                return self._flee(ground, vehicles)
+                return self._flee(terrain, vehicles)
             case "still" | "external":
                 return None
 
-    def _wander(self, ground: Ground) -> int | None:
+    def _wander(self, terrain: TrueTerrain) -> int | None:
         if self.chance.random() < _TURN_SHARE:
             self.heading = self.chance.randrange(8)
         for turn in (0, 1, -1, 2, -2, 3, -3, 4):
             heading = (self.heading + turn) % 8
-            to = ground.step(self.cell, heading)
+            to = terrain.step(self.cell, heading)
             if to is not None:
                 self.heading = heading
                 return to
         return None
 
-    def _flee(self, ground: Ground, vehicles: NDArray[np.int64]) -> int | None:
+    def _flee(self, terrain: TrueTerrain, vehicles: NDArray[np.int64]) -> int | None:
         """The neighbour with the fewest and farthest vehicles around it; a random one while none is near."""
-        row, col = ground.grid.row_col(self.cell)
-        rows, cols = np.divmod(vehicles, ground.grid.cols)
+        row, col = terrain.grid.row_col(self.cell)
+        rows, cols = np.divmod(vehicles, terrain.grid.cols)
         near = np.maximum(abs(rows - row), abs(cols - col)) <= _FEAR_CELLS
         if not near.any():
-            return self._wander(ground)
+            return self._wander(terrain)
         rows, cols = rows[near], cols[near]
 
         def crowding(to: int) -> float:
-            to_row, to_col = ground.grid.row_col(to)
+            to_row, to_col = terrain.grid.row_col(to)
             return float((1.0 / ((rows - to_row) ** 2 + (cols - to_col) ** 2 + 0.25)).sum())
 
-        steps = ground.steps(self.cell)
+        steps = terrain.steps(self.cell)
         return min(steps, key=lambda step: (crowding(step[1]), step[1]))[1] if steps else None
 
 
@@ -242,17 +244,17 @@ def slowness_of(target: TargetConfig, cost: CostConfig) -> float:
 
 
 def far_place(
-    ground: Ground, away_from: int, vehicles: NDArray[np.int64], clear_cells: int, chance: random.Random
+    terrain: TrueTerrain, away_from: int, vehicles: NDArray[np.int64], clear_cells: int, chance: random.Random
 ) -> int:
     """A random place at least a quarter of the terrain's diagonal from a cell, and clear of vehicles; of 32 drawn
     the farthest, if none is."""
-    grid = ground.grid
+    grid = terrain.grid
     row, col = grid.row_col(away_from)
     enough = math.hypot(grid.rows, grid.cols) / 4
     near_rows, near_cols = np.divmod(vehicles, grid.cols)
     best, best_distance = away_from, -1.0
     for _ in range(32):
-        place = ground.random_home(chance)
+        place = terrain.random_home(chance)
         to_row, to_col = grid.row_col(place)
         distance = math.hypot(to_row - row, to_col - col)
         crowded = bool((np.maximum(abs(near_rows - to_row), abs(near_cols - to_col)) <= clear_cells).any())

@@ -12,7 +12,7 @@ from planner_service.kernels.directed_growth import Climbs, grow_directed
 from planner_service.kernels.layout import step_offsets
 from planner_service.tree.cost_grid import CostGrid, Walks
 from shared_map.arrays import Floats
-from shared_map.terrain.climb import Climb
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 

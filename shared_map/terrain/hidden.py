@@ -11,8 +11,9 @@ import heapq
 import numpy as np
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.terrain.layers import LETHAL, TerrainClass, paint_zones
+from shared_map.terrain.layers import LETHAL, TerrainClass
 from shared_map.terrain.synthetic.noise import fractal
+from shared_map.terrain.zones import paint_zones
 from swarm.config.scenario import CostConfig, HiddenConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 

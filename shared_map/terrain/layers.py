@@ -3,7 +3,7 @@
 The merge rule, per cell, in this order:
 
 1. pace = flat pace x slope factor x class factor x (1 + rough_per_m x roughness); on a road the road pace instead.
-   Where `cost.directional`, the slope factor is left out here, and each step costs by its rise instead (`climb`).
+   Where `cost.directional`, the slope factor is left out, and each step costs by its rise instead (`step_climb`).
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
 3. Zones in the order painted: a road sets the road pace (over cliffs and water too: a bridge, a cutting; not over a
    void), preferred halves, rough doubles; then every forbidden zone is lethal, whatever else was painted there.
@@ -11,10 +11,8 @@ The merge rule, per cell, in this order:
    `vehicle_radius_m` in its middle would touch a lethal cell.
 5. Marks replace the ground cell by cell (see `cost_map`), before inflation.
 
-Costly is not lethal: a factor, however large, never makes a cell infinite.
-
-Only correctly rounded operations (+ - * / sqrt) go into linear, quadratic and energy paces, so that two machines
-get the same bits and the same digest.
+Costly is not lethal: a factor, however large, never makes a cell infinite. Slope factors are in `slope_rules`,
+zones in `zones`.
 """
 
 from __future__ import annotations
@@ -22,14 +20,13 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.row_bands import in_bands
-from swarm.config.scenario import CostConfig, ZoneConfig
-from swarm.errors import TerrainError
+from shared_map.terrain.slope_rules import slope_factor
+from swarm.config.scenario import CostConfig
 from swarm.grid import GridSpec
 
 LETHAL = np.float32(np.inf)
@@ -61,11 +58,6 @@ CLASS_FACTOR: Mapping[TerrainClass, float] = {
     TerrainClass.SNOW: 2.5,
 }
 """Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`."""
-
-PREFERRED_FACTOR = np.float32(0.5)
-ROUGH_FACTOR = np.float32(2.0)
-ROLLING_RESISTANCE = 0.08
-"""Share of its weight that a wheeled vehicle needs to roll on level open ground (grass, firm soil)."""
 
 
 def gradient(elevation_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
@@ -136,85 +128,11 @@ def slope_deg(elevation_m: Floats, resolution_m: float) -> Floats:
     return np.degrees(np.arctan(grade(elevation_m, resolution_m))).astype(np.float32)
 
 
-def slope_factor(grade_: Floats, cost: CostConfig) -> Floats:
-    """Pace relative to level ground, the same in all directions; inf where steeper than `max_slope_deg`.
-
-    linear, quadratic  in the sine of the slope (gravity's pull), reaching `steep_factor` at `max_slope_deg`
-    tobler             Tobler's hiking function, up and down averaged
-    energy             a wheeled vehicle of constant power: against rolling resistance and gravity uphill, no faster
-                       than on the level downhill, up and down averaged
-    """
-    limit = math.sin(math.radians(cost.max_slope_deg))
-    sine = _sine(grade_)
-    match cost.slope_rule:
-        case "linear":
-            factor = sine * np.float32((cost.steep_factor - 1) / limit) + np.float32(1)
-        case "quadratic":
-            factor = sine * sine
-            factor *= np.float32((cost.steep_factor - 1) / limit**2)
-            factor += np.float32(1)
-        case "tobler":
-            factor = (_tobler(grade_) + _tobler(-grade_)) * np.float32(0.5)
-        case "energy":
-            factor = (_energy(grade_) + _energy(-grade_)) * np.float32(0.5)
-    if cost.max_slope_deg < 90:
-        np.copyto(factor, LETHAL, where=sine > np.float32(limit))
-    np.copyto(factor, LETHAL, where=np.isnan(grade_))
-    return factor
-
-
-def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
-    """Pace relative to level ground when driving up a rise (metres per metre; negative is downhill).
-
-    Steeper than `max_slope_deg` is inf. Uphill is not downhill: tobler is fastest at 5 % downhill, energy gains
-    nothing downhill, linear and quadratic know only how steep it is.
-    """
-    steepness = np.abs(rise)
-    match cost.slope_rule:
-        case "tobler":
-            factor = _tobler(rise)
-        case "energy":
-            factor = _energy(rise)
-        case _:
-            return slope_factor(steepness, cost)
-    limit = np.float32(math.sin(math.radians(cost.max_slope_deg)))
-    if cost.max_slope_deg < 90:
-        np.copyto(factor, LETHAL, where=_sine(steepness) > limit)
-    return factor
-
-
-def _sine(grade_: Floats) -> Floats:
-    square = grade_ * grade_
-    square += np.float32(1)
-    np.sqrt(square, out=square)
-    np.divide(grade_, square, out=square)
-    return square
-
-
-def _tobler(rise: Floats) -> Floats:
-    """Tobler (1993): walking speed 6 exp(-3.5 |rise + 0.05|) km/h, here as pace relative to the level.
-
-    Cut off at a hundredfold pace: costly is not lethal."""
-    exponent = np.float32(3.5) * (np.abs(rise + np.float32(0.05)) - np.float32(0.05))
-    capped: Floats = np.minimum(np.exp(np.minimum(exponent, np.float32(5))), np.float32(100))
-    return capped
-
-
-def _energy(rise: Floats) -> Floats:
-    sine = _sine(rise)
-    cosine = np.sqrt(np.float32(1) - sine * sine)
-    factor = cosine + sine * np.float32(1 / ROLLING_RESISTANCE)
-    floored: Floats = np.maximum(factor, np.float32(1))
-    return floored
-
-
-def roughness_m(elevation_m: Floats, resolution_m: float) -> Floats:
-    """How far the eight neighbours lie off the plane that leans on a cell, at most: 0 on any even slope."""
-    return roughness_of_padded(np.pad(elevation_m, 1, mode="reflect", reflect_type="odd"), resolution_m)
-
-
 def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
-    """`roughness_m` of an array that brings its own border of one cell; a void beside a cell does not count."""
+    """How far the eight neighbours lie off the plane that leans on a cell, at most, in metres: 0 on any even slope.
+
+    The array brings its own border of one cell; a void beside a cell does not count.
+    """
     east, north = gradient_of_padded(padded_m, resolution_m)
     rows, cols = east.shape
     centre = padded_m[1:-1, 1:-1]
@@ -253,24 +171,6 @@ def terrain_pace(grade_: Floats, classes: Bytes, cost: CostConfig, rough_m: Floa
     return pace
 
 
-def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
-    """Cells whose middle lies in the polygon (even-odd), or that are painted in the mask. Raises TerrainError if it
-    covers none."""
-    if zone.mask is not None:
-        from shared_map.terrain.importers.rasters import mask_of
-
-        inside = mask_of(Path(zone.mask), grid)
-    else:
-        inside = polygon_mask(zone.polygon_m or (), grid)
-    if not inside.any():
-        width, height = grid.cols * grid.resolution_m, grid.rows * grid.resolution_m
-        raise TerrainError(
-            f"{where} {zone.name or zone.kind!r} covers no cell: its corners are metres east and south of the"
-            f" north-west corner of a terrain of {width:.0f} m x {height:.0f} m"
-        )
-    return inside
-
-
 def polygon_mask(polygon_m: Sequence[tuple[float, float]], grid: GridSpec) -> Bools:
     """Cells whose middle lies in a polygon of [east, south] corners in metres (even-odd rule)."""
     inside = np.zeros((grid.rows, grid.cols), np.bool_)
@@ -288,26 +188,6 @@ def polygon_mask(polygon_m: Sequence[tuple[float, float]], grid: GridSpec) -> Bo
             first, end = math.ceil(start - 0.5), math.ceil(stop - 0.5)
             inside[row, max(first, 0) : max(min(end, grid.cols), 0)] = True
     return inside
-
-
-def paint_zones(
-    pace: Floats, zones: Sequence[ZoneConfig], grid: GridSpec, cost: CostConfig, void: Bools | None = None
-) -> None:
-    """Step 3 of the merge rule, in place."""
-    for zone in zones:
-        inside = zone_mask(zone, grid)
-        match zone.kind:
-            case "preferred":
-                pace[inside] *= PREFERRED_FACTOR
-            case "rough":
-                pace[inside] *= ROUGH_FACTOR
-            case "road":
-                if void is not None:
-                    inside &= ~void
-                pace[inside] = np.float32(1 / cost.road_speed_m_per_s)
-    for zone in zones:
-        if zone.kind == "forbidden":
-            pace[zone_mask(zone, grid)] = LETHAL
 
 
 def inflation_halves(vehicle_radius_m: float, resolution_m: float) -> list[int]:

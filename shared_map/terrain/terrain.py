@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats
-from shared_map.terrain.climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.hidden import true_ground
 from shared_map.terrain.layers import (
     TerrainClass,
@@ -25,12 +24,13 @@ from shared_map.terrain.layers import (
     grade_of_padded,
     inflate,
     inflation_halves,
-    paint_zones,
     roughness_of_padded,
     slope_deg,
     terrain_pace,
 )
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.zones import paint_zones
 from swarm.config.scenario import CostConfig, Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

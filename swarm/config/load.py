@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from swarm.config.explain import explain, nearest
-from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ZoneConfig
+from swarm.config.scenario import WHOLE_TREE_STRATEGIES, PlannerConfig, Scenario, TlsConfig, ZoneConfig
 from swarm.errors import ConfigError
 
 
@@ -82,10 +82,11 @@ def _check(scenario: Scenario, source: str) -> None:
 
 
 def _check_directional(planner: PlannerConfig, source: str) -> None:
-    if planner.strategy not in ("auto", "full"):
+    if planner.strategy not in WHOLE_TREE_STRATEGIES:
+        allowed = " or ".join(map(repr, WHOLE_TREE_STRATEGIES))
         raise ConfigError(
             f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
-            " and rings know one cost per cell; expected 'auto' or 'full', which grow whole trees"
+            f" and corridors know one cost per cell; expected {allowed}, which grow whole trees"
         )
     if planner.length_weight:
         raise ConfigError(

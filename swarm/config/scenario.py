@@ -15,7 +15,6 @@ from msgspec import Meta
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
-Share = Annotated[float, Meta(ge=0, le=1)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
 GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
 ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}$")]
@@ -26,6 +25,12 @@ Point = tuple[Metres, Metres]
 Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
 ]
+WHOLE_TREE_STRATEGIES: tuple[Strategy, ...] = ("auto", "full")
+"""Strategies which need no windows, and so go with `cost.directional`: a window knows one cost per cell."""
+
+SlopeRule = Literal["linear", "quadratic", "tobler", "energy"]
+
+Walk = Literal["still", "random", "waypoints", "evade", "external"]
 
 ClassName = Literal["unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow"]
 
@@ -67,7 +72,8 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Where elevation and photo come from.
 
-    source        "jacksboro" (built in), "synthetic", or a file: .tif, .hgt, .asc, .npz, .png, .map or a ROS .yaml
+    source        "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .hgt, .vrt, .asc, .npz, .png, .map
+                  (MovingAI), .yaml or .yml (ROS)
     photo         a colour GeoTIFF on the same ground, or nothing
     labels        a TOML file of labelled polygons and points, from which to learn what the photo shows
     resolution_m  cell size to bring everything to; the source's own if not given
@@ -117,7 +123,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
 
     flat_speed_m_per_s: Positive = 10.0
     road_speed_m_per_s: Positive = 20.0
-    slope_rule: Literal["linear", "quadratic", "tobler", "energy"] = "quadratic"
+    slope_rule: SlopeRule = "quadratic"
     directional: bool = False
     steep_factor: Annotated[float, Meta(ge=1)] = 6.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
@@ -144,11 +150,16 @@ class TargetConfig(Section, frozen=True, kw_only=True):
 
     name: Name = "t"
     count: Annotated[int, Meta(ge=1, le=1000)] = 1
-    walk: Literal["still", "random", "waypoints", "evade", "external"] = "waypoints"
+    walk: Walk = "waypoints"
     speed_m_per_s: NotNegative = 4.0
     tracker: Literal["always", "sighted"] = "always"
     caught: Literal["jump", "stay"] = "jump"
     start: tuple[int, int] | None = None
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether the run moves it; the pose of an external target comes from another process."""
+        return self.walk != "external"
 
 
 class GroupConfig(Section, frozen=True, kw_only=True):
@@ -349,31 +360,3 @@ def ids_of(target: TargetConfig) -> list[str]:
     if target.count == 1:
         return [target.name]
     return [f"{target.name}{n}" for n in range(target.count)]
-
-
-class AgentPlan(msgspec.Struct, frozen=True):
-    """The vehicles that one agent process hosts: `count` of a group, from its `first` on."""
-
-    id: str
-    group: GroupConfig
-    first: int
-    count: int
-
-    @property
-    def vehicle_ids(self) -> list[str]:
-        return [f"{self.id}-{n:02d}" for n in range(self.count)]
-
-
-def agent_of(vehicle: str) -> str:
-    """The agent that hosts a vehicle, by the vehicle's id; one whose id names no agent is its own."""
-    return vehicle.rpartition("-")[0] or vehicle
-
-
-def plan_agents(scenario: Scenario) -> list[AgentPlan]:
-    """The agent processes of a scenario. An agent serves one group."""
-    agents: list[AgentPlan] = []
-    for group in scenario.groups:
-        for first in range(0, group.vehicles, scenario.vehicles.per_agent):
-            count = min(scenario.vehicles.per_agent, group.vehicles - first)
-            agents.append(AgentPlan(f"a{len(agents)}", group, first, count))
-    return agents

@@ -61,7 +61,7 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
     assert told.returncode == 3
     assert told.stderr.strip().splitlines()[-1] == (
         f"swarm: there is no file {there.parent / 'ridge.tif'}, and the base map cannot be fetched: no keeper in "
-        "namespace swarm answered within 4 s; start one where the file is"
+        "namespace swarm answered; start one where the file is"
     )
 
     hands.start("keeper", str(here))

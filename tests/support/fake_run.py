@@ -11,7 +11,8 @@ from skimage.graph import MCP_Geometric
 
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import Scenario, plan_agents
+from swarm.config.agents import plan_agents
+from swarm.config.scenario import Scenario
 from swarm.grid import STEP_COL, STEP_ROW, TILE_CELLS, walk
 from swarm.liveness import Peer
 from swarm.runtime.stats import Counters

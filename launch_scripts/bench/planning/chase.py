@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from launch_scripts.bench.machine import memory_free
 from launch_scripts.bench.planning.fields import Field
 from launch_scripts.bench.tables import Progress
-from launch_scripts.world.walks import Budget, Walk, Walker
+from launch_scripts.world.walks import Budget, Walker
+from planner_service.strategy import OnMove, row_of
 from planner_service.target_tree import TargetTree
-from swarm.config.scenario import PlannerConfig, Strategy
+from swarm.config.scenario import PlannerConfig, Strategy, Walk
 from swarm.errors import ConfigError
 from swarm.grid import walk
 from swarm.wire.routes import OK, RouteBatch
@@ -134,15 +135,16 @@ def chase(
     """Measure each entrant. Targets that do not fit into half of the free memory at once follow in batches: they do
     not depend on each other, and a frame's time is the sum over them. Raises ConfigError on more targets or
     vehicles than there are cells to stand on."""
-    home = len(field.ground.home)
+    home = len(field.terrain.home)
     for name, count in (("targets", plan.targets), ("vehicles", plan.vehicles)):
         if count > home:
             raise ConfigError(f"--{name} is {count}; the field has {home} connected cells to stand on")
     rng = np.random.default_rng(plan.seed)
     roots = field.draw(plan.targets, rng).tolist()
     places = np.array_split(field.draw(plan.vehicles, rng), plan.targets)
-    room = memory_free() // 2 // (TREE_BYTES_PER_CELL * field.grid.cells * len(entrants))
-    batches = [range(plan.targets)[n : n + max(1, room)] for n in range(0, plan.targets, max(1, room))]
+    trees_in_memory = memory_free() // 2 // (TREE_BYTES_PER_CELL * field.grid.cells)
+    at_once = max(1, trees_in_memory // len(entrants))
+    batches = [range(plan.targets)[n : n + at_once] for n in range(0, plan.targets, at_once)]
     tallies = {name: Tally(batches=len(batches)) for name in entrants}
     each = RUN_IN + plan.frames
     for done, batch in enumerate(batches):
@@ -211,7 +213,7 @@ class _Crowd:
         """Moves targets and vehicles by one frame."""
         vehicles = np.concatenate(self.places)
         for n, walker in enumerate(self._walkers):
-            to = walker.choose(self._field.ground, vehicles, Budget())
+            to = walker.choose(self._field.terrain, vehicles, Budget())
             walker.cell = walker.cell if to is None else to
             self.targets[n] = walker.cell
             if self._plan.speed:
@@ -259,10 +261,11 @@ class _Racer:
     def run_in(self, frame: int, targets: list[int]) -> None:
         """Strategies that grow the whole tree now and then do so once now, one target after the other, or all would
         in the same frame ever after."""
-        if self._strategy == "full":
+        # The row of `auto` is that of the stage in which it has windows.
+        row = row_of(self._strategy, "rotate", directed=False)
+        if row.on_move is OnMove.WHOLE_TREE:
             return
-
-        grows = self._strategy != "variable_range"
+        grows = row.grows_whole_trees
 
         def follow() -> None:
             for n, cell in enumerate(targets):

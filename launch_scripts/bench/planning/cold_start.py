@@ -12,6 +12,7 @@ from rich.table import Table
 
 from launch_scripts.bench.isolated import measure
 from launch_scripts.bench.machine import machine
+from launch_scripts.bench.planning.tree_process import MODULE
 from launch_scripts.bench.tables import Progress, number, table
 
 STAGES = {"tree": "a first tree is grown", "kernels": "a planner has called every kernel"}
@@ -33,7 +34,7 @@ def run_start(
                 cache = f"{folder}/{min(n, cold_runs - 1)}"
                 started_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
                 found = measure(
-                    *("start", what, str(size), str(started_ns)), environment={"NUMBA_CACHE_DIR": cache}
+                    *(MODULE, "start", what, str(size), str(started_ns)), environment={"NUMBA_CACHE_DIR": cache}
                 )
                 took["cold" if n < cold_runs else "warm"].append(found)
                 done += 1

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
-from launch_scripts.world.walks import Ground
+from launch_scripts.world.walks import TrueTerrain
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 
@@ -130,7 +130,7 @@ class Field:
     """A pace and its largest connected area.
 
     pace    (rows, cols) float32, s/m, inf is lethal; cells are taken as a metre wide, which scales all costs alike
-    ground  for walks; its `home` is the largest connected passable area, from which roots and vehicles are drawn
+    terrain for walks; its `home` is the largest connected passable area, from which roots and vehicles are drawn
 
     Raises TerrainError if every cell is lethal.
     """
@@ -138,9 +138,9 @@ class Field:
     def __init__(self, pace: Pace) -> None:
         self.pace = pace
         self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
-        self.ground = Ground(self.grid, pace)
+        self.terrain = TrueTerrain(self.grid, pace)
 
     def draw(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
         """Random cells of the largest area, without repetition where there are enough."""
-        home = self.ground.home
+        home = self.terrain.home
         return rng.choice(home, count, replace=count > len(home))

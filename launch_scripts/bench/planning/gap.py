@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from rich.table import Table
 
 from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.chase import Plan, Tally, chase
 from launch_scripts.bench.planning.fields import Field, make_field
-from launch_scripts.bench.tables import LABELS, Progress, number, percent, table
-from launch_scripts.world.walks import Walk
+from launch_scripts.bench.tables import Progress, label_of, number, percent, table
+from launch_scripts.world.walks import FLEEING, STANDING
 from planner_service.warm_up import warm_up
-from swarm.config.scenario import PlannerConfig, Strategy
+from swarm.config.scenario import PlannerConfig, Strategy, Walk
 
-WALKS: tuple[Walk, ...] = ("random", "waypoints", "evade")
+WALKS: tuple[Walk, ...] = tuple(walk for walk in get_args(Walk) if walk not in STANDING)
 
 
 def run_gap(
@@ -34,7 +34,7 @@ def run_gap(
 ) -> dict[str, Any]:
     """Runs one target from several roots and pools all routes.
 
-    speed  of vehicles in cells a frame; None: 1 after a target that evades, else 0
+    speed  of vehicles in cells a frame; None: 1 after a target that flees, else 0
     """
     stage = Field(make_field(dem, 512, seed))
     warm_up()
@@ -42,7 +42,7 @@ def run_gap(
     drawn: dict[Walk, dict[Strategy, Tally]] = {}
     for n, walk in enumerate(walks):
         tallies: dict[Strategy, Tally] = {name: Tally() for name in strategies}
-        drives = int(walk == "evade") if speed is None else speed
+        drives = int(walk in FLEEING) if speed is None else speed
         for run in range(runs):
             plan = Plan(vehicles=vehicles, frames=frames, walk=walk, speed=drives, probes=vehicles, seed=seed + run)
 
@@ -69,7 +69,7 @@ def run_gap(
         **machine(),
     }
     if picture is not None:
-        from launch_scripts.bench.plots import save_gap
+        from launch_scripts.bench.planning.plots import save_gap
 
         save_gap(report, drawn, picture)
     return report
@@ -93,7 +93,7 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
         for row in chosen:
             whole = row["updates"].get("full", 0) + row["updates"].get("job", 0)
             shown.add_row(
-                LABELS[row["strategy"]],
+                label_of(row["strategy"]),
                 *(percent(row[key]) for key in ("gap_mean", "gap_p95", "gap_max", "proven_p50", "proven_p95")),
                 number(row["frame_ms_mean"]),
                 f"{whole / row['frames']:.2f}",

@@ -15,7 +15,7 @@ from rich.table import Table
 from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.chase import Plan, chase
 from launch_scripts.bench.planning.fields import Field, make_field
-from launch_scripts.bench.tables import LABELS, Progress, number, percent, table, times
+from launch_scripts.bench.tables import Progress, label_of, number, percent, table, times
 from planner_service.warm_up import warm_up
 from swarm.config.scenario import PlannerConfig, Strategy
 
@@ -116,7 +116,7 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
     for row in report["table_2"]:
         printed_s = row["printed_s"]
         second.add_row(
-            LABELS[row["strategy"]],
+            label_of(row["strategy"]),
             number(None if printed_s is None else 1e3 * printed_s),
             *(number(row[key]) for key in ("frame_ms_mean", "frame_ms_p95")),
             times(full_ms / row["frame_ms_mean"]),

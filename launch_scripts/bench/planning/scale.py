@@ -12,7 +12,7 @@ from rich.table import Table
 from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.chase import Plan, chase
 from launch_scripts.bench.planning.fields import Field, make_field
-from launch_scripts.bench.tables import NARROW, Progress, number, percent, table
+from launch_scripts.bench.tables import Progress, narrow_label_of, number, percent, table
 from planner_service.warm_up import warm_up
 from swarm.config.scenario import PlannerConfig, Strategy
 
@@ -85,7 +85,7 @@ def run_scale(
         **machine(),
     }
     if picture is not None:
-        from launch_scripts.bench.plots import save_scale
+        from launch_scripts.bench.planning.plots import save_scale
 
         save_scale(report, picture)
     return report
@@ -102,7 +102,7 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
         ("Mean CPU ms a frame, full growths included", "frame_ms_mean", number),
         ("Gap to the optimum that 95 % of routes keep, in % above it", "gap_p95", percent),
     ):
-        shown = table(title, "size", "targets", "vehicles", *(NARROW[name] for name in strategies))
+        shown = table(title, "size", "targets", "vehicles", *(narrow_label_of(name) for name in strategies))
         for n, point in enumerate(points):
             cells = [write(found[(*point, name)][key]) for name in strategies]
             ends = n + 1 < len(points) and points[n + 1][0] != point[0]

@@ -54,7 +54,7 @@ def run() -> dict[str, Any]:
         report |= {f"ours_{way}_us": _short(ours), f"raw_{way}_us": _short(raw), f"ratio_{way}": _short(ours / raw)}
     report["hostile"] = [
         {"payload": name, "mib": _short(len(payload) / _MIB)}
-        | {f"{way}_mib": measure("decode", way, name, module=__name__)["mib"] for way in ("ours", "raw")}
+        | {f"{way}_mib": measure(__name__, "decode", way, name)["mib"] for way in ("ours", "raw")}
         for name, payload in hostile().items()
     ]
     return report

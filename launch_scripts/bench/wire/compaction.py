@@ -65,7 +65,7 @@ def run(lives: int, seed: int = 1, progress: Progress | None = None) -> dict[str
     """One row without compaction and one with it, of the same lives."""
     rows = []
     for done, compacts in enumerate((False, True), 1):
-        rows.append({"compaction": "with" if compacts else "without", **after_lives(lives, compacts, seed)})
+        rows.append({"compact": "yes" if compacts else "no", **after_lives(lives, compacts, seed)})
         if progress is not None:
             progress(done, 2)
     return {"rows": rows, **machine()}

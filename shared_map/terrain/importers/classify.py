@@ -264,9 +264,3 @@ def confusion(true: Bytes, predicted: Bytes) -> NDArray[np.int64]:
     size = max(TerrainClass) + 1
     pairs = true.reshape(-1).astype(np.int64) * size + predicted.reshape(-1)
     return np.bincount(pairs, minlength=size * size).reshape(size, size)
-
-
-def overlap(true: Bytes, predicted: Bytes, kind: TerrainClass) -> float:
-    """Intersection over union of one class; NaN where neither has it."""
-    union = np.count_nonzero((true == kind) | (predicted == kind))
-    return np.count_nonzero((true == kind) & (predicted == kind)) / union if union else float("nan")

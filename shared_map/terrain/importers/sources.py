@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +20,6 @@ from swarm.grid import GridSpec
 JACKSBORO_RESOLUTION_M = 75.0
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
 SYNTHETIC_RESOLUTION_M = 30.0
-FILE_KINDS = ".tif, .tiff, .hgt, .asc, .npz, .png, .map, .yaml (ROS)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,22 +119,19 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         raise TerrainError(f"terrain {path} does not exist; give {FILE_KINDS}, or jacksboro or synthetic")
     if path.is_dir():
         raise TerrainError(f"terrain {path} is a folder; give a file: {FILE_KINDS}")
-    match path.suffix.lower():
-        case ".tif" | ".tiff" | ".hgt" | ".vrt":
-            _check_hgt(path)
-            from shared_map.terrain.importers.rasters import read_elevation
+    suffix = path.suffix.lower()
+    if suffix not in _READERS:
+        raise TerrainError(f"terrain {path}: {suffix or 'a file without ending'} is unknown; give {FILE_KINDS}")
+    return _READERS[suffix](path, config, progress)
 
-            raster = read_elevation(path, config, progress)
-            classes = np.zeros(raster.elevation_m.shape, np.uint8)
-            return Source(raster.grid, raster.elevation_m, classes, notes=(str(path), *raster.notes))
-        case ".png":
-            return _png(path, config)
-        case ".asc" | ".npz":
-            return _heights(path, config)
-        case ".map" | ".yaml" | ".yml":
-            return _map(path, config)
-        case suffix:
-            raise TerrainError(f"terrain {path}: {suffix or 'a file without ending'} is unknown; give {FILE_KINDS}")
+
+def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    from shared_map.terrain.importers.rasters import read_elevation
+
+    _check_hgt(path)
+    raster = read_elevation(path, config, progress)
+    classes = np.zeros(raster.elevation_m.shape, np.uint8)
+    return Source(raster.grid, raster.elevation_m, classes, notes=(str(path), *raster.notes))
 
 
 def _check_hgt(path: Path) -> None:
@@ -148,7 +145,7 @@ def _check_hgt(path: Path) -> None:
         )
 
 
-def _png(path: Path, config: TerrainConfig) -> Source:
+def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A grey image of heights: needs to be told how many metres a grey level and a cell are."""
     from shared_map.terrain.importers.rasters import check_size, opened
 
@@ -167,7 +164,7 @@ def _png(path: Path, config: TerrainConfig) -> Source:
     return Source(grid, heights, np.zeros(heights.shape, np.uint8), notes=notes)
 
 
-def _heights(path: Path, config: TerrainConfig) -> Source:
+def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     from shared_map.terrain.importers.plain_files import read_asc, read_npz
 
     plain = read_asc(path) if path.suffix.lower() == ".asc" else read_npz(path)
@@ -203,7 +200,7 @@ def _geographic(crs: str | None) -> bool:
     return bool(crs_of(None, crs, "terrain").is_geographic)
 
 
-def _map(path: Path, config: TerrainConfig) -> Source:
+def _map(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A map without heights: level, with the pace that the file states."""
     from shared_map.terrain.importers.plain_files import read_map, read_ros
 
@@ -221,6 +218,22 @@ def _map(path: Path, config: TerrainConfig) -> Source:
     level = np.zeros(factor.shape, np.float32)
     notes = (str(path), *plain.notes)
     return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=notes)
+
+
+_READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
+    ".tif": _raster,
+    ".tiff": _raster,
+    ".hgt": _raster,
+    ".vrt": _raster,
+    ".asc": _heights,
+    ".npz": _heights,
+    ".png": _png,
+    ".map": _map,
+    ".yaml": _map,
+    ".yml": _map,
+}
+"""Ending -> reader. A new kind of file is a row here."""
+FILE_KINDS = ", ".join(_READERS)
 
 
 # --- onto the grid ------------------------------------------------------------------------------------------
@@ -312,14 +325,14 @@ def _classified(source: Source, config: TerrainConfig, seed: int, progress: Prog
     from shared_map.terrain.importers.classify import by_rules, learnt
 
     assert source.photo is not None
-    ground = (source.photo, source.elevation_m, source.grid.resolution_m)
+    inputs = (source.photo, source.elevation_m, source.grid.resolution_m)
     if config.labels is None:
-        classes = by_rules(*ground, source.seen, progress)
+        classes = by_rules(*inputs, source.seen, progress)
         note = "classes from the photo, by rules"
     else:
         from shared_map.terrain.importers.labels import read_labels
 
         labels = read_labels(Path(config.labels), source.grid)
-        classes = learnt(*ground, labels.classes, source.seen, seed, progress)
+        classes = learnt(*inputs, labels.classes, source.seen, seed, progress)
         note = f"classes from the photo, learnt from {labels.count} labels"
     return replace(source, classes=classes, notes=(*source.notes, note))

@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 
 from launch_scripts.bench.cli import app
 from launch_scripts.bench.isolated import measure
-from launch_scripts.bench.planning import libraries as rivals
+from launch_scripts.bench.planning import library_adapters as rivals
 from launch_scripts.bench.planning.chase import FEWEST, Plan, Tally, chase
 from launch_scripts.bench.planning.cold_start import tables
 from launch_scripts.bench.planning.fields import FIELDS, Field, make_field
 from launch_scripts.bench.planning.scale import points_of
+from launch_scripts.bench.planning.tree_process import MODULE
 from launch_scripts.bench.wire import partition
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
@@ -60,7 +61,7 @@ def assert_fits(text: str) -> None:
 def test_peers_agree_with_ours_and_every_ratio_is_that_of_the_times(field: str) -> None:
     report = bench("peers", "--size", "96", "--field", field, "--repeats", "3", "--no-memory")
     assert list(report)[:8] == [
-        *("size", "field", "ours_ms", "floor_ms", "peers", "ratios", "agreement", "memory_mb"),
+        *("size", "field", "ours_ms", "breadth_first_ms", "peers", "ratios", "agreement", "memory_mb"),
     ]
     assert report["size"] == 96
     assert report["field"] == field
@@ -70,7 +71,7 @@ def test_peers_agree_with_ours_and_every_ratio_is_that_of_the_times(field: str) 
     for name in peers:
         assert report["ratios"][name] == pytest.approx(report["peers"][name] / report["ours_ms"], rel=0.05)
         assert report["agreement"][name] < (1e-3 if name.startswith("tcod") else 1e-5), name
-    assert report["over_floor"] == pytest.approx(report["ours_ms"] / report["floor_ms"], rel=0.1)
+    assert report["over_breadth_first"] == pytest.approx(report["ours_ms"] / report["breadth_first_ms"], rel=0.1)
 
 
 def test_with_octile_edges_scipy_agrees() -> None:
@@ -104,7 +105,7 @@ def test_the_peak_of_memory_is_what_a_tree_needs(tmp_path: Path) -> None:
     """Padded weights, costs and parents take 9 bytes a cell; no more than five times that is passed through."""
     pace = make_field("uniform", 1024)
     np.save(tmp_path / "pace.npy", pace)
-    found = measure("memory", str(tmp_path / "pace.npy"), "ours", "5000", "paper")["mb"]
+    found = measure(MODULE, "memory", str(tmp_path / "pace.npy"), "ours", "5000", "paper")["mb"]
     if found is None:
         pytest.skip("the system does not tell a process's peak of memory")
     assert 9 * pace.size / 1e6 <= found <= 45 * pace.size / 1e6
@@ -112,7 +113,7 @@ def test_the_peak_of_memory_is_what_a_tree_needs(tmp_path: Path) -> None:
 
 def test_a_process_that_fails_is_told_in_a_sentence() -> None:
     with pytest.raises(SwarmError, match="exit code 1: expected memory FIELD"):
-        measure("nonsense")
+        measure(MODULE, "nonsense")
 
 
 def test_costs_along_parents_are_sums_and_circles_cost_inf() -> None:
@@ -317,10 +318,10 @@ def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
 # --- the map and its fleets --------------------------------------------------------------------------------------
 
 
-def test_folding_leaves_the_marked_cells_and_drops_what_was_said_twice() -> None:
-    without, folded = bench("compaction", "--lives", "8")["rows"]
-    assert (without["compaction"], folded["compaction"]) == ("without", "with")
-    assert folded["cells_marked"] == without["cells_marked"] == folded["marks"] < without["marks"]
+def test_compaction_leaves_the_marked_cells_and_drops_what_was_said_twice() -> None:
+    without, compacted = bench("compaction", "--lives", "8")["rows"]
+    assert (without["compact"], compacted["compact"]) == ("no", "yes")
+    assert compacted["cells_marked"] == without["cells_marked"] == compacted["marks"] < without["marks"]
     assert_fits(words_of("compaction", "--lives", "2"))
 
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 from support.target_reports import RES, flat, fleet
 
+from launch_scripts.world.service import TargetsService
 from launch_scripts.world.targets import (
     LISTEN_NS,
     PATIENCE_NS,
     Action,
     Captured,
     Publish,
-    TargetsService,
     TargetWorld,
 )
 from launch_scripts.world.walks import Walk

@@ -12,17 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.target_reports import FLAT, RES, flat
 
-from launch_scripts.world.walks import Budget, Ground, Walk, Walker, far_place, slowness_of
-from swarm.config.scenario import CostConfig, TargetConfig
+from launch_scripts.world.walks import Budget, TrueTerrain, Walker, far_place, slowness_of
+from swarm.config.scenario import CostConfig, TargetConfig, Walk
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 NOBODY = np.empty(0, np.int64)
 
 
-def ground(pace: NDArray[np.float32]) -> Ground:
+def terrain(pace: NDArray[np.float32]) -> TrueTerrain:
     rows, cols = pace.shape
-    return Ground(GridSpec(rows, cols, RES), pace)
+    return TrueTerrain(GridSpec(rows, cols, RES), pace)
 
 
 def rough(seed: int, rows: int = 30, cols: int = 34, lethal: float = 0.3) -> NDArray[np.float32]:
@@ -33,7 +33,7 @@ def rough(seed: int, rows: int = 30, cols: int = 34, lethal: float = 0.3) -> NDA
     return pace
 
 
-def walker(where: Ground, cell: int, walk: Walk, slowness: float = 1.0, seed: int = 1) -> Walker:
+def walker(where: TrueTerrain, cell: int, walk: Walk, slowness: float = 1.0, seed: int = 1) -> Walker:
     return Walker("t", walk, slowness, random.Random(seed), cell)
 
 
@@ -42,27 +42,27 @@ def test_the_largest_part_is_what_legal_steps_connect() -> None:
     pace[:, 3] = np.inf
     pace[0, 2] = pace[1, 3] = np.inf
     pace[1, 3] = np.inf
-    assert ground(pace).home.tolist() == [0, 1, 6, 7, 8, 12, 13, 14, 18, 19, 20]
+    assert terrain(pace).home.tolist() == [0, 1, 6, 7, 8, 12, 13, 14, 18, 19, 20]
 
 
 def test_nobody_squeezes_past_the_corner_of_a_lethal_cell() -> None:
     pace = flat(2, 2)
     pace[0, 1] = np.inf
-    assert ground(pace).step(0, 3) is None
-    assert ground(pace).step(0, 4) == 2
+    assert terrain(pace).step(0, 3) is None
+    assert terrain(pace).step(0, 4) == 2
     pace[1, 0] = np.inf
-    assert len(ground(pace).home) == 1
+    assert len(terrain(pace).home) == 1
 
 
 def test_a_terrain_without_a_passable_cell_is_refused() -> None:
     with pytest.raises(TerrainError, match="every cell of the terrain is lethal"):
-        ground(np.full((3, 3), np.inf, np.float32))
+        terrain(np.full((3, 3), np.inf, np.float32))
 
 
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 10_000), st.sampled_from(["random", "waypoints", "evade"]))
 def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
-    where = ground(rough(seed))
+    where = terrain(rough(seed))
     one = walker(where, where.random_home(random.Random(seed)), walk, seed=seed)
     vehicles = where.home[:3]
     for _ in range(80):
@@ -78,7 +78,7 @@ def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 10_000))
 def test_a_way_is_the_cheapest_there_is(seed: int) -> None:
-    where = ground(rough(seed, 12, 14))
+    where = terrain(rough(seed, 12, 14))
     start = where.random_home(random.Random(seed))
     way = where.way(start, random.Random(seed))
     cost, at = 0.0, start
@@ -89,7 +89,7 @@ def test_a_way_is_the_cheapest_there_is(seed: int) -> None:
     assert cost == pytest.approx(naive_cost(where, start, at))
 
 
-def naive_cost(where: Ground, start: int, end: int) -> float:
+def naive_cost(where: TrueTerrain, start: int, end: int) -> float:
     """Bellman-Ford: slow and obviously right."""
     cost = {start: 0.0}
     changed = True
@@ -108,7 +108,7 @@ def test_a_walled_in_target_stays_where_it_is() -> None:
     pace = flat(5, 5)
     pace[1:4, 1:4] = np.inf
     pace[2, 2] = FLAT
-    where = ground(pace)
+    where = terrain(pace)
     walks: tuple[Walk, ...] = ("random", "waypoints", "evade")
     for walk in walks:
         one = walker(where, 12, walk)
@@ -129,7 +129,7 @@ def test_a_walled_in_target_stays_where_it_is() -> None:
 )
 def test_ten_seconds_of_driving(speed: float, pace: float, metres: float) -> None:
     """At 10 m/s on level ground: a target's own speed there, as much slower on slow ground, never outrunning it."""
-    where = ground(np.full((1, 40), pace, np.float32))
+    where = terrain(np.full((1, 40), pace, np.float32))
     config = TargetConfig(speed_m_per_s=speed)
     one = walker(where, 0, "waypoints", slowness_of(config, CostConfig(flat_speed_m_per_s=10.0)))
     one.way = list(range(39, 0, -1))
@@ -140,7 +140,7 @@ def test_ten_seconds_of_driving(speed: float, pace: float, metres: float) -> Non
 
 
 def test_an_evader_gets_away_from_the_vehicles_near_it() -> None:
-    where = ground(flat())
+    where = terrain(flat())
     grid = where.grid
     one = walker(where, grid.cell(20, 25), "evade")
     vehicles = np.array([grid.cell(20, 22), grid.cell(18, 23)])
@@ -149,7 +149,7 @@ def test_an_evader_gets_away_from_the_vehicles_near_it() -> None:
 
 
 def test_ways_are_computed_one_a_tick() -> None:
-    where = ground(flat())
+    where = terrain(flat())
     walkers = [walker(where, 100 * n, "waypoints") for n in range(4)]
     for ticked in range(1, 5):
         budget = Budget()
@@ -159,7 +159,7 @@ def test_ways_are_computed_one_a_tick() -> None:
 
 
 def test_a_jump_leads_far_away_and_clear_of_vehicles() -> None:
-    where = ground(flat())
+    where = terrain(flat())
     grid = where.grid
     vehicles = np.array([grid.cell(row, 40) for row in range(40)])
     for seed in range(50):

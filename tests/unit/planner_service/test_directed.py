@@ -11,11 +11,12 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from planner_service.target_tree import TargetTree
-from shared_map.terrain.climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.synthetic.noise import mountains
 from shared_map.terrain.terrain import build_terrain, load_prepared, save_prepared
+from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import CostConfig, PlannerConfig, Scenario, TerrainConfig, plan_agents
+from swarm.config.scenario import CostConfig, PlannerConfig, Scenario, TerrainConfig
 from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.messages.planning import RouteReply

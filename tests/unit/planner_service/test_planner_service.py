@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from support.slow_twins import cost_to_go
 from support.swarm_model import SwarmModel
 
-from launch_scripts.world.targets import TargetsService
+from launch_scripts.world.service import TargetsService
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.service import PlannerService
 from planner_service.target_tree import TargetTree

@@ -10,7 +10,7 @@ import pytest
 from planner_service import strategy as table
 from planner_service.strategy import STAGES, STRATEGIES, FullGrowth, OnMove, StrategyRow, row_of
 from planner_service.target_tree import TargetTree
-from swarm.config.scenario import PlannerConfig, Strategy
+from swarm.config.scenario import WHOLE_TREE_STRATEGIES, PlannerConfig, Strategy
 from swarm.grid import GridSpec
 
 GRID = GridSpec(96, 96, 1.0)
@@ -28,6 +28,8 @@ def kinds_of_moves(config: PlannerConfig, moves: int) -> list[str]:
 def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None:
     assert {*STRATEGIES, "auto"} == set(get_args(Strategy))
     assert set(STAGES) == set(get_args(table.Stage))
+    exact = {name for name, row in STRATEGIES.items() if row.on_move is OnMove.WHOLE_TREE}
+    assert {*exact, "auto"} == set(WHOLE_TREE_STRATEGIES)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.draw import line
 
-from shared_map.terrain.importers.classify import by_rules, confusion, held_out, learnt, overlap
+from shared_map.arrays import Bytes
+from shared_map.terrain.importers.classify import by_rules, confusion, held_out, learnt
 from shared_map.terrain.importers.labels import Labels, read_labels
 from shared_map.terrain.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
@@ -25,6 +26,12 @@ from swarm.grid import GridSpec
 DATA = Path(__file__).parents[4] / "shared" / "data" / "dem"
 LABELS = Path(__file__).parent / "davosdorf_labels.toml"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
+
+
+def overlap(true: Bytes, predicted: Bytes, kind: TerrainClass) -> float:
+    """Intersection over union of one class; NaN where neither has it."""
+    union = np.count_nonzero((true == kind) | (predicted == kind))
+    return np.count_nonzero((true == kind) & (predicted == kind)) / union if union else float("nan")
 
 
 @pytest.fixture(scope="module")

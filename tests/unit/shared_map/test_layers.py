@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,18 +15,16 @@ from shared_map.terrain.importers.sources import load_source
 from shared_map.terrain.layers import (
     CLASS_FACTOR,
     TerrainClass,
-    directional_factor,
     gradient,
-    paint_zones,
     polygon_mask,
-    roughness_m,
+    roughness_of_padded,
     slope_deg,
-    slope_factor,
     terrain_pace,
-    zone_mask,
 )
+from shared_map.terrain.slope_rules import SLOPE_RULES, directional_factor, slope_factor
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.scenario import CostConfig, Scenario, TerrainConfig, ZoneConfig
+from shared_map.terrain.zones import paint_zones, zone_mask
+from swarm.config.scenario import CostConfig, Scenario, SlopeRule, TerrainConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -36,7 +35,7 @@ MODELS = {
     "bigtujunga": str(DEM / "bigtujunga/bigtujunga_512.tif"),
     "rmnp": str(DEM / "rmnp/rmnp-dem.tif"),
 }
-RULES = ("linear", "quadratic", "tobler", "energy")
+RULES: tuple[SlopeRule, ...] = get_args(SlopeRule)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -75,17 +74,21 @@ def test_a_void_counts_as_level_with_its_neighbours_and_spoils_none() -> None:
 
 
 def test_roughness_is_what_stands_off_the_even_slope() -> None:
-    row, col = np.mgrid[:7, :7]
+    row, col = np.mgrid[:9, :9]
     heights = (3.0 * row + 2.0 * col).astype(np.float32)
-    np.testing.assert_allclose(roughness_m(heights, 10.0), 0, atol=1e-4)
-    heights[3, 3] += 7
-    assert roughness_m(heights, 10.0)[3, 3] == pytest.approx(7, abs=1e-4)
-    assert roughness_m(heights, 10.0)[0, 0] == pytest.approx(0, abs=1e-4)
+    np.testing.assert_allclose(roughness_of_padded(heights, 10.0), 0, atol=1e-4)
+    heights[4, 4] += 7
+    assert roughness_of_padded(heights, 10.0)[3, 3] == pytest.approx(7, abs=1e-4)
+    assert roughness_of_padded(heights, 10.0)[0, 0] == pytest.approx(0, abs=1e-4)
     pace = [
         terrain_pace(np.zeros((1, 1), np.float32), np.zeros((1, 1), np.uint8), CostConfig(rough_per_m=0.5), rough)
         for rough in (None, np.full((1, 1), 4.0, np.float32))
     ]
     assert pace[1][0, 0] == pytest.approx(3 * pace[0][0, 0])
+
+
+def test_every_slope_rule_of_the_scenario_has_a_row() -> None:
+    assert set(SLOPE_RULES) == set(RULES)
 
 
 @pytest.mark.parametrize("rule", RULES)

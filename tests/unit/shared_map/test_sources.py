@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,11 @@ import pytest
 import rasterio
 from rasterio.transform import Affine, from_origin
 
-from shared_map.terrain.importers.sources import Source, load_source, metres_per_degree
+from launch_scripts.commands.terrain import info
+from shared_map.terrain.importers.sources import FILE_KINDS, Source, load_source, metres_per_degree
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
+from swarm.config.describe import meanings
 from swarm.config.scenario import Scenario, TerrainConfig
 from swarm.errors import TerrainError
 
@@ -348,3 +351,8 @@ def test_real_pairs_come_onto_one_grid() -> None:
 def test_jacksboro_from_its_file_is_jacksboro() -> None:
     file = load(DATA / "dem/jacksboro/jacksboro_fault_dem.npz", resolution_m=75.0)
     np.testing.assert_array_equal(file.elevation_m, load("jacksboro").elevation_m)
+
+
+def test_the_words_about_kinds_of_files_name_every_reader() -> None:
+    for text in (meanings(TerrainConfig)["source"], info.__doc__ or ""):
+        assert set(re.findall(r"\.[a-z]{3,4}\b", text)) >= set(FILE_KINDS.split(", "))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
@@ -161,10 +160,10 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     import rasterio
     from rasterio.transform import from_origin
 
-    text = (Path(__file__).parents[3] / "docs" / "terrain.md").read_text()
-    block = re.search(r"(?:^ {7}.*\n)+", text, re.MULTILINE)
+    text = (Path(__file__).parents[3] / "docs" / "tutorial" / "terrain.md").read_text()
+    block = re.search(r"^```toml\n# mine\.toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     assert block is not None
-    (tmp_path / "mine.toml").write_text(textwrap.dedent(block[0]))
+    (tmp_path / "mine.toml").write_text(block[1])
     base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(5e5, 5e6, 20, 20)}
     with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
         file.write(np.random.default_rng(1).uniform(0, 2, (60, 70)).astype(np.float32), 1)

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario, plan_agents
+from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply

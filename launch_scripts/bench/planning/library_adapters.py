@@ -37,15 +37,14 @@ def ours(pace: Pace, edge: Edge) -> Tool:
     return Tool(tree.grow, lambda _, root: tree.inner(tree.cost).copy())
 
 
-def floor(pace: Pace, edge: Edge) -> Tool:
+def breadth_first(pace: Pace, edge: Edge) -> Tool:
     """A plain breadth-first search over the same arrays: a lower bound for any search that visits every cell."""
-    from planner_service.kernels.bucket_queue import breadth_first
+    from planner_service.kernels.bucket_queue import breadth_first as search
 
     cost_grid = _our_tree(pace, edge).cost_grid
     cost = np.empty(cost_grid.size, np.float32)
     return Tool(
-        lambda root: breadth_first(cost_grid.cell_cost, cost, cost_grid.stride, cost_grid.pad(root)),
-        lambda *_: None,
+        lambda root: search(cost_grid.cell_cost, cost, cost_grid.stride, cost_grid.pad(root)), lambda *_: None
     )
 
 
@@ -164,7 +163,7 @@ PEERS: dict[str, tuple[str, Callable[[Pace, Edge], Tool]]] = {
 }
 """Name -> its package, and the function that prepares it."""
 
-MAKERS = {"ours": ours, "floor": floor, **{name: make for name, (_, make) in PEERS.items()}}
+MAKERS = {"ours": ours, "breadth_first": breadth_first, **{name: make for name, (_, make) in PEERS.items()}}
 PAPER_ONLY = {"dijkstra3d.parental_field", "dijkstra3d.distance_field"}
 """Libraries in which all steps are equally long."""
 EXTRA = ("dijkstra3d", "tcod")

@@ -15,7 +15,7 @@ from rich.table import Table
 from launch_scripts.bench.isolated import measure
 from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.fields import Field, make_field
-from launch_scripts.bench.planning.libraries import (
+from launch_scripts.bench.planning.library_adapters import (
     MAKERS,
     PEERS,
     Costs,
@@ -24,6 +24,7 @@ from launch_scripts.bench.planning.libraries import (
     present_peers,
     versions,
 )
+from launch_scripts.bench.planning.tree_process import MODULE
 from launch_scripts.bench.tables import Progress, number, table
 
 
@@ -42,7 +43,7 @@ def run(
     memory_mb  peak increase of the resident memory of a process of its own; None if not measured
     """
     made_field = Field(make_field(field, size, seed))
-    names = ["ours", "floor", *present_peers(edge)]
+    names = ["ours", "breadth_first", *present_peers(edge)]
     roots = made_field.draw(repeats + 1, np.random.default_rng(seed + 1)).tolist()
     total = len(roots) + (len(names) if with_memory else 0)
     tell = progress or (lambda done, total: None)
@@ -52,7 +53,7 @@ def run(
             saved = Path(folder) / "field.npy"
             np.save(saved, made_field.pace)
             for name in names:
-                memory_mb[name] = measure("memory", str(saved), name, str(roots[0]), edge)["mb"]
+                memory_mb[name] = measure(MODULE, "memory", str(saved), name, str(roots[0]), edge)["mb"]
                 tell(len(memory_mb), total)
     took: dict[str, list[float]] = {name: [] for name in names}
     agreement: dict[str, float] = {}
@@ -72,12 +73,12 @@ def run(
                 agreement[name] = max(agreement.get(name, 0.0), _difference(grown, costs))
         tell(len(memory_mb) + turn + 1, total)
     medians = {name: statistics.median(values) for name, values in took.items()}
-    peers = {name: round(ms, 3) for name, ms in medians.items() if name not in ("ours", "floor")}
+    peers = {name: round(ms, 3) for name, ms in medians.items() if name not in ("ours", "breadth_first")}
     return {
         "size": made_field.pace.shape[0],
         "field": field,
         "ours_ms": round(medians["ours"], 3),
-        "floor_ms": round(medians["floor"], 3),
+        "breadth_first_ms": round(medians["breadth_first"], 3),
         "peers": peers,
         "ratios": {name: round(medians[name] / medians["ours"], 2) for name in peers},
         "agreement": agreement,
@@ -85,7 +86,7 @@ def run(
         "shape": list(made_field.pace.shape),
         "edge": edge,
         "repeats": repeats,
-        "over_floor": round(medians["ours"] / medians["floor"], 2),
+        "over_breadth_first": round(medians["ours"] / medians["breadth_first"], 2),
         "missing": missing_packages(),
         "versions": versions(),
         **machine(),
@@ -113,12 +114,12 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
         "A full tree",
         *("<", "<version", "CPU\nms", "over\nours", "peak\nMB", "differs\nfrom ours"),
     )
-    times_ms = {"ours": report["ours_ms"], **report["peers"], "floor": report["floor_ms"]}
+    times_ms = {"ours": report["ours_ms"], **report["peers"], "breadth_first": report["breadth_first_ms"]}
     for name, ms in times_ms.items():
         package = PEERS[name][0] if name in PEERS else ""
         differs = report["agreement"].get(name)
         shown.add_row(
-            {"floor": "breadth-first search"}.get(name, name),
+            name.replace("breadth_first", "breadth-first search"),
             report["versions"].get(package, ""),
             number(ms),
             "" if name == "ours" else f"{ms / report['ours_ms']:.2f} x",

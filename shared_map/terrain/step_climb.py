@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
-from shared_map.terrain.layers import directional_factor
+from shared_map.terrain.slope_rules import directional_factor
 from swarm.config.scenario import CostConfig
 from swarm.grid import GridSpec
 

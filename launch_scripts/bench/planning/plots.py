@@ -15,13 +15,13 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from launch_scripts.bench.planning.chase import Tally
-from launch_scripts.bench.tables import LABELS, on_machine
-from launch_scripts.report.palette import BLUE, FAINT, GREEN, INK, ORANGE, PINK, SKY
+from launch_scripts.bench.tables import label_of, on_machine
+from launch_scripts.report.palette import BLUE, FAINT, GREEN, INK, ORANGE, PINK, SKY, VIOLET
 from launch_scripts.report.plot_style import STYLE
 from launch_scripts.report.plots import halo
 from swarm.config.scenario import Strategy
 
-COLOURS: dict[Strategy, str] = {
+_COLOURS: dict[Strategy, str] = {
     "full": INK,
     "auto": BLUE,
     "rotation": GREEN,
@@ -105,6 +105,10 @@ def save_gap(report: dict[str, Any], tallies: Mapping[Any, Mapping[Strategy, Tal
         _save(figure, path)
 
 
+def _colour_of(strategy: Strategy) -> str:
+    return _COLOURS.get(strategy, VIOLET)
+
+
 def _lines(axes: Axes, rows: Sequence[dict[str, Any]], name: str, key: str, label: bool) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -117,7 +121,9 @@ def _lines(axes: Axes, rows: Sequence[dict[str, Any]], name: str, key: str, labe
         along, values = np.array(points, np.float64).T
         if gaps:
             values = np.maximum(100 * (values - 1), EXACT_PERCENT)
-        axes.plot(along, values, "o-", color=COLOURS[strategy], linewidth=2, markersize=5, markeredgecolor="white")
+        axes.plot(
+            along, values, "o-", color=_colour_of(strategy), linewidth=2, markersize=5, markeredgecolor="white"
+        )
         ends.append((float(values[-1]), strategy))
     numbers = sorted({row[name] for row in rows})
     axes.set_xticks(numbers, [f"{value:,}" for value in numbers])
@@ -135,9 +141,9 @@ def _shares(axes: Axes, tallies: Mapping[Strategy, Tally]) -> None:
         above = np.sort(100 * (np.concatenate(tally.gaps) - 1))
         share = 100 * (1 - np.arange(above.size) / above.size)
         drawn = above >= EXACT_PERCENT
-        axes.plot(above[drawn], share[drawn], color=COLOURS[strategy], linewidth=2)
-        label = LABELS[strategy] if drawn.any() else f"{LABELS[strategy]}: exact"
-        handles.append(Line2D([], [], color=COLOURS[strategy], linewidth=2, label=label))
+        axes.plot(above[drawn], share[drawn], color=_colour_of(strategy), linewidth=2)
+        label = label_of(strategy) if drawn.any() else f"{label_of(strategy)}: exact"
+        handles.append(Line2D([], [], color=_colour_of(strategy), linewidth=2, label=label))
     axes.set_ylim(0.01, 100)
     axes.set_xlim(left=EXACT_PERCENT)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} %"))
@@ -159,7 +165,7 @@ def _over_time(axes: Axes, tallies: Mapping[Strategy, Tally], frames: int) -> No
         each = [100 * (np.quantile(gaps, 0.95) - 1) if gaps.size else 0.0 for gaps in tally.gaps]
         runs = np.array(each).reshape(-1, frames)
         middle = np.maximum(np.median(runs, axis=0), EXACT_PERCENT)
-        axes.plot(np.arange(1, frames + 1), middle, color=COLOURS[strategy], linewidth=1.6)
+        axes.plot(np.arange(1, frames + 1), middle, color=_colour_of(strategy), linewidth=1.6)
         ends.append((float(middle[-1]), strategy))
     axes.set_xlim(1, max(2, frames))
     axes.set_ylim(bottom=EXACT_PERCENT * 0.8)
@@ -187,11 +193,11 @@ def _label_ends(axes: Axes, at: float, ends: Sequence[tuple[float, Strategy]]) -
         height = float(np.log(value / low) / span)
         heights.append(max(height, heights[-1] + 0.055) if heights else max(height, 0.02))
         axes.annotate(
-            LABELS[strategy],
+            label_of(strategy),
             (at, value),
             xytext=(1.03, heights[-1]),
             textcoords="axes fraction",
-            color=COLOURS[strategy],
+            color=_colour_of(strategy),
             fontsize=9,
             fontweight="bold",
             va="center",

@@ -1,0 +1,95 @@
+"""The bus side of the simulated targets: `TargetWorld` is the core."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.world.referee import Collision, LethalEntry
+from launch_scripts.world.targets import Action, Captured, Publish, TargetWorld
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import ids_of
+from swarm.runtime.membership import Member
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.topics import COST, FLEET, POSE, STATUS, TRUE_POSE
+
+_ASK_NS = NS_PER_S // 2
+_ASK = "where"
+
+
+class TargetsService:
+    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`."""
+
+    def __init__(
+        self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
+    ) -> None:
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._scenario = setup.scenario
+        self._bus = bus
+        self._post = post
+        self._ask_due_ns = 0
+        self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation)
+        self.counters = self._member.counters
+        for name in ("captures", "collisions", "lethal_entries", "poses"):
+            self.counters.count(name, 0)
+
+    def start(self, now_ns: int) -> None:
+        self._member.join()
+        self._bus.subscribe(FLEET, self._post)
+        self._bus.subscribe(STATUS, self._post)
+        self._bus.watch_alive(self._post, role="planner")
+        for target in self._scenario.targets:
+            if not target.is_simulated:
+                for id in ids_of(target):
+                    self._bus.subscribe(POSE, self._post, target=id)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        if self._member.handle(event):
+            return
+        match event:
+            case Heard(message=Fleet() as fleet):
+                self._perform(self._world.hear_fleet(fleet, now_ns), now_ns)
+            case Heard(message=PlannerStatus() as status):
+                self._world.hear_planner(status.target, status.target_cell)
+            case Replied(message=CostReply() as reply):
+                self._world.hear_planner(reply.target, reply.target_cell)
+            case Appeared(peer):
+                self._world.planner_up(peer.id, True)
+            case Disappeared(peer):
+                self._world.planner_up(peer.id, False)
+            case Heard(message=TargetPose() as pose):
+                self._world.hear_pose(pose)
+            case _:
+                pass
+
+    def tick(self, now_ns: int) -> None:
+        if self._world.listening and now_ns >= self._ask_due_ns:
+            self._ask_due_ns = now_ns + _ASK_NS
+            self._bus.ask(COST, CostRequest(), self._post, tag=_ASK)
+        self._perform(self._world.tick(now_ns), now_ns)
+        self._member.tick(now_ns)
+
+    def stop(self, now_ns: int) -> None:
+        self._member.publish_stats(now_ns)
+
+    def _perform(self, actions: list[Action], now_ns: int) -> None:
+        for action in actions:
+            match action:
+                case Publish(pose):
+                    self.counters.count("poses")
+                    topic = TRUE_POSE if pose.target in self._scenario.untracked else POSE
+                    self._bus.publish(topic, pose, target=pose.target)
+                case Captured(target, vehicle, cell):
+                    self.counters.count("captures")
+                    self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell)
+                case Collision(first, second, cell):
+                    self.counters.count("collisions")
+                    self._member.note(now_ns, "collision", f"{first} and {second} on one cell", cell)
+                case LethalEntry(vehicle, cell):
+                    self.counters.count("lethal_entries")
+                    self._member.note(now_ns, "lethal-entry", f"{vehicle} entered a lethal cell", cell)
