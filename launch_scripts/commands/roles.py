@@ -177,4 +177,10 @@ def _found(network: NetworkConfig) -> list[RunInfo]:
     from swarm.bus.zenoh_bus import open_bus
 
     with open_bus(network) as bus:
-        return ask_run(bus)
+        found = ask_run(bus, routers=True)
+    if not found and network.tls is not None:
+        # Denied messages are silent. A router of ours answers everybody that it admits, zenohd does not.
+        logging.getLogger(__name__).warning(
+            "nobody answers, not even a router: does it admit the name in %s?", network.tls.certificate
+        )
+    return [info for info in found if info.run_id]

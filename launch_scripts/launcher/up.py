@@ -115,6 +115,8 @@ class _StopAsked:
 
 def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
+    for spec in options.table or processes_of(options.scenario, options.roles):
+        as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     if not options.joins:
         check_ports(options.scenario, options.roles)
     run_id = _run_id(options)
@@ -150,8 +152,6 @@ class _Run:
         self._terminal = Terminal(options.as_json, options.plain)
         self._stop_asked = _StopAsked()
         specs = list(options.table or processes_of(self._scenario, options.roles))
-        for spec in specs:
-            self._setup_of(spec)  # a certificate that is missing is told of before anything starts
         self._swarm = LocalSwarm(specs, self._setup_of, run_dir)
         self._startup_s: float | None = None
 

@@ -63,7 +63,7 @@ class TwoSides:
         east, west = SIDES
         try:
             for side in SIDES:
-                issue(self._folder, side, [ADDRESSES[side]], 2)
+                issue(self._folder, f"router.{side}", [ADDRESSES[side]], 2)
                 _ip("netns", "add", self._spaces[side])
             _ip("link", "add", self._ends[east], "type", "veth", "peer", "name", self._ends[west])
             for side in SIDES:

@@ -86,12 +86,14 @@ class MapService:
 
 def run_child(side: str, role: str, id: str, folder: Path) -> None:
     """Runs one process until its standard input ends."""
-    names = {name: str(folder / f"{side}.{kind}") for name, kind in (("certificate", "pem"), ("key", "key"))}
+    files = (("certificate", "pem"), ("key", "key"))
+    names = {name: str(folder / f"router.{side}.{kind}") for name, kind in files}
     tls = TlsConfig(ca=str(folder / "ca.pem"), **names)
     other = SIDES[1 - SIDES.index(side)]
     here, there = (f"tls/{ADDRESSES[each]}:{_PORT}" for each in (side, other))
     peers = (there,) if side == SIDES[0] else ()
-    network = NetworkConfig(listen=(_LOCAL, here), connect=(_LOCAL,), peers=peers, tls=tls)
+    admit = tuple(f"router.{each}" for each in SIDES)
+    network = NetworkConfig(listen=(_LOCAL, here), connect=(_LOCAL,), peers=peers, tls=tls, admit=admit)
     started_ns = time.time_ns()
     setup = RoleSetup(Scenario(network=network), "partition", role, f"{side}-{id}", started_ns, started_ns)
     terrain = terrain_of_pace(np.ones((_SIDE_CELLS, _SIDE_CELLS), np.float32))

@@ -1,0 +1,121 @@
+"""A run on two machines, as docs/deploy.md says: certificates, a launcher on each, a name that is revoked."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+from support.live_swarm import Hands, swarm
+from support.processes import eventually
+
+from launch_scripts.launcher.options import as_process, free_ports, tls_of
+from swarm.bus.bus import Event, Heard
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.config.load import load_scenario
+from swarm.wire.messages.processes import Stats
+from swarm.wire.topics import STATS
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+
+def tls(folder: Path) -> list[str]:
+    return ["--tls-ca", str(folder / "ca.pem"), "--tls-cert", str(folder), "--tls-key", str(folder)]
+
+
+def opened(hands: Hands, role: str, id: str, certs: Path, endpoint: str) -> ZenohBus:
+    """A session with the certificate of a process."""
+    scenario = load_scenario(hands.path)
+    files = tls_of(str(certs / "ca.pem"), str(certs), str(certs))
+    network = msgspec.structs.replace(scenario.network, connect=(endpoint,), tls=files)
+    return open_bus(as_process(msgspec.structs.replace(scenario, network=network), role, id).network)
+
+
+def issue(hands: Hands, *arguments: str) -> Path:
+    certs = hands.folder / "certs"
+    told = swarm("deploy", "certs", certs, "--scenario", hands.path, *arguments)
+    assert told.returncode == 0, told.stderr
+    return certs
+
+
+def test_launchers_on_two_machines_make_one_run_each_with_the_certificates_of_its_own_processes(
+    hands: Hands,
+) -> None:
+    certs = issue(hands)
+    car = hands.folder / "car"
+    car.mkdir()
+    for path in (certs / "ca.pem", *certs.glob("agent.*"), *certs.glob("operator.*")):
+        shutil.copy(path, car)
+    endpoint = f"tls/localhost:{free_ports(1)[0]}"
+    elsewhere = ["--connect", endpoint, *tls(car)]
+    told = swarm("up", hands.path, *elsewhere, "--only", "planner", "--runs", hands.folder / "car-runs")
+    assert told.returncode == 2
+    assert "car/planner.t0.pem, which planner.t0 needs" in told.stderr
+    roles = [option for role in ("router", "keeper", "targets", "planner") for option in ("--only", role)]
+    base = hands.start("up", str(hands.path), *roles, "--listen", endpoint, *tls(certs), "--plain")
+    eventually(lambda: swarm("status", *elsewhere).returncode == 0, 90, "the router")
+    eventually(lambda: len(hands.members()) == 5, 60, "all of the base")
+    part = hands.start(
+        "up", str(hands.path), *elsewhere, "--only", "agent", "--plain", runs=hands.folder / "car-runs"
+    )
+
+    def routed() -> int:
+        told = swarm("status", *elsewhere, "--json")
+        status = json.loads(told.stdout) if told.returncode == 0 else {}
+        return sum(planner["routes_served"] for planner in status.get("planners", ()))
+
+    eventually(lambda: routed() >= 12, 90, "routes for all vehicles")
+    for process in (part, base):
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0, hands.logs()
+
+
+def test_a_name_that_is_revoked_is_denied_from_the_routers_next_start_and_its_successor_is_not(
+    hands: Hands,
+) -> None:
+    certs = issue(hands)
+    endpoint = f"tls/localhost:{free_ports(1)[0]}"
+    start = ("router", str(hands.path), "--listen", endpoint, *tls(certs))
+    heard: list[str] = []
+
+    def tell(event: Event) -> None:
+        if isinstance(event, Heard):
+            heard.append(event.fields["id"])
+
+    def stats(bus: ZenohBus, id: str) -> None:
+        said = Stats(role="agent", id=id, incarnation=1, stamp_ns=1, counts={}, gauges={}, histograms={})
+        bus.publish(STATS, said, role="agent", id=id)
+
+    def says(bus: ZenohBus, id: str) -> bool:
+        """Whether what it says is heard; a0 speaks meanwhile, so that not hearing is no matter of time."""
+        heard.clear()
+        until_s = time.monotonic() + 10
+        while heard.count("a0") < 5 and time.monotonic() < until_s:
+            stats(bus, id)
+            stats(other, "a0")
+            time.sleep(0.05)
+        assert heard.count("a0") >= 5
+        return id in heard
+
+    router = hands.start(*start)
+    eventually(lambda: swarm("status", "--connect", endpoint, *tls(certs)).returncode == 0, 30, "the router")
+    with (
+        opened(hands, "launcher", "0", certs, endpoint) as operator,
+        opened(hands, "agent", "a0", certs, endpoint) as other,
+        opened(hands, "agent", "a1", certs, endpoint) as stolen,
+    ):
+        operator.subscribe(STATS, tell, role="agent")
+        assert says(stolen, "a1")
+        router.send_signal(signal.SIGINT)
+        assert router.wait(10) == 0
+        hands.path.write_text(hands.path.read_text().replace("[network]", '[network]\nrevoked = ["agent.all.a1"]'))
+        hands.start(*start)
+        assert not says(stolen, "a1")
+        issue(hands, "agent.all.a1", "--renew")
+        with opened(hands, "agent", "a1", certs, endpoint) as successor:
+            assert says(successor, "a1")
+            assert not says(stolen, "a1")
