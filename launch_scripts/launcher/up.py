@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from launch_scripts.launcher.disk_watch import DiskWatch
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.launcher.log_file import log_to
@@ -153,6 +154,7 @@ class _Run:
         self._stop_asked = _StopAsked()
         specs = list(options.table or processes_of(self._scenario, options.roles))
         self._swarm = LocalSwarm(specs, self._setup_of, run_dir)
+        self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
 
     def run(self) -> int:
@@ -286,6 +288,8 @@ class _Run:
         return [spec.name for spec in specs if (spec.role, spec.id) not in watcher.ever_up]
 
     def _tell(self, watcher: Watcher) -> None:
+        if (sentence := self._disk.look(time.monotonic())) is not None:
+            self._terminal.say(sentence, "red")
         for note in watcher.take_notes():
             if note.kind == "live_view":
                 self._terminal.say(f"live view: {note.text}", "bold")
