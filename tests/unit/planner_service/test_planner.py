@@ -589,7 +589,7 @@ def test_the_status_is_told_twice_a_second(ready: World) -> None:
 
 def test_the_cells_of_a_route_are_those_walked() -> None:
     start, directions = GRID.cell(5, 5), bytes([0, 1, 2, 3, 4, 5, 6, 7, 2])
-    rows, cols = route_cells(GRID, Route(status=RouteStatus.OK, start=start, directions=directions))
+    rows, cols = route_cells(GRID, Route(status=RouteStatus.OK, start=start, directions=directions, cost_s=1.0))
     assert [GRID.cell(r, c) for r, c in zip(rows.tolist(), cols.tolist(), strict=True)] == walk(
         GRID, start, directions
     )
