@@ -15,6 +15,7 @@ from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window
+from swarm.liveness import Newest
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import (
@@ -97,6 +98,7 @@ class Planner:
         self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
         # The newest pose heard; the tick takes it in.
         self._pose: TargetPose | None = None
+        self._poses = Newest()
         # (target cell, map version) that the tree was last told.
         self._told: tuple[int, int] | None = None
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
@@ -120,12 +122,9 @@ class Planner:
         for name in COUNTS:
             counters.count(name, 0)
 
-    def hear_pose(self, pose: TargetPose) -> None:
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where the target is, if the pose is newer than what is known. The next tick takes it in."""
-        known = self._pose
-        if pose.target != self.target:
-            return
-        if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):
+        if pose.target == self.target and self._poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
             self._pose = pose
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> None:

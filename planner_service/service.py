@@ -83,11 +83,11 @@ class PlannerService:
             return
         match event:
             case Heard(message=TargetPose() as pose):
-                self._planner.hear_pose(pose)
+                self._planner.hear_pose(pose, now_ns)
             case Heard(message=Sighted() as sighted):
                 if self._sightings.hear(sighted):
                     for seen in self._sightings.best(now_ns).values():
-                        self._planner.hear_pose(pose_of(seen))
+                        self._planner.hear_pose(pose_of(seen), now_ns)
             case Heard(message=Fleet() as fleet):
                 self._planner.hear_fleet(fleet, now_ns)
             case Asked(request=RouteRequest() | CostRequest() as request):

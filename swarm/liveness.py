@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -47,6 +50,36 @@ class Roster:
     def is_alive(self, role: str, id: str) -> bool:
         """Whether any incarnation of the process is alive."""
         return (role, id) in self._alive
+
+
+SILENCE_NS = 3 * NS_PER_S
+"""A stream that has been silent for so long is heard again from wherever it goes on."""
+
+
+class Newest:
+    """Which messages of each stream are news: those numbered above the last that was.
+
+    Once there has been no news for `SILENCE_NS`, any other number is: so no single message outweighs all that
+    follow it, and a sender whose clock was set back is heard. A message that comes so late as to be taken for news
+    then stands only until the next.
+    """
+
+    def __init__(self, most: int = 4096) -> None:
+        self._most = most
+        """Streams remembered: whatever comes of others is news."""
+        self._newest: dict[Hashable, tuple[tuple[int, int], int]] = {}
+        """Stream -> the number of its last news, and when that was heard."""
+
+    def is_news(self, stream: Hashable, number: tuple[int, int], now_ns: int) -> bool:
+        """Whether a message is news, which it is once."""
+        known = self._newest.get(stream)
+        if known is not None:
+            last, heard_ns = known
+            if number == last or (number < last and now_ns - heard_ns < SILENCE_NS):
+                return False
+        if known is not None or len(self._newest) < self._most:
+            self._newest[stream] = (number, now_ns)
+        return True
 
 
 class Leases:

@@ -16,6 +16,7 @@ from shared_map.terrain.climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import AgentPlan, Scenario
 from swarm.grid import GridSpec
+from swarm.liveness import Newest
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
@@ -105,6 +106,7 @@ class Agent:
         self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance, presence)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
+        self._newest_poses = Newest()
         self._unplaced = Unplaced(ground.grid, self.rights, self._traffic.closed)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
@@ -246,11 +248,11 @@ class Agent:
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Where a target is. Of each target the newest pose counts; one outside the grid is ignored."""
-        known = self._poses.get(pose.target)
-        if known is not None and (pose.incarnation, pose.seq) <= (known.incarnation, known.seq):
-            return
         if not 0 <= pose.cell < self._map.grid.cells:
             return
+        if not self._newest_poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
+            return
+        known = self._poses.get(pose.target)
         self._poses[pose.target] = pose
         if known is not None and pose.jumps != known.jumps:
             for vehicle in self.vehicles.values():

@@ -149,7 +149,7 @@ class AgentService:
             case Heard(message=Fleet() as fleet):
                 self._presence.hear(fleet, now_ns)
             case Heard(topic=topic, message=TargetPose() as pose):
-                self._detector.set_truth(pose)
+                self._detector.set_truth(pose, now_ns)
                 if topic is POSE and pose.target not in self._untracked.targets:
                     agent.hear_pose(pose, now_ns)
             case Heard(message=Sighted() as sighted):

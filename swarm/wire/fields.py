@@ -179,7 +179,7 @@ _MAX_KNOWN_IDS = 4096
 
 
 class Bounded(msgspec.Struct, frozen=True):
-    """Base of structs: checks what their annotations state beyond `msgspec.Meta`, and `relate`, when one is made."""
+    """Base of structs: checks what their annotations state beyond `Meta`, and `relate`, when one is made."""
 
     def check_bounds(self) -> None:
         """Raise ValueError where a field breaks a rule of its annotation, or `relate` says so."""
@@ -295,6 +295,13 @@ def _values_check(column: Column) -> Callable[[str, bytes], None]:
 
         return check_length
     code = _CODES[str(column.dtype)]
+    if code == "B":
+
+        def check_bytes(name: str, data: bytes) -> None:
+            if max(data, default=0) > most:
+                raise ValueError(f"{name} has {max(data)}, expected {dtype.name} of {least:g} ... {most:g}")
+
+        return check_bytes
 
     def check(name: str, data: bytes) -> None:
         if len(data) % width:
@@ -316,7 +323,7 @@ def _values_check(column: Column) -> Callable[[str, bytes], None]:
 
 
 def unbounded(struct: type[msgspec.Struct]) -> Iterator[str]:
-    """The fields of a struct whose type leaves something unbounded, each with what it lacks: there should be none."""
+    """The fields of a struct whose type leaves something unbounded, each with what it lacks."""
     for name, hint in typing.get_type_hints(struct, include_extras=True).items():
         yield from (f"{struct.__name__}.{name}: {lack}" for lack in _lacking(hint))
 

@@ -158,7 +158,7 @@ class World:
 
     def pose(self, row: int, col: int, seq: int = 1, incarnation: int = 1) -> None:
         cell = GRID.cell(row, col)
-        self.planner.hear_pose(pose(cell, seq, incarnation))
+        self.planner.hear_pose(pose(cell, seq, incarnation), self.now_ns)
 
     def mark(self, *cells: int, stamp_ns: int | None = None) -> None:
         kinds = np.full(len(cells), MarkKind.LETHAL, np.uint8)
@@ -265,7 +265,7 @@ def test_the_newest_pose_wins_in_whatever_order_poses_arrive(order: list[tuple[i
 
 
 def test_the_pose_of_another_target_is_not_ours(world: World) -> None:
-    world.planner.hear_pose(pose(5, target="t1"))
+    world.planner.hear_pose(pose(5, target="t1"), world.now_ns)
     assert world.tick() == []
     assert world.planner.status(0).target_cell is None
 

@@ -77,7 +77,7 @@ def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
 def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
     detector = TargetDetector(GRID, "red.a0.1", "red", range_m=100.0, lasts_s=2.0)
     x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
-    detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m))
+    detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m), 0)
     far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
     assert detector.look([far], 0) == []
     (told,) = detector.look([far, near], 0)
