@@ -15,7 +15,7 @@ from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window
-from swarm.liveness import Succession
+from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import (
@@ -96,9 +96,9 @@ class Planner:
         self._newest_mark_ns = newest_mark_ns
         self._push_ns = int(config.push_s * NS_PER_S)
         self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
-        # The newest pose heard, and which poses of the tracker count; the tick takes it in.
-        self._succession = Succession()
+        # The newest pose heard, and which poses of the tracker are news; the tick takes it in.
         self._pose: TargetPose | None = None
+        self._poses = Newest(silence_ns=POSE_SILENCE_NS)
         # (target cell, map version) that the tree was last told.
         self._told: tuple[int, int] | None = None
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
@@ -124,7 +124,7 @@ class Planner:
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where the target's tracker says it is, if that is news. The next tick takes it in."""
-        if pose.target == self.target and self._succession.accepts(pose.target, pose.incarnation, pose.seq, now_ns):
+        if pose.target == self.target and self._poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
             self._pose = pose
 
     def set_pose(self, pose: TargetPose) -> None:

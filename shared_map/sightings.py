@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from shared_map.replication.filter import MarkFilter
 from swarm.clock import NS_PER_S
-from swarm.liveness import SUCCESSION_LEASE_NS
+from swarm.liveness import POSE_SILENCE_NS
 from swarm.wire.messages.targets import Sighted, TargetPose
 
 LONGEST_NS = 120 * NS_PER_S
@@ -48,12 +48,11 @@ class Sightings:
     def hear(self, sighted: Sighted, now_ns: int) -> bool:
         """Take in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit.
 
-        An author's sighting with a lower number is news once none of it has been heard for the lease: see
-        `Succession`.
+        An author's sighting with a lower number is news after a silence, as `swarm.liveness.Newest` has it.
         """
         key = (sighted.target, sighted.author)
         known = self._newest.get(key)
-        if known is not None and now_ns - known.heard_ns <= SUCCESSION_LEASE_NS:
+        if known is not None and now_ns - known.heard_ns < POSE_SILENCE_NS:
             before = known.sighted
             if (sighted.stamp_ns, sighted.seq) <= (before.stamp_ns, before.seq):
                 return False

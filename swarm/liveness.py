@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -49,6 +52,39 @@ class Roster:
         return (role, id) in self._alive
 
 
+SILENCE_NS = 3 * NS_PER_S
+"""A stream that has been silent for so long is heard again from wherever it goes on."""
+POSE_SILENCE_NS = NS_PER_S
+"""The same of target poses, which come ten times a second."""
+
+
+class Newest:
+    """Which messages of each stream are news: those numbered above the last that was.
+
+    Once there has been no news for `silence_ns`, any other number is: so no single message outweighs all that
+    follow it, and a sender whose clock was set back is heard. A message that comes so late as to be taken for news
+    then stands only until the next.
+    """
+
+    def __init__(self, most: int = 4096, silence_ns: int = SILENCE_NS) -> None:
+        self._silence_ns = silence_ns
+        self._most = most
+        """Streams remembered: whatever comes of others is news."""
+        self._newest: dict[Hashable, tuple[tuple[int, int], int]] = {}
+        """Stream -> the number of its last news, and when that was heard."""
+
+    def is_news(self, stream: Hashable, number: tuple[int, int], now_ns: int) -> bool:
+        """Whether a message is news, which it is once."""
+        known = self._newest.get(stream)
+        if known is not None:
+            last, heard_ns = known
+            if number == last or (number < last and now_ns - heard_ns < self._silence_ns):
+                return False
+        if known is not None or len(self._newest) < self._most:
+            self._newest[stream] = (number, now_ns)
+        return True
+
+
 class Leases:
     """When each key was last heard of. `expired` forgets keys that have been silent for longer than the lease."""
 
@@ -66,28 +102,3 @@ class Leases:
         for key in late:
             del self._heard_ns[key]
         return late
-
-
-SUCCESSION_LEASE_NS = 1_000_000_000
-
-
-class Succession:
-    """Which of the numbered values that are heard under a key counts, whatever the clocks of its senders.
-
-    A value counts if its (life, seq) is higher than that of the last which counted, or if none has counted for the
-    lease. So a sender that restarts with an earlier clock is followed after the lease, and no single value with a
-    huge number outweighs those that follow it.
-    """
-
-    def __init__(self, lease_ns: int = SUCCESSION_LEASE_NS) -> None:
-        self._lease_ns = lease_ns
-        # Key -> (life, seq) of the last value that counted, and when it was heard.
-        self._last: dict[str, tuple[tuple[int, int], int]] = {}
-
-    def accepts(self, key: str, life: int, seq: int, now_ns: int) -> bool:
-        """Whether a value counts. If so it is the last one from now on."""
-        known = self._last.get(key)
-        if known is not None and (life, seq) <= known[0] and now_ns - known[1] <= self._lease_ns:
-            return False
-        self._last[key] = ((life, seq), now_ns)
-        return True

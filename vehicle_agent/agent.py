@@ -17,7 +17,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
-from swarm.liveness import Succession
+from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
@@ -107,7 +107,7 @@ class Agent:
         self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance, presence)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
-        self._succession = Succession()
+        self._newest_poses = Newest(silence_ns=POSE_SILENCE_NS)
         self._unplaced = Unplaced(ground.grid, self.rights, self._traffic.closed)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
@@ -248,9 +248,9 @@ class Agent:
     # --- what is heard --------------------------------------------------------------------------------------
 
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Where the tracker of a target says it is. Poses outside the grid or out of succession are ignored."""
+        """Where the tracker of a target says it is. Poses off the grid, and those that are no news, are ignored."""
         inside = 0 <= pose.cell < self._map.grid.cells
-        if inside and self._succession.accepts(pose.target, pose.incarnation, pose.seq, now_ns):
+        if inside and self._newest_poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
             self.set_pose(pose, now_ns)
 
     def set_pose(self, pose: TargetPose, now_ns: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
+from swarm.liveness import Newest
 from swarm.wire.messages.marks import Digest
 
 _GRACE_NS = NS_PER_S // 10
@@ -40,16 +41,13 @@ class PendingDigests:
         # A sender here is (author, whole): a digest of late changes does not replace the last whole one.
         self._pending: dict[tuple[str, bool], PendingDigest] = {}
         self._bytes = 0  # sum of `size` of what is pending
-        self._newest_seqs: dict[tuple[str, bool], int] = {}  # of the digests heard, of those who count them
+        self._newest = Newest(_MAX_SENDERS)  # of the digests whose senders count them
 
     def add(self, digest: Digest, now_ns: int) -> bool:
         """Take in a digest; false if a newer one of the same sender overtook it."""
         sender = (digest.author, digest.whole)
-        if digest.seq:
-            if digest.seq <= self._newest_seqs.get(sender, 0):
-                return False
-            if sender in self._newest_seqs or len(self._newest_seqs) < _MAX_SENDERS:
-                self._newest_seqs[sender] = digest.seq
+        if digest.seq and not self._newest.is_news(sender, (0, digest.seq), now_ns):
+            return False
         due_ns = now_ns + _GRACE_NS
         replaced = self._pending.get(sender)
         if replaced is not None:

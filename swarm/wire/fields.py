@@ -1,40 +1,146 @@
-"""Types and checks of the fields of messages.
+"""Types of the fields of messages, each with its bounds.
 
-Columns of numbers travel as little-endian bytes, because a list of a thousand Python ints costs a hundred times
-more to pack and check. A check raises ValueError, which the codec turns into ProtocolError.
+msgspec checks what `msgspec.Meta` states when it decodes. `Bounded` checks the rest, which is declared in the same
+annotations: the characters of an `Id`, and what a `Column` holds. Columns of numbers travel as little-endian bytes,
+because a list of a thousand Python ints costs a hundred times more to pack and check.
+
+A check raises ValueError, which the codec turns into ProtocolError. Bounds refuse; they change no message.
 """
 
 from __future__ import annotations
 
-import math
 import re
 import sys
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from operator import attrgetter
 from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 assert sys.byteorder == "little", "columns travel as little-endian bytes"
 
-Natural = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
-"""A count, a time in ns or a sequence number: small enough that sums of two fit in 64 bits."""
-Metres = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+
+@dataclass(frozen=True, slots=True)
+class Characters:
+    """In an annotation: which characters a text consists of. `Bounded` checks it with a set of those found valid,
+    because msgspec's patterns take 0.8 us each, and a fleet has 25 ids."""
+
+    pattern: re.Pattern[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """In an annotation of bytes: the values that they hold. `Bounded` checks it.
+
+    dtype        of the values; NaN is refused
+    per          the field of the same struct that has as many items as this column values; "" if there is none
+    least, most  bounds of the values; None where the dtype has no other, or `relate` says more
+    checked      false where the struct checks it itself: the statements of many sets of marks at once
+    """
+
+    dtype: np.dtype[Any] | str
+    per: str = ""
+    least: float | None = None
+    most: float | None = None
+    checked: bool = True
+
+    def describe(self) -> str:
+        """As in the reference of the wire: "column of float32, 0 ... inf"."""
+        dtype = np.dtype(self.dtype)
+        name = f"rows of {dtype.itemsize} bytes" if dtype.names else f"column of {dtype.name}"
+        return name + (f", one for each of `{self.per}`" if self.per else "")
+
+
+@dataclass(frozen=True, slots=True)
+class OrInfinite:
+    """In an annotation of a float: there is no upper bound, and inf has a meaning."""
+
+
+OR_INFINITE = OrInfinite()
+
+# --- numbers ------------------------------------------------------------------------------------------------------
+
+Natural = Annotated[int, Meta(ge=0, lt=1 << 62)]
+"""A sequence number or a Lamport time: small enough that sums of two fit in 64 bits."""
+StampNs = Annotated[int, Meta(ge=0, lt=1 << 62)]
+"""A time in ns since 1970, or since a simulation began. The bound is in the year 2116."""
+Incarnation = Annotated[int, Meta(ge=0, lt=1 << 62)]
+"""The time at which a process started, which tells its lives apart."""
+Count = Annotated[int, Meta(ge=0, lt=1 << 53)]
+"""How often something happened: what a float64 counts exactly."""
+Metres = Annotated[float, Meta(ge=-1e9, le=1e9)]
 """A place in the map frame. Rejects infinities and NaN."""
-GridSide = Annotated[int, msgspec.Meta(ge=1, le=1 << 16)]
+Distance = Annotated[float, Meta(ge=0.0, le=1e9)]
+"""Metres from here to there, on the map."""
+Length = Annotated[float, Meta(ge=0.0, le=1e15)]
+"""Metres along a route."""
+Resolution = Annotated[float, Meta(ge=1e-6, le=1e9)]
+"""Side of a cell, in metres."""
+Cost = Annotated[float, Meta(ge=0.0), OR_INFINITE]
+"""Seconds of travel. Inf is no way: who gives a way gives a finite cost."""
+FiniteCost = Annotated[float, Meta(ge=0.0, le=1e18)]
+"""Seconds of travel along a way that there is."""
+Millis = Annotated[float, Meta(ge=0.0, le=1e12)]
+"""What something took, in ms."""
+AgeMillis = Annotated[float, Meta(ge=0.0), OR_INFINITE]
+"""How old something is, in ms; inf while it is not there yet."""
+Gap = Annotated[float, Meta(ge=0.0), OR_INFINITE]
+"""Cost over optimum or lower bound: 1 but for rounding, or more; inf is nothing proven."""
+Gauge = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+"""What a process measured of itself: any finite number."""
+
+GridSide = Annotated[int, Meta(ge=1, le=1 << 16)]
 """Rows or columns of a grid."""
-Cell = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 32)]
-"""A cell, row or column named by another process. It may lie outside the grid, which messages do not know."""
+GridSideOrNone = Annotated[int, Meta(ge=0, le=1 << 16)]
+"""As `GridSide`; 0 of a process that has no grid."""
+Cell = Annotated[int, Meta(ge=-(1 << 31), lt=1 << 32)]
+"""A cell, row or column to which somebody refers. It may lie outside the grid, which messages do not know."""
+CellIndex = Annotated[int, Meta(ge=0, lt=1 << 32)]
+"""A cell in which something is: not negative, which Python would count from the end."""
+Tile = Annotated[int, Meta(ge=0, lt=1 << 22)]
+"""A tile of the largest grid."""
+Region = Annotated[int, Meta(ge=0, lt=1 << 16)]
+"""A region of the largest grid."""
+Plot = Annotated[int, Meta(ge=0, lt=1 << 20)]
+"""A plot of the largest grid."""
 
 ZERO_BUCKET = -20_000
 """Histogram bucket of zero and below; the smallest float has a higher one."""
 TOP_BUCKET = 18_000
 """Highest histogram bucket, about 1e306: beyond it a float overflows."""
+Bucket = Annotated[int, Meta(ge=ZERO_BUCKET, le=TOP_BUCKET)]
+
+# --- texts --------------------------------------------------------------------------------------------------------
 
 _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_KNOWN_IDS: set[str] = set()
-"""Ids found valid: the same few hundred come thousands of times a second."""
-_MAX_KNOWN_IDS = 4096
+Id = Annotated[str, Meta(min_length=1, max_length=64), Characters(_ID)]
+"""What can be one chunk of a key: 1 to 64 of letters, digits, '_', '.', '-'."""
+VehicleId = Id
+Word = Annotated[str, Meta(max_length=100)]
+"""A name, of a counter or a strategy, or what kind of note it is."""
+MOST_TEXT = 2000
+Text = Annotated[str, Meta(max_length=MOST_TEXT)]
+"""Sentences for people."""
+LongText = Annotated[str, Meta(max_length=1 << 16)]
+"""A coordinate system in its own language, or where terrain came from."""
+
+# --- columns and lists --------------------------------------------------------------------------------------------
+
+Directions = Annotated[bytes, Meta(max_length=4 << 20), Column("<u1", least=0, most=7)]
+"""One code 0..7 per step, clockwise from north. No planner gives more steps in one answer."""
+
+MOST_VEHICLES = 1000
+"""Of one agent: what a scenario may say at most."""
+MOST_IDS = 1 << 12
+"""Agents, authors or targets in one message."""
+SMALL, LARGE = Meta(max_length=MOST_VEHICLES), Meta(max_length=100_000)
+"""Bounds of lists and maps: as many as an agent has vehicles, or as one request may name cells."""
+IDS = Meta(max_length=MOST_IDS)
 
 
 def pack_column(values: Any, dtype: str) -> bytes:
@@ -65,14 +171,179 @@ def check_id(name: str, value: str) -> None:
         raise ValueError(f"{name} {value[:80]!r} is not 1 to 64 of letters, digits, '_', '.', '-'")
 
 
-def check_directions(directions: bytes) -> None:
-    """Raise ValueError on a code outside 0..7."""
-    if directions and max(directions) > 7:
-        raise ValueError(f"direction code {max(directions)} is not in 0..7")
+_KNOWN_IDS: set[str] = set()
+"""Ids found valid: the same few hundred come thousands of times a second."""
+_MAX_KNOWN_IDS = 4096
+
+# --- what msgspec cannot check ------------------------------------------------------------------------------------
 
 
-def check_finite(name: str, *values: float) -> None:
-    """Raise ValueError on an infinity or NaN."""
-    for value in values:
-        if not math.isfinite(value):
-            raise ValueError(f"{name} is {value}, expected a finite number")
+class Bounded(msgspec.Struct, frozen=True):
+    """Base of structs: checks what their annotations state beyond `Meta`, and `relate`, when one is made."""
+
+    def check_bounds(self) -> None:
+        """Raise ValueError where a field breaks a rule of its annotation, or `relate` says so."""
+        for rule in _RULES.get(type(self)) or _rules_of(type(self)):
+            rule(self)
+
+    __post_init__ = check_bounds
+
+    def relate(self) -> None:
+        """Raise ValueError where fields contradict each other. What one field says alone is in its type."""
+
+
+Rule = Callable[[Any], None]
+_RULES: dict[type[Bounded], tuple[Rule, ...]] = {}
+"""Of each struct type that was made so far."""
+
+
+def _rules_of(struct: type[Bounded]) -> tuple[Rule, ...]:
+    """The rules of a struct type, made of its annotations once."""
+    ids: list[str] = []
+    rules: list[Rule] = []
+    for name, hint in typing.get_type_hints(struct, include_extras=True).items():
+        bare, notes = taken_apart(hint)
+        parts = [note for part in typing.get_args(bare) for note in taken_apart(part)[1]]
+        if any(isinstance(note, Characters) for note in notes):
+            ids.append(name)
+        if any(isinstance(note, Characters) for note in parts):
+            rules.append(_all_ids(name))
+        rules.extend(_column_rule(name, note) for note in notes if isinstance(note, Column) and note.checked)
+        rules.extend(_columns_rule(name, note) for note in parts if isinstance(note, Column))
+    if ids:
+        rules.insert(0, _each_id(ids))
+    if struct.relate is not Bounded.relate:
+        rules.append(struct.relate)
+    # The empty tuple would be looked for again and again.
+    _RULES[struct] = tuple(rules) or (Bounded.relate,)
+    return _RULES[struct]
+
+
+def taken_apart(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+    """A type hint without `Annotated`, and what that says."""
+    notes: tuple[Any, ...] = ()
+    while typing.get_origin(hint) is Annotated:
+        hint, *more = typing.get_args(hint)
+        notes = (*more, *notes)
+    return hint, notes
+
+
+def _each_id(names: list[str]) -> Rule:
+    """Ids that are fields, looked up all at once."""
+    get = attrgetter(*names, names[0])  # a tuple even of one
+
+    def rule(struct: Any) -> None:
+        if not _KNOWN_IDS.issuperset(get(struct)):
+            for name in names:
+                check_id(name, getattr(struct, name))
+
+    return rule
+
+
+def _all_ids(name: str) -> Rule:
+    """Ids in a list, or those which are the keys of a map."""
+    get = attrgetter(name)
+
+    def rule(struct: Any) -> None:
+        values = get(struct)
+        if not _KNOWN_IDS.issuperset(values):
+            for value in values:
+                check_id(name, value)
+
+    return rule
+
+
+def _column_rule(name: str, column: Column) -> Rule:
+    get, per = attrgetter(name), attrgetter(column.per) if column.per else None
+    width, check = np.dtype(column.dtype).itemsize, _values_check(column)
+
+    def rule(struct: Any) -> None:
+        data = get(struct)
+        if per is not None and len(data) != width * len(per(struct)):
+            check_column(name, data, width, len(per(struct)))
+        if data:
+            check(name, data)
+
+    return rule
+
+
+def _columns_rule(name: str, column: Column) -> Rule:
+    """Columns that are the values of a map."""
+    get, check = attrgetter(name), _values_check(column)
+
+    def rule(struct: Any) -> None:
+        for key, data in get(struct).items():
+            check(f"{name} of {key}", data)
+
+    return rule
+
+
+_CODES = {"<u1": "B", "<u2": "H", "<u4": "I", "<u8": "Q", "<i4": "i", "<i8": "q", "<f4": "f", "<f8": "d"}
+_FEW = 800
+"""Bytes of a column up to which a list is checked faster than an array."""
+
+
+def _values_check(column: Column) -> Callable[[str, bytes], None]:
+    dtype, least, most = np.dtype(column.dtype), column.least, column.most
+    width = dtype.itemsize
+    if least is None or most is None:
+        assert dtype.kind != "f", "a column of floats has bounds"
+
+        def check_length(name: str, data: bytes) -> None:
+            if len(data) % width:
+                raise ValueError(f"{name} has {len(data)} bytes, not a multiple of {width}")
+
+        return check_length
+    code = _CODES[str(column.dtype)]
+    if code == "B":
+
+        def check_bytes(name: str, data: bytes) -> None:
+            if max(data, default=0) > most:
+                raise ValueError(f"{name} has {max(data)}, expected {dtype.name} of {least:g} ... {most:g}")
+
+        return check_bytes
+
+    def check(name: str, data: bytes) -> None:
+        if len(data) % width:
+            raise ValueError(f"{name} has {len(data)} bytes, not a column of {dtype.name}")
+        if len(data) <= _FEW:
+            values = memoryview(data).cast(code).tolist()
+            low, high, total = min(values, default=least), max(values, default=most), sum(values)
+        else:
+            array = np.frombuffer(data, dtype)
+            low, high = array.min(), array.max()
+            total = low  # NaN if any value is
+        # A list's min and max may miss a NaN, its sum does not.
+        if not (least <= low and high <= most and total == total):
+            worst = high if high > most else low
+            expected = f"{dtype.name} of {least:g} ... {most:g}" + (", without NaN" if dtype.kind == "f" else "")
+            raise ValueError(f"{name} has {worst}, expected {expected}")
+
+    return check
+
+
+def unbounded(struct: type[msgspec.Struct]) -> Iterator[str]:
+    """The fields of a struct whose type leaves something unbounded, each with what it lacks."""
+    for name, hint in typing.get_type_hints(struct, include_extras=True).items():
+        yield from (f"{struct.__name__}.{name}: {lack}" for lack in _lacking(hint))
+
+
+def _lacking(hint: Any) -> Iterator[str]:
+    bare, notes = taken_apart(hint)
+    origin = typing.get_origin(bare) or bare
+    metas = [note for note in notes if isinstance(note, Meta)]
+    sized = any(meta.max_length is not None for meta in metas)
+    if origin in (int, float):
+        below = any(meta.ge is not None or meta.gt is not None for meta in metas)
+        above = any(meta.le is not None or meta.lt is not None for meta in metas) or OR_INFINITE in notes
+        if not (below and above):
+            yield f"{origin.__name__} without bounds"
+    elif origin is bytes:
+        if not sized and not any(isinstance(note, Column) and note.per for note in notes):
+            yield "bytes without a length"
+    elif origin in (str, list, dict) and not sized:
+        yield f"{origin.__name__} without a length"
+    elif isinstance(origin, type) and issubclass(origin, msgspec.Struct):
+        yield from unbounded(origin)
+    for part in typing.get_args(bare):
+        yield from _lacking(part)

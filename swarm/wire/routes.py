@@ -7,13 +7,13 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
-import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from swarm.wire.fields import Cell, check_column, check_directions, column, pack_column
+from swarm.wire.fields import Bounded, Cell, Column, Cost, Directions, Length, check_column, column, pack_column
 
 
 class RouteStatus(enum.StrEnum):
@@ -32,8 +32,9 @@ STATUSES = tuple(RouteStatus)
 OK, UNREACHABLE, OUTSIDE, LETHAL_START, NO_TARGET = range(len(STATUSES))
 
 
-class Route(msgspec.Struct, frozen=True, kw_only=True):
-    """One route. `directions` holds one code 0..7 per step, clockwise from north.
+class Route(Bounded, frozen=True, kw_only=True):
+    """One route. `directions` holds one code 0..7 per step, clockwise from north. Its numbers are finite if the
+    status is OK.
 
     cost_s         travel time of the whole route, as driven along its cells
     lower_bound_s  proven: no route from `start` is quicker on the planner's present map
@@ -43,16 +44,16 @@ class Route(msgspec.Struct, frozen=True, kw_only=True):
 
     status: RouteStatus
     start: Cell
-    directions: bytes = b""
-    cost_s: float = math.inf
-    lower_bound_s: float = 0.0
-    length_m: float = 0.0
-    remaining_s: float = 0.0
+    directions: Directions = b""
+    cost_s: Cost = math.inf
+    lower_bound_s: Cost = 0.0
+    length_m: Length = 0.0
+    remaining_s: Cost = 0.0
 
-    def __post_init__(self) -> None:
-        check_directions(self.directions)
-        if math.isnan(self.cost_s + self.lower_bound_s + self.length_m + self.remaining_s):
-            raise ValueError("a cost or length of a route is not a number")
+    def relate(self) -> None:
+        total = self.cost_s + self.lower_bound_s + self.length_m + self.remaining_s
+        if self.status is RouteStatus.OK and not math.isfinite(total):
+            raise ValueError("a route whose status is ok has a number that is not finite")
 
     @property
     def gap(self) -> float:
@@ -144,8 +145,11 @@ class RouteBatch:
         )
 
 
-class Routes(msgspec.Struct, frozen=True, kw_only=True, dict=True):
-    """Many routes as columns, with the fields of `Route`.
+_Numbers = Annotated[bytes, Column("<f8", per="statuses", least=0, most=math.inf)]
+
+
+class Routes(Bounded, frozen=True, kw_only=True, dict=True):
+    """Many routes as columns, with the fields of `Route`. The numbers of those whose status is OK are finite.
 
     statuses    uint8    RouteStatus, as its index
     starts      int64    cell, -2^31 ... 2^32 - 1
@@ -154,31 +158,22 @@ class Routes(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     cost_s, lower_bound_s, length_m, remaining_s  float64
     """
 
-    statuses: bytes
-    starts: bytes
-    steps: bytes
-    directions: bytes
-    cost_s: bytes
-    lower_bound_s: bytes
-    length_m: bytes
-    remaining_s: bytes
+    statuses: Annotated[bytes, Meta(max_length=100_001), Column("<u1", least=0, most=len(STATUSES) - 1)]
+    starts: Annotated[bytes, Column("<i8", per="statuses", least=-(1 << 31), most=(1 << 32) - 1)]
+    steps: Annotated[bytes, Column("<u4", per="statuses", least=0, most=4 << 20)]
+    directions: Annotated[bytes, Meta(max_length=3 << 19)]
+    cost_s: _Numbers
+    lower_bound_s: _Numbers
+    length_m: _Numbers
+    remaining_s: _Numbers
 
-    def __post_init__(self) -> None:
-        count = len(self.statuses)
-        if count and max(self.statuses) >= len(STATUSES):
-            raise ValueError(f"status {max(self.statuses)} is not in 0..{len(STATUSES) - 1}")
-        check_column("starts", self.starts, 8, count)
-        starts = column(self.starts, "<i8")
-        outside = starts[(starts < -(1 << 31)) | (starts >= 1 << 32)]
-        if outside.size:
-            raise ValueError(f"start {outside[0]} is no cell, expected -2^31 ... 2^32 - 1")
-        check_column("steps", self.steps, 4, count)
+    def relate(self) -> None:
         steps = int(column(self.steps, "<u4").sum(dtype=np.int64))
         check_column(f"directions of {steps} steps", self.directions, 3, -(-steps // 8))
+        found = column(self.statuses, "u1") == OK
         for name in _NUMBERS:
-            check_column(name, getattr(self, name), 8, count)
-            if np.isnan(column(getattr(self, name), "<f8")).any():
-                raise ValueError(f"{name} has a value that is not a number")
+            if np.isinf(column(getattr(self, name), "<f8"), where=found, out=np.zeros(len(found), bool)).any():
+                raise ValueError(f"{name} of a route whose status is ok is not finite")
 
     @cached_property
     def batch(self) -> RouteBatch:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,12 @@ TILE_AREA = TILE_CELLS * TILE_CELLS
 
 STAMP_LIMIT_NS = 1 << 62
 """Marks stamped from here on (year 2116) are rejected by all processes, so that there is always a newer stamp."""
+
+PACE_LEAST = float(np.float32(1 / 340))
+"""s/m; what drives quicker than sound is no vehicle. Float32, as marks are."""
+PACE_MOST = 100.0
+"""s/m, a cell of 10 m in 17 minutes: slower ground is better told as lethal. Both bound what one wrong mark can do
+to lower bounds and to the number of buckets of every planner."""
 
 FOREVER = (1 << 63) - 1
 """`until_ns` of a mark that does not expire."""
@@ -67,7 +72,7 @@ def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes)
         times = column(stamps_ns, "<i8")
         oldest_ns, newest_ns = int(times.min()), int(times.max())
         told = column(paces, "<f4")[column(kinds, "<u1") == MarkKind.PACE]
-        possible = bool(((told > 0) & (told < math.inf)).all())
+        possible = bool(((told >= PACE_LEAST) & (told <= PACE_MOST)).all())
     else:
         listed = memoryview(cells).cast("H").tolist()
         rising = sorted(set(listed)) == listed
@@ -75,11 +80,11 @@ def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes)
         stamps = memoryview(stamps_ns).cast("q").tolist()
         oldest_ns, newest_ns = min(stamps), max(stamps)
         said = zip(memoryview(paces).cast("f").tolist(), kinds, strict=True)
-        possible = all(kind != MarkKind.PACE or 0 < pace < math.inf for pace, kind in said)
+        possible = all(kind != MarkKind.PACE or PACE_LEAST <= pace <= PACE_MOST for pace, kind in said)
     if not rising or last >= TILE_AREA:
         raise ValueError(f"cells must increase strictly below {TILE_AREA}")
     if not possible:
-        raise ValueError("the pace of a PACE mark must be positive and finite")
+        raise ValueError(f"the pace of a PACE mark must be in {PACE_LEAST:.4g} ... {PACE_MOST:g} s/m")
     if oldest_ns < 0 or newest_ns >= STAMP_LIMIT_NS:
         raise ValueError("stamps_ns must not be negative, and below 2**62")
 
@@ -94,7 +99,7 @@ def faulty_sets(
     cell, kind = column(cells, "<u2"), column(kinds, "<u1")
     pace, stamp_ns = column(paces, "<f4"), column(stamps_ns, "<i8")
     wrong = (cell >= TILE_AREA) | (kind > LAST_KIND) | (stamp_ns < 0) | (stamp_ns >= STAMP_LIMIT_NS)
-    wrong |= (kind == MarkKind.PACE) & ~((pace > 0) & (pace < math.inf))
+    wrong |= (kind == MarkKind.PACE) & ~((pace >= PACE_LEAST) & (pace <= PACE_MOST))
     fallen = np.zeros(len(cell), bool)
     fallen[1:] = cell[1:] <= cell[:-1]
     starts = np.cumsum(counts) - counts

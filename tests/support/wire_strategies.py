@@ -37,27 +37,34 @@ from swarm.wire.routes import Route, RouteBatch, RouteStatus
 from swarm.wire.statements import TILE_AREA, MarkKind
 
 naturals = st.integers(0, (1 << 62) - 1)
+counts = st.integers(0, (1 << 53) - 1)
+sides = st.integers(1, 1 << 16)
+tiles = st.integers(0, (1 << 22) - 1)
+regions = st.integers(0, (1 << 16) - 1)
+plots = st.integers(0, (1 << 20) - 1)
+millis = st.floats(0, 1e12)
+ages = st.floats(min_value=0, allow_nan=False)
+lengths = st.floats(0, 1e15)
+finite_costs = st.floats(0, 1e18)
 cells = st.integers(-(1 << 31), (1 << 32) - 1)
 ids = st.text("abcXYZ019_.-", min_size=1, max_size=64)
 texts = st.text(max_size=40)
 finite = st.floats(allow_nan=False, allow_infinity=False)
 metres = st.floats(-1e9, 1e9)
 costs = st.floats(min_value=0, allow_nan=False)
-floats32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
+places32 = st.floats(-1e9, 1e9, width=32)
+headings32 = st.floats(-12.5, 12.5, width=32)
 directions = st.lists(st.integers(0, 7), max_size=50).map(bytes)
 optional_cells = st.none() | cells
-gaps = st.none() | st.floats(min_value=1, allow_nan=False, allow_infinity=False)
+gaps = st.none() | st.floats(min_value=1, allow_nan=False)
 
 routes = st.builds(
-    Route,
-    status=st.sampled_from(RouteStatus),
-    start=cells,
-    directions=directions,
-    cost_s=costs,
-    lower_bound_s=costs,
-    length_m=costs,
-    remaining_s=costs,
-)
+    Route, status=st.just(RouteStatus.OK), start=cells, directions=directions, cost_s=finite_costs,
+    lower_bound_s=finite_costs, length_m=lengths, remaining_s=finite_costs,
+) | st.builds(
+    Route, status=st.sampled_from([status for status in RouteStatus if status is not RouteStatus.OK]), start=cells,
+    directions=directions, cost_s=costs, lower_bound_s=costs, length_m=lengths, remaining_s=costs,
+)  # fmt: skip
 
 
 @st.composite
@@ -67,12 +74,12 @@ def mark_sets(draw: st.DrawFn) -> MarkSet:
     return MarkSet(
         author=draw(ids),
         group=draw(ids),
-        tile=draw(naturals),
+        tile=draw(tiles),
         epoch=draw(naturals),
         seq=draw(naturals),
         cells=pack_column(where, "<u2"),
         kinds=bytes(draw(st.lists(st.sampled_from([int(kind) for kind in MarkKind]), min_size=n, max_size=n))),
-        paces=pack_column(draw(st.lists(st.floats(0.015625, 8192, width=32), min_size=n, max_size=n)), "<f4"),
+        paces=pack_column(draw(st.lists(st.floats(0.015625, 64, width=32), min_size=n, max_size=n)), "<f4"),
         stamps_ns=pack_column(draw(st.lists(st.integers(0, (1 << 62) - 1), min_size=n, max_size=n)), "<i8"),
     )
 
@@ -108,15 +115,15 @@ def fleets(draw: st.DrawFn) -> Fleet:
     return Fleet(
         author=draw(ids),
         group=draw(ids),
-        region=draw(naturals),
+        region=draw(regions),
         seq=draw(naturals),
         stamp_ns=draw(naturals),
         ids=draw(st.lists(ids, min_size=n, max_size=n)),
         target_ids=target_ids,
         cells=pack_column(some(st.integers(0, (1 << 32) - 1)), "<u4"),
-        east_m=pack_column(some(floats32), "<f4"),
-        south_m=pack_column(some(floats32), "<f4"),
-        heading_rad=pack_column(some(floats32), "<f4"),
+        east_m=pack_column(some(places32), "<f4"),
+        south_m=pack_column(some(places32), "<f4"),
+        heading_rad=pack_column(some(headings32), "<f4"),
         states=bytes(draw(st.lists(st.sampled_from([int(s) for s in VehicleState]), min_size=n, max_size=n))),
         targets=bytes(
             draw(st.lists(st.sampled_from([*range(len(target_ids)), NO_TARGET]), min_size=n, max_size=n))
@@ -131,7 +138,7 @@ def route_requests(draw: st.DrawFn) -> RouteRequest:
     return RouteRequest(
         cells=asked,
         vehicles=draw(st.sampled_from([[], [f"a0-{n}" for n in range(len(asked))]])),
-        max_cells=draw(naturals),
+        max_cells=draw(counts),
         force=draw(st.booleans()),
         row=place[0] if place else None,
         col=place[1] if place else None,
@@ -147,38 +154,44 @@ reservations = st.builds(
 
 MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     RunInfo: st.builds(
-        RunInfo, run_id=texts, role=ids, id=ids, incarnation=naturals, scenario=texts, terrain=texts, rows=naturals,
-        cols=naturals, resolution_m=finite, started_ns=naturals,
+        RunInfo, run_id=texts, role=ids, id=ids, incarnation=naturals, scenario=texts, terrain=texts, rows=sides,
+        cols=sides, resolution_m=st.floats(0, 1e9), started_ns=naturals,
     ),
     Nothing: st.just(Nothing()),
     MarkSet: mark_sets(),
     MarkSets: bulks(),
     Digest: digests(),
-    MarksRequest: st.builds(MarksRequest, authors=st.lists(ids, max_size=3), tiles=st.lists(naturals, max_size=3)),
+    MarksRequest: st.builds(MarksRequest, authors=st.lists(ids, max_size=3), tiles=st.lists(tiles, max_size=3)),
     BaseMap: st.builds(
         BaseMap, keeper=ids, terrain=texts, rows=st.integers(1, 256), cols=st.integers(1, 256),
         resolution_m=st.floats(0.01, 1e6), west_m=metres, north_m=metres, crs=texts,
         digests=st.dictionaries(texts, st.binary(min_size=8, max_size=8), max_size=4),
         notes=st.lists(texts, max_size=3),
     ),
-    BaseMapRequest: st.builds(BaseMapRequest, layers=st.lists(texts, max_size=3), regions=st.lists(naturals)),
-    BaseMapTile: st.builds(BaseMapTile, layer=texts, region=naturals, data=st.binary(max_size=50)),
+    BaseMapRequest: st.builds(BaseMapRequest, layers=st.lists(texts, max_size=3), regions=st.lists(regions)),
+    BaseMapTile: st.builds(BaseMapTile, layer=texts, region=regions, data=st.binary(max_size=50)),
     Fleet: fleets(),
     Reservations: reservations,
     TerritoryRequest: st.builds(
-        TerritoryRequest, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(naturals, max_size=3),
+        TerritoryRequest, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(plots, max_size=3),
         silent=st.lists(ids, max_size=2),
     ),
     TerritoryReply: st.builds(
-        TerritoryReply, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(naturals, max_size=3),
+        TerritoryReply, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(plots, max_size=3),
         reservations=st.lists(reservations, max_size=2),
     ),
     Followed: st.builds(
-        Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite, lower_bound_s=finite
+        Followed,
+        vehicle=ids,
+        target=ids,
+        start=cells,
+        directions=directions,
+        cost_s=finite_costs,
+        lower_bound_s=finite_costs,
     ),
     TargetPose: st.builds(
         TargetPose, target=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, cell=cells, x_m=metres,
-        y_m=metres, captures=naturals, jumps=naturals,
+        y_m=metres, captures=counts, jumps=counts,
     ),
     Sighted: st.builds(
         Sighted, author=ids, group=ids, target=ids, seq=naturals, stamp_ns=naturals, until_ns=naturals, cell=cells,
@@ -186,31 +199,31 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     ),
     RouteRequest: route_requests(),
     RouteReply: st.builds(
-        RouteReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=naturals,
-        tree_age_ms=finite, rows=naturals, cols=naturals,
+        RouteReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=counts,
+        tree_age_ms=ages, rows=sides, cols=sides,
         routes=st.lists(routes, max_size=3).map(lambda some: RouteBatch.of(some).columns()),
     ),
     PushedRoute: st.builds(
-        PushedRoute, vehicle=ids, target=ids, incarnation=naturals, target_cell=cells, map_version=naturals,
+        PushedRoute, vehicle=ids, target=ids, incarnation=naturals, target_cell=cells, map_version=counts,
         route=routes,
     ),
     CostRequest: st.builds(CostRequest, cells=st.lists(cells, max_size=5), row=st.none(), col=st.none()),
     CostReply: st.builds(
-        CostReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=naturals,
-        tree_age_ms=finite,
+        CostReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=counts,
+        tree_age_ms=ages,
         cost_to_go_s=st.lists(st.floats(0, width=32), max_size=5).map(lambda column: pack_column(column, "<f4")),
     ),
     PlannerStatus: st.builds(
         PlannerStatus, target=ids, incarnation=naturals, stamp_ns=naturals, strategy=texts,
-        target_cell=optional_cells, map_version=naturals, tree_age_ms=finite,
-        window=st.sampled_from([[], [0, 0, 8, 8]]), growths=naturals, window_growths=naturals, growth_ms=finite,
-        routes_served=naturals, following=naturals, gap_mean=gaps, gap_p95=gaps, gap_max=gaps,
+        target_cell=optional_cells, map_version=counts, tree_age_ms=ages,
+        window=st.sampled_from([[], [0, 0, 8, 8]]), growths=counts, window_growths=counts, growth_ms=millis,
+        routes_served=counts, following=counts, gap_mean=gaps, gap_p95=gaps, gap_max=gaps,
     ),
     Stats: st.builds(
         Stats, role=ids, id=ids, incarnation=naturals, stamp_ns=naturals,
-        counts=st.dictionaries(texts, naturals, max_size=3), gauges=st.dictionaries(texts, finite, max_size=3),
+        counts=st.dictionaries(texts, counts, max_size=3), gauges=st.dictionaries(texts, finite, max_size=3),
         histograms=st.dictionaries(
-            texts, st.dictionaries(st.integers(ZERO_BUCKET, TOP_BUCKET), naturals, max_size=3), max_size=2
+            texts, st.dictionaries(st.integers(ZERO_BUCKET, TOP_BUCKET), counts, max_size=3), max_size=2
         ),
     ),
     Note: st.builds(Note, role=ids, id=ids, stamp_ns=naturals, kind=texts, text=texts, cell=optional_cells),

@@ -9,7 +9,7 @@ from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings, pose_of
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.liveness import Succession
+from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from vehicle_agent.driving.vehicle import Vehicle
 
@@ -37,13 +37,13 @@ class TargetDetector:
         self._range_m = range_m
         self._lasts_ns = int(lasts_s * NS_PER_S)
         self._true: dict[str, TargetPose] = {}
-        self._succession = Succession()
+        self._newest = Newest(silence_ns=POSE_SILENCE_NS)
         self._told_ns: dict[str, int] = {}
         self._seq = 0
 
     def set_truth(self, pose: TargetPose, now_ns: int) -> None:
         """Where a target truly is. Of each target the newest pose counts."""
-        if self._succession.accepts(pose.target, pose.incarnation, pose.seq, now_ns):
+        if self._newest.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
             self._true[pose.target] = pose
 
     def look(self, vehicles: Iterable[Vehicle], now_ns: int) -> list[Sighted]:

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import msgspec
+from msgspec import Meta
 
 from swarm.grid import GridSpec
-from swarm.wire.fields import GridSide, Metres, Natural, check_column, check_id
+from swarm.wire.fields import GridSide, Id, LongText, Metres, Region, Resolution, Word, check_column
 from swarm.wire.messages.base import Message, schema_of
+
+BASE_DIGEST_BYTES = 8
+MOST_REGIONS = 1 << 16
+"""Of the largest grid."""
+_DIGESTS = Meta(max_length=BASE_DIGEST_BYTES * MOST_REGIONS)
+_LAYERS = Meta(max_length=100)
 
 
 class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
@@ -18,19 +24,18 @@ class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
     notes    sentences about where the terrain came from
     """
 
-    keeper: str
-    terrain: str
+    keeper: Id
+    terrain: Word
     rows: GridSide
     cols: GridSide
-    resolution_m: Annotated[float, msgspec.Meta(ge=1e-6, le=1e9)]
+    resolution_m: Resolution
     west_m: Metres
     north_m: Metres
-    crs: str
-    digests: dict[str, bytes]
-    notes: list[str] = []
+    crs: LongText
+    digests: Annotated[dict[Word, Annotated[bytes, _DIGESTS]], _LAYERS]
+    notes: Annotated[list[LongText], Meta(max_length=1000)] = []
 
-    def __post_init__(self) -> None:
-        check_id("keeper", self.keeper)
+    def relate(self) -> None:
         regions = self.grid.regions
         for layer, digests in self.digests.items():
             check_column(f"digests of {layer[:40]}", digests, BASE_DIGEST_BYTES, regions)
@@ -43,17 +48,14 @@ class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
 class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map-request")):
     """Asks a keeper for these layers of these regions."""
 
-    layers: list[str] = []
-    regions: list[Natural] = []
+    layers: Annotated[list[Word], _LAYERS] = []
+    regions: Annotated[list[Region], Meta(max_length=MOST_REGIONS)] = []
 
 
 class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
     """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
     row, then the next. Similar bytes side by side compress better."""
 
-    layer: str
-    region: Natural
-    data: bytes
-
-
-BASE_DIGEST_BYTES = 8
+    layer: Word
+    region: Region
+    data: Annotated[bytes, Meta(max_length=4 << 20)]

@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Annotated
 
-from swarm.wire.fields import Natural, check_column, check_id, column
+import numpy as np
+from msgspec import Meta
+
+from swarm.wire.fields import Column, Id, Natural, Tile, Word, check_column, column
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.statements import check_lengths, check_statements, faulty_sets
+from swarm.wire.statements import (
+    LAST_KIND,
+    PACE_LEAST,
+    PACE_MOST,
+    STAMP_LIMIT_NS,
+    TILE_AREA,
+    check_lengths,
+    check_statements,
+    faulty_sets,
+)
 
 SEQ_STEP = 1 << 16
 """An author's own numbers are multiples of this."""
+DIGEST_ROW = np.dtype([("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8")])
+MOST_TILES = 1 << 18
+"""Named in one message: every tile of a map of 16,384 x 16,384 cells."""
+_ROWS = Meta(max_length=DIGEST_ROW.itemsize * MOST_TILES)
+_AUTHORS = Meta(max_length=1 << 16)
+_Cells = Annotated[bytes, Column("<u2", per="kinds", least=0, most=TILE_AREA - 1, checked=False)]
+_Kinds = Annotated[bytes, Column("<u1", least=0, most=LAST_KIND, checked=False)]
+_Paces = Annotated[bytes, Column("<f4", per="kinds", least=PACE_LEAST, most=PACE_MOST, checked=False)]
+_Stamps = Annotated[bytes, Column("<i8", per="kinds", least=0, most=STAMP_LIMIT_NS - 1, checked=False)]
 
 
 class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks")):
@@ -24,18 +45,24 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     paces      float32 s/m for PACE, ignored otherwise
     stamps_ns  int64   hybrid logical time of each statement
     untils_ns  int64   when each statement ends by itself, FOREVER if it does not; empty if none does
+
+    A set is checked when it is decoded (`check`), not when it is made: the statements of many sets are checked at
+    once, by the rules of `swarm.wire.statements`.
     """
 
-    author: str
-    group: str
-    tile: Natural
+    author: Id
+    group: Id
+    tile: Tile
     epoch: Natural
     seq: Natural
-    cells: bytes
-    kinds: bytes
-    paces: bytes
-    stamps_ns: bytes
-    untils_ns: bytes = b""
+    cells: _Cells
+    kinds: Annotated[_Kinds, Meta(max_length=TILE_AREA)]
+    paces: _Paces
+    stamps_ns: _Stamps
+    untils_ns: Annotated[bytes, Meta(max_length=8 * TILE_AREA), Column("<i8")] = b""
+
+    def __post_init__(self) -> None:
+        pass
 
     def check(self) -> None:
         self.check_head()
@@ -44,8 +71,7 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
 
     def check_head(self) -> None:
         """All but the rules of the statements themselves, which are cheaper to check of many sets at once."""
-        check_id("author", self.author)
-        check_id("group", self.group)
+        self.check_bounds()
         check_lengths(len(self.kinds), self.cells, self.kinds, self.paces, self.stamps_ns, self.untils_ns)
 
 
@@ -62,34 +88,31 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
     untils_ns  int64   of the statements of the sets that have them
     """
 
-    author: str
-    group: str
-    tiles: bytes
-    epochs: bytes
-    seqs: bytes
-    counts: bytes
-    ending: bytes
-    cells: bytes
-    kinds: bytes
-    paces: bytes
-    stamps_ns: bytes
-    untils_ns: bytes = b""
+    author: Id
+    group: Id
+    tiles: Annotated[bytes, Column("<u4", per="ending", least=0, most=(1 << 22) - 1)]
+    epochs: Annotated[bytes, Column("<u8", per="ending", least=0, most=(1 << 62) - 1)]
+    seqs: Annotated[bytes, Column("<u8", per="ending", least=0, most=(1 << 62) - 1)]
+    counts: Annotated[bytes, Column("<u2", per="ending", least=0, most=TILE_AREA)]
+    ending: Annotated[bytes, Meta(max_length=MOST_TILES), Column("<u1", least=0, most=1)]
+    cells: _Cells
+    kinds: Annotated[_Kinds, Meta(max_length=1 << 20)]
+    paces: _Paces
+    stamps_ns: _Stamps
+    untils_ns: Annotated[bytes, Meta(max_length=8 << 20), Column("<i8")] = b""
+
+    def __post_init__(self) -> None:
+        pass
 
     def check(self) -> None:
-        check_id("author", self.author)
-        check_id("group", self.group)
+        self.check_bounds()
+
+    def relate(self) -> None:
         sets = len(self.ending)
-        for name, width in (("tiles", 4), ("epochs", 8), ("seqs", 8), ("counts", 2)):
-            check_column(name, getattr(self, name), width, sets)
         counts = column(self.counts, "<u2").astype(np.int64)
         ending = column(self.ending, "<u1")
-        if (ending > 1).any():
-            raise ValueError(f"ending has a {int(ending.max())}, expected 0 or 1")
         check_lengths(int(counts.sum()), self.cells, self.kinds, self.paces, self.stamps_ns)
         check_column("untils_ns", self.untils_ns, 8, int(counts[ending == 1].sum()))
-        for name in ("epochs", "seqs"):
-            if (column(getattr(self, name), "<u8") >= 1 << 62).any():
-                raise ValueError(f"{name} must be below 2**62")
         if len(np.unique(column(self.tiles, "<u4"))) < sets:
             raise ValueError("tiles names a tile twice")
         faulty = faulty_sets(counts, self.cells, self.kinds, self.paces, self.stamps_ns)
@@ -105,21 +128,11 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     seq    counts this sender's digests, so that one that comes late replaces no newer one; 0 if it does not count
     """
 
-    author: str
-    role: str
-    held: dict[str, bytes]
+    author: Id
+    role: Word
+    held: Annotated[dict[Id, Annotated[bytes, _ROWS, Column(DIGEST_ROW)]], _AUTHORS]
     whole: bool = True
     seq: Natural = 0
-
-    def __post_init__(self) -> None:
-        check_id("author", self.author)
-        for author, rows in self.held.items():
-            check_id("author", author)
-            if len(rows) % DIGEST_ROW.itemsize:
-                raise ValueError(f"digest of {author} has {len(rows)} bytes, not a multiple of 20")
-
-
-DIGEST_ROW = np.dtype([("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8")])
 
 
 class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-request")):
@@ -128,6 +141,6 @@ class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-requ
     bulk  answers may be MarkSets, under a key with `-` for region and tile
     """
 
-    authors: list[str] = []
-    tiles: list[Natural] = []
+    authors: Annotated[list[Id], _AUTHORS] = []
+    tiles: Annotated[list[Tile], Meta(max_length=MOST_TILES)] = []
     bulk: bool = False

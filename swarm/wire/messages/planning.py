@@ -2,9 +2,27 @@
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from typing import Annotated
 
-from swarm.wire.fields import Cell, Natural, check_id, column
+from msgspec import Meta
+
+from swarm.wire.fields import (
+    LARGE,
+    SMALL,
+    AgeMillis,
+    Cell,
+    Column,
+    Count,
+    Gap,
+    GridSide,
+    Id,
+    Incarnation,
+    Millis,
+    StampNs,
+    VehicleId,
+    Word,
+)
 from swarm.wire.messages.base import Message, schema_of
 from swarm.wire.routes import Route, Routes
 
@@ -17,16 +35,14 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
     force      a route ran out: the planner extends its window to these cells
     """
 
-    cells: list[Cell] = []
-    vehicles: list[str] = []
-    max_cells: Natural = 0
+    cells: Annotated[list[Cell], LARGE] = []
+    vehicles: Annotated[list[VehicleId], SMALL] = []
+    max_cells: Count = 0
     force: bool = False
     row: Cell | None = None
     col: Cell | None = None
 
-    def __post_init__(self) -> None:
-        if len(self.cells) > 100_000:
-            raise ValueError(f"{len(self.cells)} cells in one request, at most 100000")
+    def relate(self) -> None:
         if self.vehicles and len(self.vehicles) != len(self.cells):
             raise ValueError(f"{len(self.vehicles)} vehicles for {len(self.cells)} cells")
         if (self.row is None) != (self.col is None):
@@ -41,37 +57,35 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     tree_age_ms  time since the last full growth
     """
 
-    target: str
-    incarnation: Natural
+    target: Id
+    incarnation: Incarnation
     target_cell: Cell | None
-    map_version: Natural
-    tree_age_ms: float
-    rows: Natural
-    cols: Natural
+    map_version: Count
+    tree_age_ms: AgeMillis
+    rows: GridSide
+    cols: GridSide
     routes: Routes
 
 
 class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-route")):
     """A newer route for a vehicle that follows this target."""
 
-    vehicle: str
-    target: str
-    incarnation: Natural
+    vehicle: VehicleId
+    target: Id
+    incarnation: Incarnation
     target_cell: Cell
-    map_version: Natural
+    map_version: Count
     route: Route
 
 
 class CostRequest(Message, frozen=True, kw_only=True, tag=schema_of("cost-request")):
     """Asks what it costs to reach the planner's target from each of these cells."""
 
-    cells: list[Cell] = []
+    cells: Annotated[list[Cell], LARGE] = []
     row: Cell | None = None
     col: Cell | None = None
 
-    def __post_init__(self) -> None:
-        if len(self.cells) > 100_000:
-            raise ValueError(f"{len(self.cells)} cells in one request, at most 100000")
+    def relate(self) -> None:
         if (self.row is None) != (self.col is None):
             raise ValueError("give both row and col, or neither")
 
@@ -79,17 +93,12 @@ class CostRequest(Message, frozen=True, kw_only=True, tag=schema_of("cost-reques
 class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
     """cost_to_go_s  float32 per asked cell, inf where there is no way or the cell is outside."""
 
-    target: str
-    incarnation: Natural
+    target: Id
+    incarnation: Incarnation
     target_cell: Cell | None
-    map_version: Natural
-    tree_age_ms: float
-    cost_to_go_s: bytes
-
-    def __post_init__(self) -> None:
-        check_id("target", self.target)
-        if len(self.cost_to_go_s) % 4 or np.isnan(column(self.cost_to_go_s, "<f4")).any():
-            raise ValueError("cost_to_go_s is not a column of float32 without NaN")
+    map_version: Count
+    tree_age_ms: AgeMillis
+    cost_to_go_s: Annotated[bytes, Meta(max_length=4 * 100_001), Column("<f4", least=0, most=math.inf)]
 
 
 class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-status")):
@@ -99,24 +108,23 @@ class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-s
     gap_*   driven cost over optimum of the vehicles that follow, at the last full growth; None before the first
     """
 
-    target: str
-    incarnation: Natural
-    stamp_ns: Natural
-    strategy: str
+    target: Id
+    incarnation: Incarnation
+    stamp_ns: StampNs
+    strategy: Word
     target_cell: Cell | None
-    map_version: Natural
-    tree_age_ms: float
-    window: list[Cell]
-    growths: Natural
-    window_growths: Natural
-    growth_ms: float
-    routes_served: Natural
-    following: Natural
-    gap_mean: float | None = None
-    gap_p95: float | None = None
-    gap_max: float | None = None
+    map_version: Count
+    tree_age_ms: AgeMillis
+    window: Annotated[list[Cell], Meta(max_length=4)]
+    growths: Count
+    window_growths: Count
+    growth_ms: Millis
+    routes_served: Count
+    following: Count
+    gap_mean: Gap | None = None
+    gap_p95: Gap | None = None
+    gap_max: Gap | None = None
 
-    def __post_init__(self) -> None:
-        check_id("target", self.target)
+    def relate(self) -> None:
         if len(self.window) not in (0, 4):
             raise ValueError(f"window has {len(self.window)} numbers, expected [row0, col0, row1, col1]")

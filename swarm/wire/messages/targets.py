@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from swarm.wire.fields import Cell, Metres, Natural, check_id
+from swarm.wire.fields import Cell, Count, Distance, Id, Incarnation, Metres, Natural, StampNs
 from swarm.wire.messages.base import Message, schema_of
 
 
@@ -14,38 +14,28 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
     jumps     how often it was put somewhere else, as after a capture
     """
 
-    target: str
-    incarnation: Natural
+    target: Id
+    incarnation: Incarnation
     seq: Natural
-    stamp_ns: Natural
+    stamp_ns: StampNs
     cell: Cell
     x_m: Metres
     y_m: Metres
-    captures: Natural = 0
-    jumps: Natural = 0
-
-    def __post_init__(self) -> None:
-        check_id("target", self.target)
+    captures: Count = 0
+    jumps: Count = 0
 
 
 class Sighted(Message, frozen=True, kw_only=True, tag=schema_of("sighted")):
     """A sighting: a vehicle of this author saw a target within `uncertainty_m` of the place. It expires at
     `until_ns`, and the author's next sighting of the target replaces it."""
 
-    author: str
-    group: str
-    target: str
+    author: Id
+    group: Id
+    target: Id
     seq: Natural
-    stamp_ns: Natural
-    until_ns: Natural
+    stamp_ns: StampNs
+    until_ns: StampNs
     cell: Cell
     x_m: Metres
     y_m: Metres
-    uncertainty_m: Metres
-
-    def __post_init__(self) -> None:
-        check_id("author", self.author)
-        check_id("group", self.group)
-        check_id("target", self.target)
-        if self.uncertainty_m < 0:
-            raise ValueError(f"uncertainty_m is {self.uncertainty_m}, expected 0 or more")
+    uncertainty_m: Distance

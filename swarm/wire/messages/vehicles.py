@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 import enum
+import math
+from typing import Annotated
 
-import msgspec
-import numpy as np
+from msgspec import Meta
 
-from swarm.wire.fields import Cell, Natural, check_column, check_directions, check_finite, check_id
+from swarm.wire.fields import (
+    IDS,
+    SMALL,
+    Bounded,
+    Cell,
+    Column,
+    Directions,
+    FiniteCost,
+    Id,
+    Incarnation,
+    Natural,
+    Plot,
+    Region,
+    StampNs,
+    VehicleId,
+)
 from swarm.wire.fields import column as column
 from swarm.wire.fields import pack_column as pack_column
 from swarm.wire.messages.base import Message, schema_of
@@ -35,6 +51,8 @@ class VehicleState(enum.IntEnum):
 
 
 NO_TARGET = 255
+_Place = Annotated[bytes, Column("<f4", per="ids", least=-1e9, most=1e9)]
+_PLOTS = Meta(max_length=1 << 16)
 
 
 class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
@@ -48,53 +66,38 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
     targets      uint8    index into target_ids, NO_TARGET for none
     """
 
-    author: str
-    group: str
-    region: Natural
+    author: Id
+    group: Id
+    region: Region
     seq: Natural
-    stamp_ns: Natural
-    ids: list[str]
-    target_ids: list[str]
-    cells: bytes
-    east_m: bytes
-    south_m: bytes
-    heading_rad: bytes
-    states: bytes
-    targets: bytes
+    stamp_ns: StampNs
+    ids: Annotated[list[VehicleId], SMALL]
+    target_ids: Annotated[list[Id], Meta(max_length=NO_TARGET)]
+    cells: Annotated[bytes, Column("<u4", per="ids")]
+    east_m: _Place
+    south_m: _Place
+    heading_rad: Annotated[bytes, Column("<f4", per="ids", least=-2 * math.tau, most=2 * math.tau)]
+    states: Annotated[bytes, Column("<u1", per="ids", least=0, most=int(VehicleState.LOST))]
+    targets: Annotated[bytes, Column("<u1", per="ids")]
 
-    def __post_init__(self) -> None:
-        check_id("author", self.author)
-        check_id("group", self.group)
-        for id in self.ids:
-            check_id("vehicle", id)
-        for id in self.target_ids:
-            check_id("target", id)
-        count = len(self.ids)
-        for name, width in (("cells", 4), ("east_m", 4), ("south_m", 4), ("heading_rad", 4)):
-            check_column(name, getattr(self, name), width, count)
-        check_column("states", self.states, 1, count)
-        check_column("targets", self.targets, 1, count)
-        if any(state > VehicleState.LOST for state in self.states):
-            raise ValueError(f"state {max(self.states)} is not in 0..{int(VehicleState.LOST)}")
-        if any(t != NO_TARGET and t >= len(self.target_ids) for t in self.targets):
+    def relate(self) -> None:
+        if any(t != NO_TARGET and t >= len(self.target_ids) for t in set(self.targets)):
             raise ValueError("a target index points past target_ids")
-        for name in ("east_m", "south_m", "heading_rad"):
-            if not np.isfinite(column(getattr(self, name), "<f4")).all():
-                raise ValueError(f"{name} must be finite")
 
 
-class RequestedCell(msgspec.Struct, frozen=True, kw_only=True):
+MOST_CELLS = 1 << 16
+"""Held by a vehicle or requested by an agent: more than any scenario's reserve."""
+
+
+class RequestedCell(Bounded, frozen=True, kw_only=True):
     """A cell that a vehicle requests. Of rival requests the lowest (ticket, agent, vehicle) goes first.
 
     ticket  Lamport time of the request
     """
 
-    vehicle: str
+    vehicle: VehicleId
     cell: Cell
     ticket: Natural
-
-    def __post_init__(self) -> None:
-        check_id("vehicle", self.vehicle)
 
 
 class Reservations(Message, frozen=True, kw_only=True, tag=schema_of("reservations")):
@@ -107,20 +110,13 @@ class Reservations(Message, frozen=True, kw_only=True, tag=schema_of("reservatio
     seen       agent -> [incarnation, seq] of the newest reservations heard of it
     """
 
-    agent: str
-    incarnation: Natural
+    agent: Id
+    incarnation: Incarnation
     seq: Natural
     clock: Natural
-    held: dict[str, list[Cell]]
-    requested: list[RequestedCell]
-    seen: dict[str, tuple[Natural, Natural]]
-
-    def __post_init__(self) -> None:
-        check_id("agent", self.agent)
-        for vehicle in self.held:
-            check_id("vehicle", vehicle)
-        if any(not cells for cells in self.held.values()):
-            raise ValueError("a vehicle holds at least the cell that it stands on")
+    held: Annotated[dict[VehicleId, Annotated[list[Cell], Meta(min_length=1, max_length=MOST_CELLS)]], SMALL]
+    requested: Annotated[list[RequestedCell], Meta(max_length=MOST_CELLS)]
+    seen: Annotated[dict[Id, tuple[Incarnation, Natural]], IDS]
 
 
 class TerritoryRequest(Message, frozen=True, kw_only=True, tag=schema_of("territory-request")):
@@ -131,16 +127,11 @@ class TerritoryRequest(Message, frozen=True, kw_only=True, tag=schema_of("territ
     silent  dead agents whose newest reservations the sender needs
     """
 
-    agent: str
-    incarnation: Natural
+    agent: Id
+    incarnation: Incarnation
     seq: Natural
-    plots: list[Natural]
-    silent: list[str] = []
-
-    def __post_init__(self) -> None:
-        check_id("agent", self.agent)
-        for agent in self.silent:
-            check_id("silent", agent)
+    plots: Annotated[list[Plot], _PLOTS]
+    silent: Annotated[list[Id], IDS] = []
 
 
 class TerritoryReply(Message, frozen=True, kw_only=True, tag=schema_of("territory")):
@@ -150,28 +141,19 @@ class TerritoryReply(Message, frozen=True, kw_only=True, tag=schema_of("territor
     reservations  the newest that it has heard of the agents named as silent
     """
 
-    agent: str
-    incarnation: Natural
+    agent: Id
+    incarnation: Incarnation
     seq: Natural
-    plots: list[Natural]
-    reservations: list[Reservations] = []
-
-    def __post_init__(self) -> None:
-        check_id("agent", self.agent)
+    plots: Annotated[list[Plot], _PLOTS]
+    reservations: Annotated[list[Reservations], IDS] = []
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
     """The route that a vehicle has just begun to follow, for those who watch."""
 
-    vehicle: str
-    target: str
+    vehicle: VehicleId
+    target: Id
     start: Cell
-    directions: bytes
-    cost_s: float
-    lower_bound_s: float
-
-    def __post_init__(self) -> None:
-        check_id("vehicle", self.vehicle)
-        check_id("target", self.target)
-        check_directions(self.directions)
-        check_finite("cost_s", self.cost_s, self.lower_bound_s)
+    directions: Directions
+    cost_s: FiniteCost
+    lower_bound_s: FiniteCost

@@ -281,7 +281,7 @@ def test_no_single_pose_misleads_a_planner_for_longer_than_the_lease(ready: Worl
 
 
 def test_the_pose_of_another_target_is_not_ours(world: World) -> None:
-    world.planner.hear_pose(pose(5, target="t1"), 0)
+    world.planner.hear_pose(pose(5, target="t1"), world.now_ns)
     assert world.tick() == []
     assert world.planner.status(0).target_cell is None
 
@@ -602,7 +602,7 @@ def test_the_status_is_told_twice_a_second(ready: World) -> None:
 
 def test_the_cells_of_a_route_are_those_walked() -> None:
     start, directions = GRID.cell(5, 5), bytes([0, 1, 2, 3, 4, 5, 6, 7, 2])
-    rows, cols = route_cells(GRID, Route(status=RouteStatus.OK, start=start, directions=directions))
+    rows, cols = route_cells(GRID, Route(status=RouteStatus.OK, start=start, directions=directions, cost_s=1.0))
     assert [GRID.cell(r, c) for r, c in zip(rows.tolist(), cols.tolist(), strict=True)] == walk(
         GRID, start, directions
     )

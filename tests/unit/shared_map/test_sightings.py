@@ -14,7 +14,7 @@ from shared_map.sightings import LONGEST_NS, Sightings, pose_of
 from swarm.bus.bus import Heard
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.liveness import SUCCESSION_LEASE_NS
+from swarm.liveness import POSE_SILENCE_NS
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.topics import POSE, SIGHTED
 from vehicle_agent.driving.vehicle import Vehicle
@@ -82,9 +82,9 @@ def test_an_author_with_a_fast_clock_outweighs_nobody_and_its_sightings_expire_a
 def test_an_author_whose_clock_is_put_back_is_heard_again_after_the_lease() -> None:
     seen = Sightings(MarkFilter(GRID))
     seen.hear(sighted(1 << 61, cell=1, until_ns=1 << 62), 0)
-    assert not seen.hear(sighted(5, seq=9, cell=2, until_ns=1 << 62), SUCCESSION_LEASE_NS)
-    assert seen.hear(sighted(5, seq=9, cell=2, until_ns=1 << 62), SUCCESSION_LEASE_NS + 1)
-    assert seen.best(SUCCESSION_LEASE_NS + 1)["t"].cell == 2
+    assert not seen.hear(sighted(5, seq=9, cell=2, until_ns=1 << 62), POSE_SILENCE_NS - 1)
+    assert seen.hear(sighted(5, seq=9, cell=2, until_ns=1 << 62), POSE_SILENCE_NS)
+    assert seen.best(POSE_SILENCE_NS)["t"].cell == 2
 
 
 def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
