@@ -1,0 +1,208 @@
+"""One agent's part in right of way: its seats among the members of plots, and the cells that its own vehicles hold.
+
+Messages and time in, actions out. The shell performs actions in their order: what is saved must be on file before
+what follows is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from swarm.config.scenario import agent_of
+from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Standing, Stored, Table
+from vehicle_agent.traffic.holdings import Holdings, Wish
+from vehicle_agent.traffic.member import Member, MemberAction
+from vehicle_agent.traffic.plots import Plots
+from vehicle_agent.traffic.warden import first_life, is_far_ahead
+
+Place = Callable[[str, Sequence[int]], int]
+
+_LIVES_KEPT = 32
+
+
+def _first(vehicle: str, cells: Sequence[int]) -> int:
+    return cells[0]
+
+
+@dataclass(frozen=True, slots=True)
+class OwnRecord:
+    """What an agent keeps on file about itself and the others' files.
+
+    disk      names this file: a number drawn when it was made
+    lives     the agent's lives that have run on it, the last ones
+    noted     agent -> its file, the first that we were told of
+    noted_by  the agents that have noted ours
+    """
+
+    disk: int
+    lives: tuple[int, ...] = ()
+    noted: Mapping[str, int] = field(default_factory=dict)
+    noted_by: tuple[str, ...] = ()
+
+
+Action = MemberAction | Standing | OwnRecord | Known
+
+
+class Council:
+    """Right of way of one agent.
+
+    spawns  agent -> vehicle -> the cell where it stands when the run begins
+    own     what this agent's file holds: of itself,
+    saved   and of plots: (promised epoch, stored table)
+    place   tells on which of the cells that it was granted a vehicle of a new life stands
+
+    holdings  which cells our vehicles hold; None before `begin`
+    """
+
+    def __init__(
+        self,
+        agent: str,
+        plots: Plots,
+        spawns: Mapping[str, Mapping[str, int]],
+        own: OwnRecord,
+        saved: Mapping[int, tuple[int, Table]],
+        place: Place = _first,
+    ) -> None:
+        self.agent = agent
+        self.plots = plots
+        self.own = own
+        self.holdings: Holdings | None = None
+        self._spawns = spawns
+        self._vehicles = {vehicle: cell for each in spawns.values() for vehicle, cell in each.items()}
+        self._saved = dict(saved)
+        self._place = place
+        self._members: dict[int, Member] = {}
+        self._found: dict[int, None] = {}
+        self._known_life = 0
+
+    # --- beginning a life -----------------------------------------------------------------------------------
+
+    @property
+    def settled(self) -> bool:
+        """Whether all other agents have noted our file, so that nobody needs to be asked again."""
+        return len(self.own.noted_by) >= len(self._spawns) - 1
+
+    def answer_known(self, request: KnownRequest) -> list[Action]:
+        """Another agent has begun a life. The last action is what to answer.
+
+        Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
+        first.
+        """
+        if request.agent not in self._spawns:
+            return []
+        actions: list[Action] = []
+        if request.agent not in self.own.noted:
+            self.own = replace(self.own, noted={**self.own.noted, request.agent: request.disk})
+            actions.append(self.own)
+        life, plots = self._known(request.agent)
+        disk = self.own.noted[request.agent]
+        return [*actions, Known(agent=self.agent, disk=disk, life=life, plots=plots)]
+
+    def hear_known(self, known: Known) -> list[Action]:
+        """An answer to our question."""
+        if not is_far_ahead(known.life, self._known_life):
+            self._known_life = max(self._known_life, known.life)
+        self._found.update(dict.fromkeys(known.plots))
+        if self.holdings is not None:
+            self.holdings.watch([plot for plot in known.plots if plot < self.plots.count])
+        if known.disk != self.own.disk or known.agent in self.own.noted_by or known.agent not in self._spawns:
+            return []
+        self.own = replace(self.own, noted_by=(*self.own.noted_by, known.agent))
+        return [self.own]
+
+    def begin(self, chance: int) -> list[Action]:
+        """Begin a new life, once those who could be asked have answered.
+
+        chance  a random number
+        """
+        life, plots = self._known(self.agent)
+        dead = self.own.lives  # they have ended: this life has the file
+        life = first_life(max(self._known_life, life, *dead), chance)
+        mine = self._spawns[self.agent]
+        self.holdings = Holdings(self.plots, self.agent, mine, life, dead)
+        home = map(self.plots.of, mine.values())
+        self.holdings.watch([plot for plot in (*self._found, *plots, *home) if plot < self.plots.count])
+        self.own = replace(self.own, lives=(*dead[1 - _LIVES_KEPT :], life))
+        return [self.own]
+
+    def _known(self, agent: str) -> tuple[int, list[int]]:
+        """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles."""
+        stored = {plot: table for plot, (_, table) in self._saved.items()}
+        stored.update((plot, member.stored) for plot, member in self._members.items())
+        life = max((table.hosts.get(agent, (0, 0))[0] for table in stored.values()), default=0)
+        return life, sorted(
+            plot for plot, table in stored.items() if any(agent_of(v) == agent for v in table.grants)
+        )
+
+    # --- what is heard --------------------------------------------------------------------------------------
+
+    def hear_standing(self, standing: Standing, now_ns: int) -> None:
+        member = self._member(standing.plot, now_ns)
+        if member is not None and standing.agent in self._spawns:
+            member.hear_standing(standing, now_ns)
+
+    def hear_table(self, table: Table, now_ns: int) -> tuple[list[Action], list[str]]:
+        """Returns what to do, and which vehicles have found their place."""
+        member = self._member(table.plot, now_ns)
+        actions: list[Action] = [] if member is None else [*member.hear_table(table, now_ns)]
+        placed = []
+        if self.holdings is not None and table.plot in self.holdings.plots:
+            placed = self.holdings.hear_table(table, self._place)
+            for action in actions:
+                if isinstance(action, Stored):
+                    placed += self.holdings.hear_stored(action, self._place)
+        return actions, placed
+
+    def hear_stored(self, stored: Stored, now_ns: int) -> list[str]:
+        member = self._members.get(stored.plot)
+        if member is not None:
+            member.hear_stored(stored, now_ns)
+        if self.holdings is None or stored.plot not in self.holdings.plots:
+            return []
+        return self.holdings.hear_stored(stored, self._place)
+
+    def hear_claim(self, plot: int, agent: str, epoch: int, now_ns: int) -> list[Action]:
+        """Another member asks for our promise: `Save`, then the table to answer with; or nothing."""
+        member = self._member(plot, now_ns)
+        if member is None or agent != self.plots.warden(plot, epoch):
+            return []
+        return [*member.hear_claim(epoch, now_ns)]
+
+    def hear_promise(self, member: str, epoch: int, table: Table, now_ns: int) -> None:
+        seat = self._members.get(table.plot)
+        if seat is not None:
+            seat.hear_promise(member, epoch, table, now_ns)
+
+    # --- time passes ----------------------------------------------------------------------------------------
+
+    def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
+        """What our members and our vehicles have to say now."""
+        actions: list[Action] = []
+        for member in self._members.values():
+            actions += member.tick(now_ns)
+        if self.holdings is not None:
+            actions += self.holdings.standings(wishes)
+        return actions
+
+    def _member(self, plot: int, now_ns: int) -> Member | None:
+        """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is
+        not known to be the first, and what was promised in the first is not in it."""
+        known = self._members.get(plot)
+        if known is not None or not 0 <= plot < self.plots.count:
+            return known
+        members = self.plots.members(plot)
+        if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):
+            return None
+        promised, stored = self._saved.get(plot) or (0, self._at_start(plot))
+        made = self._members[plot] = Member(self.plots, self.agent, promised, stored, self._vehicles, now_ns)
+        return made
+
+    def _at_start(self, plot: int) -> Table:
+        """The table from before any warden: vehicles stand where the run begins."""
+        grants = {
+            vehicle: Grant([cell], (0, 0))
+            for vehicle, cell in self._vehicles.items()
+            if self.plots.of(cell) == plot
+        }
+        return Table(plot=plot, agent=self.agent, epoch=0, seq=0, hosts={}, grants=grants)
