@@ -104,6 +104,7 @@ class Process:
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:
             self.disk.bodies[vehicle] = self.council.holdings.path(vehicle)[0]
+            self.world.unmoved.pop(vehicle, None)
             self.world.placed += 1
         self.world.look()
 
@@ -186,8 +187,7 @@ class TrafficWorld:
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._count = 0
         self.disks: dict[str, list[Disk]] = {name: [self.new_disk()] for name in names}
-        for name, disks in self.disks.items():
-            disks[0].bodies = dict(self.spawns[name])
+        self.unmoved = {vehicle: cell for each in self.spawns.values() for vehicle, cell in each.items()}
         self.processes: list[Process] = []
         for name in names:
             self.at(self.chance.randrange(300 * MS), lambda name=name: self.start(name, self.disks[name][0]))
@@ -217,7 +217,7 @@ class TrafficWorld:
 
     def look(self) -> None:
         """The law: different vehicles are on different cells, whoever commands them."""
-        on: dict[int, str] = {}
+        on = {cell: vehicle for vehicle, cell in self.unmoved.items()}
         for disks in self.disks.values():
             for disk in disks:
                 for vehicle, cell in disk.bodies.items():
@@ -304,7 +304,7 @@ class TrafficWorld:
             self.at(NS_PER_S, lambda: self.ask_known(source))
 
     def new_disk(self) -> Disk:
-        return Disk(OwnRecord(self.chance.getrandbits(60)))
+        return Disk(OwnRecord(disk=self.chance.getrandbits(60)))
 
     # --- what goes wrong ------------------------------------------------------------------------------------
 
@@ -367,7 +367,11 @@ class TrafficWorld:
         elif chance.random() < faults.twins / 10:
             self.twin(somebody)
         if chance.random() < faults.leaps / 10:
-            somebody.offset_ns += chance.randrange(5 * NS_PER_S)
+            # One machine's clock leaps, or all but one: then they take a warden for silent that is not.
+            alone = chance.random() < 0.5
+            for process in self.processes:
+                if (process is somebody) == alone:
+                    process.offset_ns += chance.randrange(5 * NS_PER_S)
         if chance.random() < faults.cuts / 10:
             names = list(self.spawns)
             side = set(chance.sample(names, chance.randint(1, -(-len(names) // 2))))

@@ -7,7 +7,9 @@ what follows is said.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from swarm.config.scenario import agent_of
 from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Standing, Stored, Table
@@ -25,8 +27,7 @@ def _first(vehicle: str, cells: Sequence[int]) -> int:
     return cells[0]
 
 
-@dataclass(frozen=True, slots=True)
-class OwnRecord:
+class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What an agent keeps on file about itself and the others' files.
 
     disk      names this file: a number drawn when it was made
@@ -36,9 +37,9 @@ class OwnRecord:
     """
 
     disk: int
-    lives: tuple[int, ...] = ()
-    noted: Mapping[str, int] = field(default_factory=dict)
-    noted_by: tuple[str, ...] = ()
+    lives: list[int] = []
+    noted: dict[str, int] = {}
+    noted_by: list[str] = []
 
 
 Action = MemberAction | Standing | OwnRecord | Known
@@ -108,7 +109,7 @@ class Council:
             self.holdings.watch([plot for plot in known.plots if plot < self.plots.count])
         if known.disk != self.own.disk or known.agent in self.own.noted_by or known.agent not in self._spawns:
             return []
-        self.own = replace(self.own, noted_by=(*self.own.noted_by, known.agent))
+        self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
         return [self.own]
 
     def begin(self, chance: int) -> list[Action]:
@@ -123,7 +124,7 @@ class Council:
         self.holdings = Holdings(self.plots, self.agent, mine, life, dead)
         home = map(self.plots.of, mine.values())
         self.holdings.watch([plot for plot in (*self._found, *plots, *home) if plot < self.plots.count])
-        self.own = replace(self.own, lives=(*dead[1 - _LIVES_KEPT :], life))
+        self.own = replace(self.own, lives=[*dead[1 - _LIVES_KEPT :], life])
         return [self.own]
 
     def _known(self, agent: str) -> tuple[int, list[int]]:
@@ -134,6 +135,11 @@ class Council:
         return life, sorted(
             plot for plot, table in stored.items() if any(agent_of(v) == agent for v in table.grants)
         )
+
+    def leads(self, plot: int) -> bool:
+        """Whether we are the plot's warden, as far as we know."""
+        member = self._members.get(plot)
+        return member is not None and member.warden is not None
 
     # --- what is heard --------------------------------------------------------------------------------------
 

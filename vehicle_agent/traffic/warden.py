@@ -19,12 +19,15 @@ BEAT_NS = NS_PER_S // 5
 """A table is told so often though nothing has changed, so that the other members know of a warden."""
 SILENT_NS = NS_PER_S
 """Vehicles of a host that has not spoken for so long are obstacles: nobody waits for them or pushes them."""
+_AGE_BITS = 12
+"""Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is the
+older most of the time, or each lets its own wait for the other."""
 _LIFE_BITS = 32
 _FURTHEST_LIFE = 1 << 16
 
 
 def first_life(after: int, chance: int) -> int:
-    """A number for a new life of a host: greater than every one known; of two that begin at once, chance decides."""
+    """A new life's number: greater than all that are known. Of two that begin at once, chance decides."""
     return ((after >> _LIFE_BITS) + 1 << _LIFE_BITS) | (chance & 0xFFFF_FFFF)
 
 
@@ -71,6 +74,9 @@ class Warden:
 
     def hear(self, standing: Standing, now_ns: int) -> None:
         host = standing.agent
+        for dead in standing.dead:
+            if self._shut.pop((host, dead), None) is not None:
+                self._changed = True
         life, seq = self._lives.get(host, (0, 0))
         if standing.ended:
             self._ended(host, standing.life, life)
@@ -83,9 +89,6 @@ class Warden:
         if standing.life != life:
             self._succeed(host, life)
         self._lives[host] = (standing.life, standing.seq)
-        for dead in standing.dead:
-            if self._shut.pop((host, dead), None) is not None:
-                self._changed = True
         holds = {stand.vehicle: stand.holds for stand in standing.vehicles}
         for vehicle in [vehicle for vehicle in self._grants if agent_of(vehicle) == host]:
             self._free(vehicle, holds.get(vehicle, []), standing.knows)
@@ -103,7 +106,7 @@ class Warden:
             self._changed = True
 
     def _succeed(self, host: str, before: int) -> None:
-        """A new life of a host speaks. What the one before it was granted stays shut until that one is known to have
+        """A new life of a host speaks. What the one before it was granted stays shut until that is known to have
         ended; the new one is granted the same cells, and has to see that before it can give any back."""
         mine = [vehicle for vehicle in self._grants if agent_of(vehicle) == host]
         if (host, before) in self._shut:
@@ -116,7 +119,7 @@ class Warden:
         self._changed = True
 
     def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
-        """Drop what a vehicle has left behind; and if its host knew of its last grant, all that it does not hold."""
+        """Drop what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
         cells, stamp = self._grants[vehicle]
         if knows >= stamp:
             kept = [cell for cell in cells if cell in holds]
@@ -195,7 +198,7 @@ class Warden:
             for stand in host.standing.vehicles
             if stand.vehicle in self._vehicles and agent_of(stand.vehicle) == name
         ]
-        return sorted(stands, key=lambda stand: (-stand.age_ms, stand.vehicle))
+        return sorted(stands, key=lambda stand: (-(stand.age_ms >> _AGE_BITS), stand.vehicle))
 
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
         """The cells ahead of one that is under way, from where all that it has been granted ends."""
