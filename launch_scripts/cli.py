@@ -13,11 +13,12 @@ from typing import Annotated, Any
 import typer
 
 from launch_scripts.commands import query, roles
+from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Tls, spread
 from swarm.errors import SwarmError
 
 
 def _began_s() -> float:
-    """When this process began, on the monotonic clock: its imports are part of the start-up."""
+    """Start of this process on the monotonic clock, so that imports count as start-up time."""
     try:
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
@@ -53,18 +54,6 @@ ScenarioArgument = Annotated[
     str,
     typer.Argument(metavar="SCENARIO", help="A .toml file, or the name of a built-in scenario such as jacksboro."),
 ]
-Seconds = Annotated[float | None, typer.Option(min=0.1, help="How long the run lasts once the swarm is up.")]
-Seed = Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")]
-Runs = Annotated[Path, typer.Option(help="Folder in which each run gets a folder of its own.")]
-Port = Annotated[
-    int | None,
-    typer.Option(min=0, max=65533, help="Router on this port, live view on the next two; 0 picks free ones."),
-]
-NoLive = Annotated[bool, typer.Option("--no-live", help="Serve no live view. The run is recorded all the same.")]
-Plain = Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live table.")]
-AsJson = Annotated[
-    bool, typer.Option("--json", help="Print the report as JSON on standard output, all else on stderr.")
-]
 
 
 def _version(wanted: bool) -> None:
@@ -83,30 +72,22 @@ def _root(
 
 
 @app.command()
-def demo(
-    seconds: Seconds = None,
-    seed: Seed = None,
-    runs: Runs = Path("runs"),
-    port: Port = None,
-    no_live: NoLive = False,
-    plain: Plain = False,
-    as_json: AsJson = False,
-) -> None:
+@spread
+def demo(run: RunOptions) -> None:
     """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 18 processes.
 
-    The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/TIME/ with run.rrd,
+    The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
     report.json, report.png and a log file per process.
     """
-    _up("jacksboro", seconds, seed, runs, port, no_live, plain, as_json)
+    _up("jacksboro", run)
 
 
 @app.command()
+@spread
 def up(
     scenario: ScenarioArgument,
-    seconds: Seconds = None,
-    seed: Seed = None,
-    runs: Runs = Path("runs"),
-    port: Port = None,
+    run: RunOptions,
+    tls: Tls,
     connect: Annotated[
         str | None,
         typer.Option(help="Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here."),
@@ -115,17 +96,9 @@ def up(
         list[str] | None, typer.Option(help="Start only this role; may be given several times.")
     ] = None,
     run_id: Annotated[
-        str | None, typer.Option(help="Take part in this run; otherwise it is made or learnt.")
+        str | None, typer.Option(help="Take part in this run; by default a new one, or the one in the namespace.")
     ] = None,
-    namespace: Annotated[
-        str | None, typer.Option(help="Prefix of all keys: runs in different ones do not meet.")
-    ] = None,
-    tls_ca: roles.TlsCa = None,
-    tls_cert: roles.TlsCert = None,
-    tls_key: roles.TlsKey = None,
-    no_live: NoLive = False,
-    plain: Plain = False,
-    as_json: AsJson = False,
+    namespace: Namespace = None,
 ) -> None:
     """Run a scenario: all of its processes on this machine, or some of them.
 
@@ -135,37 +108,16 @@ def up(
 
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
-    tls = (tls_ca, tls_cert, tls_key)
-    _up(
-        scenario,
-        seconds,
-        seed,
-        runs,
-        port,
-        no_live,
-        plain,
-        as_json,
-        connect=connect,
-        namespace=namespace,
-        tls=tls,
-        only=only,
-        run_id=run_id,
-    )
+    _up(scenario, run, tls, connect=connect, namespace=namespace, only=only, run_id=run_id)
 
 
 def _up(
     name: str,
-    seconds: float | None,
-    seed: int | None,
-    runs: Path,
-    port: int | None,
-    no_live: bool,
-    plain: bool,
-    as_json: bool,
+    run: RunOptions,
+    tls: Tls | None = None,
     *,
     connect: str | None = None,
     namespace: str | None = None,
-    tls: tuple[str | None, str | None, str | None] = (None, None, None),
     only: list[str] | None = None,
     run_id: str | None = None,
 ) -> None:
@@ -177,15 +129,15 @@ def _up(
     from swarm.errors import ConfigError
 
     scenario = options.with_network(
-        options.find_scenario(name), connect=connect, namespace=namespace, tls=options.tls_of(*tls)
+        options.find_scenario(name), connect=connect, namespace=namespace, tls=None if tls is None else tls.config()
     )
-    if port is not None:
-        scenario = options.with_port(scenario, port)
-    monitor = msgspec.structs.replace(scenario.monitor, live=scenario.monitor.live and not no_live)
+    if run.port is not None:
+        scenario = options.with_port(scenario, run.port)
+    monitor = msgspec.structs.replace(scenario.monitor, live=scenario.monitor.live and not run.no_live)
     scenario = msgspec.structs.replace(
         scenario,
-        seconds=scenario.seconds if seconds is None else seconds,
-        seed=scenario.seed if seed is None else seed,
+        seconds=scenario.seconds if run.seconds is None else run.seconds,
+        seed=scenario.seed if run.seed is None else run.seed,
         monitor=monitor,
     )
     for role in only or ():
@@ -194,29 +146,26 @@ def _up(
     roles = tuple(role for role in ROLES if not only or role in only)
     if connect is not None:
         roles = tuple(role for role in roles if role != "router")
-    raise typer.Exit(
-        run_swarm(
-            UpOptions(
-                scenario,
-                runs,
-                roles=roles,
-                joins="router" not in roles,
-                run_id=run_id,
-                as_json=as_json,
-                plain=plain,
-                began_s=_began_s(),
-            )
-        )
+    chosen = UpOptions(
+        scenario,
+        run.runs,
+        roles=roles,
+        joins="router" not in roles,
+        run_id=run_id,
+        as_json=run.as_json,
+        plain=run.plain,
+        began_s=_began_s(),
     )
+    raise typer.Exit(run_swarm(chosen))
 
 
 @app.command()
 def simulate(
     scenario: ScenarioArgument,
-    seed: Seed = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Simulated seconds.")] = None,
     trace: Annotated[
-        Path | None, typer.Option(help="Write the event log here; a seed always writes the same.")
+        Path | None, typer.Option(help="Write the event log here; the same seed writes the same log.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -232,7 +181,7 @@ app.add_typer(query.app)
 
 
 def _mount(name: str, module: str, help: str) -> None:
-    """A sub-command whose own typer app is imported when it is called."""
+    """Adds a sub-command whose own typer app is imported when it is called."""
 
     def forward(ctx: typer.Context) -> None:
         sub_app: Any = importlib.import_module(module).app
@@ -259,7 +208,7 @@ _mount(
 
 
 def main() -> int:
-    """Entry point: an error of the user's is one sentence and an exit code, never a traceback."""
+    """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
     try:
         app(prog_name="swarm")
     except SwarmError as error:

@@ -1,4 +1,4 @@
-"""The one table of processes: which roles a scenario is made of, in the order in which they start and stop."""
+"""The table of processes: the roles of a scenario, in the order in which they start and stop."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from swarm.config.scenario import Scenario, plan_agents
 Restart = Literal["always", "never"]
 
 ROLES = ("router", "keeper", "monitor", "planner", "targets", "agent")
-"""In the order of their start: each finds at once what it needs, and the slowest to import begins early."""
+"""In order of start: each role finds what it needs, and the slowest to import starts early."""
 
 STOP_ORDER = ("agent", "targets", "planner", "monitor", "keeper", "router")
-"""Each role outlives those that still talk to it."""
+"""Each role stops after those which still talk to it."""
 
 ENTRIES = {
     "router": "launch_scripts.launcher.router:run",
@@ -23,7 +23,7 @@ ENTRIES = {
     "targets": "launch_scripts.world.main:run",
     "agent": "vehicle_agent.main:run",
 }
-"""Where each role's `run(setup, stop_when)` is found."""
+"""`module:function` of each role's `run(setup, stop_when)`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class ProcessSpec:
 
 
 def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES) -> list[ProcessSpec]:
-    """The processes of a scenario, restricted to `roles`, in the order of their start."""
+    """Processes of a scenario, restricted to `roles`, in order of start."""
     ids: dict[str, list[str]] = {
         "router": ["0"],
         "keeper": ["0"],

@@ -44,9 +44,19 @@ class Follower:
     stamp_ns: int = -1
 
 
+CAPACITY = 4096
+"""Followers at most: whoever can ask may name vehicles that do not exist."""
+MOST_PUSHES = 256
+"""Routes pushed in one tick at most, so that a tick stays short however many followers a change concerns."""
+
+
 class Followers:
-    """Registered by a request that names them, or by a report that they chase this target; dropped when they
-    report another target or have been silent for the lease."""
+    """The followers of one target, at most `CAPACITY`, each on a cell of the grid.
+
+    Registered by a request that names them, or by a report that they chase this target; dropped when they report
+    another target, when they have been silent for the lease, and, beyond the capacity, in the order in which they
+    were registered. A vehicle that reports registers itself again with its next report.
+    """
 
     def __init__(self, target: str, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
         self._target = target
@@ -84,16 +94,16 @@ class Followers:
                     del self._by_id[id]
                 continue
             if follower is None:
-                follower = self._by_id[id] = Follower(cell, self._max_cells, now_ns)
+                follower = self._register(id, Follower(cell, self._max_cells, now_ns))
             follower.cell, follower.heard_ns, follower.stamp_ns = cell, now_ns, fleet.stamp_ns
 
     def given(self, vehicle: str, route: Route, max_cells: int, now_ns: int, push_ns: int) -> None:
-        """A vehicle asked, and this is the answer."""
-        if route.status is RouteStatus.OUTSIDE:
+        """A vehicle asked, and this is the answer. One outside the grid is no follower, whatever the status."""
+        if not 0 <= route.start < self._grid.cells:
             return
         follower = self._by_id.get(vehicle)
         if follower is None:
-            follower = self._by_id[vehicle] = Follower(route.start, max_cells, now_ns)
+            follower = self._register(vehicle, Follower(route.start, max_cells, now_ns))
         follower.cell, follower.max_cells, follower.heard_ns = route.start, max_cells, now_ns
         self.sent(follower, route, push_ns)
 
@@ -104,6 +114,12 @@ class Followers:
         if len(rows):
             row0, col0, row1, col1 = int(rows.min()), int(cols.min()), int(rows.max()), int(cols.max())
             follower.bounds = Window(row0 - 1, col0 - 1, row1 + 2, col1 + 2)
+
+    def _register(self, vehicle: str, follower: Follower) -> Follower:
+        if len(self._by_id) >= CAPACITY:
+            del self._by_id[next(iter(self._by_id))]
+        self._by_id[vehicle] = follower
+        return follower
 
     def drop_silent(self, now_ns: int) -> None:
         late = [id for id, follower in self._by_id.items() if now_ns - follower.heard_ns > self._lease_ns]
@@ -119,8 +135,11 @@ class Followers:
                 follower.stale = inside or any(_crosses(follower, each) for each in changed)
 
     def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
-        """Those with a stale route who may be pushed another one."""
-        return [(id, each) for id, each in self._by_id.items() if each.stale and now_ns >= each.push_ns]
+        """Those with a stale route who may be pushed another one; of too many, those who have waited longest."""
+        due = [(id, each) for id, each in self._by_id.items() if each.stale and now_ns >= each.push_ns]
+        if len(due) > MOST_PUSHES:
+            due = sorted(due, key=lambda item: item[1].push_ns)[:MOST_PUSHES]
+        return due
 
     def is_news(self, follower: Follower, route: Route) -> bool:
         """Whether a route says anything that the follower does not know: other steps, or that there is no way."""

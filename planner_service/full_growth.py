@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.layout import NONE
-from planner_service.tree.corridors import Skeleton, find_skeleton
-from planner_service.tree.cost_grid import Ground
+from planner_service.tree.corridors import CorridorGraph, find_corridors
+from planner_service.tree.cost_grid import CostGrid
 from shared_map.arrays import Floats
 
 
@@ -22,34 +22,34 @@ class GrownTree:
     map_version  of the snapshot
     cost         float32, s, cost-to-go of each cell
     parent       uint8, direction of the next cell
-    weight       float32, s, the cell costs of the snapshot
+    cell_cost    float32, s, the cell costs of the snapshot
     reach        s; no cost exceeds it. Negative where nothing was grown, as no tree can lead there
     offered      parents of the tree that was served when the snapshot was taken; None where none led there
-    skeleton     the corridors of the snapshot; None unless they were wanted
+    corridors     the corridors of the snapshot; None unless they were wanted
     """
 
     target_cell: int
     map_version: int
     cost: Floats
     parent: NDArray[np.uint8]
-    weight: Floats
+    cell_cost: Floats
     reach: float
     offered: NDArray[np.uint8] | None
-    skeleton: Skeleton | None = None
+    corridors: CorridorGraph | None = None
 
 
-def can_be_root(ground: Ground, cell: int) -> bool:
+def can_be_root(cost_grid: CostGrid, cell: int) -> bool:
     """Whether a tree can lead to a cell: it is one of the grid, and not lethal."""
-    return ground.grid.inside(*divmod(cell, ground.grid.cols)) and ground.passable(cell)
+    return cost_grid.grid.inside(*divmod(cell, cost_grid.grid.cols)) and cost_grid.passable(cell)
 
 
 def growth_job(
-    empty: Callable[[], Ground],
+    empty: Callable[[], CostGrid],
     pace_snapshot: Floats,
     target_cell: int,
     map_version: int,
     offered: NDArray[np.uint8] | None,
-    wants_skeleton: bool,
+    wants_corridors: bool,
 ) -> Callable[[], GrownTree]:
     """A pure full growth that releases the interpreter lock. Nobody may write to `pace_snapshot` before it ends.
 
@@ -57,30 +57,30 @@ def growth_job(
     """
 
     def job() -> GrownTree:
-        ground = empty()
-        ground.load(pace_snapshot)
-        cost = np.full(ground.size, np.inf, np.float32)
-        parent = np.full(ground.size, NONE, np.uint8)
+        cost_grid = empty()
+        cost_grid.load(pace_snapshot)
+        cost = np.full(cost_grid.size, np.inf, np.float32)
+        parent = np.full(cost_grid.size, NONE, np.uint8)
         reach = -1.0
-        skeleton = None
-        if can_be_root(ground, target_cell):
-            reach = ground.grow(ground.pad(target_cell), cost, parent)
-            skeleton = find_skeleton(ground) if wants_skeleton else None
-        return GrownTree(target_cell, map_version, cost, parent, ground.weight, reach, offered, skeleton)
+        corridors = None
+        if can_be_root(cost_grid, target_cell):
+            reach = cost_grid.grow(cost_grid.pad(target_cell), cost, parent)
+            corridors = find_corridors(cost_grid) if wants_corridors else None
+        return GrownTree(target_cell, map_version, cost, parent, cost_grid.cell_cost, reach, offered, corridors)
 
     return job
 
 
-def offered_gaps(ground: Ground, grown: GrownTree, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+def offered_gaps(cost_grid: CostGrid, grown: GrownTree, cells: NDArray[np.int64]) -> NDArray[np.float64]:
     """Driven cost over optimum of what the earlier tree offered cells of the grid, on the snapshot of `grown`.
 
     Cells without a way in either tree are left out.
     """
     offered = grown.offered
     assert offered is not None
-    starts = ground.pad_all(cells)
+    starts = cost_grid.pad_all(cells)
     starts = starts[(grown.cost[starts] < np.inf) & (offered[starts] != NONE)]
-    walks = ground.walk(offered, ground.pad(grown.target_cell), starts, 0, grown.weight)
+    walks = cost_grid.walk(offered, cost_grid.pad(grown.target_cell), starts, 0, grown.cell_cost)
     whole = walks.ends >= 0
     optimum = grown.cost[starts[whole]].astype(np.float64)
     gaps: NDArray[np.float64] = np.maximum(walks.driven[whole] / optimum, 1.0)

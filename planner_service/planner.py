@@ -31,6 +31,8 @@ from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
 STATUS_NS = NS_PER_S // 2
+MAX_GAP = 1.5
+"""A served route whose certified gap (cost over proven bound) exceeds this asks for a full growth."""
 MOST_ROUTES = 20_000
 MOST_STEPS = 4 << 20
 """In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
@@ -164,7 +166,7 @@ class Planner:
         )
         self._told = news
         self._wants_full = False  # all that happened until now is in what `adopt` says
-        self._grown(took_ns, usual=grown.skeleton is None)
+        self._grown(took_ns, usual=grown.corridors is None)
         if grown.map_version == news[1] and grown.target_cell == news[0]:
             self._exact_ns = now_ns
         else:
@@ -289,7 +291,7 @@ class Planner:
     def _certify(self, routes: RouteBatch, now_ns: int) -> None:
         """Note the proven gaps; one that is too wide asks for a full growth, now and then, if the strategy does."""
         widest = self._gaps.certify(routes)
-        loose = widest > self._config.max_gap and self.tree.strategy.renews_loose_bounds
+        loose = widest > MAX_GAP and self.tree.strategy.renews_loose_bounds
         if loose and now_ns >= self._full_due_ns:
             self._full_due_ns = now_ns + self._push_ns
             self._wants_full = True

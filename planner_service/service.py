@@ -9,9 +9,9 @@ from planner_service.full_growth import GrownTree
 from planner_service.planner import Action, GrowTree, Planner, Refusal
 from planner_service.target_tree import TargetTree
 from shared_map.cost_map import CostMap
-from shared_map.replication.filter import Reading, readable_for_target
+from shared_map.replication.filter import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
@@ -51,11 +51,11 @@ class PlannerService:
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
         self.counters = self._member.counters
         self._cost_map = CostMap(terrain)
-        reading = Reading(terrain.grid, readable_for_target(scenario, setup.id))
+        filter = MarkFilter(terrain.grid, readable_for_target(scenario, setup.id))
         self._untracked = setup.id in scenario.untracked
-        self._sightings = Sightings(reading)
-        self._replica = MapReplica(terrain.grid, self._cost_map, reading=reading)
-        self._feed = MapFeed(self._replica, bus, post, scenario.map, setup.role)
+        self._sightings = Sightings(filter)
+        self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role)
         self._planner = Planner(
             setup.id,
             setup.incarnation,
@@ -72,14 +72,14 @@ class PlannerService:
 
     def start(self, now_ns: int) -> None:
         self._member.join()
-        self._feed.start(now_ns)
+        self._sync.start(now_ns)
         self._bus.subscribe(SIGHTED if self._untracked else POSE, self._post, target=self._target)
         self._bus.subscribe(FLEET, self._post)
         self._bus.serve(ROUTE, self._post, target=self._target)
         self._bus.serve(COST, self._post, target=self._target)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if self._member.handle(event) or self._feed.handle(event, now_ns):
+        if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         match event:
             case Heard(message=TargetPose() as pose):
@@ -103,7 +103,7 @@ class PlannerService:
                 pass
 
     def tick(self, now_ns: int) -> None:
-        self._feed.tick(now_ns)
+        self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
         self._perform(self._planner.tick(now_ns))
         for name in ("marks_merged", "sets_foreign"):

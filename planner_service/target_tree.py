@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from planner_service.full_growth import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.strategy import AutoStage, FullGrowth, OnMove, StrategyRow, WidestWindow, row_of
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.corridors import Skeleton
+from planner_service.tree.corridors import CorridorGraph
 from planner_service.tree.cost_grid import Changes, check_pace
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.directed_cost_grid import ground_of
+from planner_service.tree.directed_cost_grid import cost_grid_of
 from planner_service.tree.route_reading import read_routes
-from planner_service.tree.windows import AHEAD, Rungs, block_half
+from planner_service.tree.windows import AHEAD, WindowSchedule, block_half
 from shared_map.arrays import Floats
 from shared_map.terrain.climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -79,11 +79,11 @@ class TargetTree:
         self._grid = grid
         self._config = config
         self._side = max(grid.rows, grid.cols)
-        self._new_ground = partial(ground_of, grid, config, climb)
+        self._new_cost_grid = partial(cost_grid_of, grid, config, climb)
         # The cell costs of the map as it was last told, and whether it was told at all.
-        self._ground = self._new_ground()
+        self._costs = self._new_cost_grid()
         self._loaded = False
-        self._tree = CostToGoTree(self._ground)
+        self._tree = CostToGoTree(self._costs)
         # The tree is of no use and must be grown: before the first, and when the map changed without a target.
         self._stale = True
         # Moves of the target since the last full growth, and where that was rooted.
@@ -92,20 +92,20 @@ class TargetTree:
         # A worker has a `full_job` that was not adopted yet: no second one is asked for.
         self._job_out = False
         # The corridors of strategies that thin far cells; None until a worker found them, and again once stale.
-        self._skeleton: Skeleton | None = None
+        self._corridors: CorridorGraph | None = None
         # What a full growth takes, ns: the model's figure until `observe_full_ns` tells a measured one.
         self._full_ns = self.measured_model_ns()
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
-        self._rungs = Rungs(grid, self._narrowest)
+        self._schedule = WindowSchedule(grid, self._narrowest)
         self._auto = AutoStage(config.cpu_budget * 1e9 / config.tick_hz)
         self._auto.observe(self._full_ns, self._widest)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
-        self._bounds = LowerBounds(self._ground)
+        self._bounds = LowerBounds(self._costs)
 
     @property
     def strategy(self) -> StrategyRow:
         """The row in force now; under `auto` it changes with `observe_full_ns`."""
-        return row_of(self._config.strategy, self._auto.stage, directed=self._ground.directed)
+        return row_of(self._config.strategy, self._auto.stage, directed=self._costs.directed)
 
     # --- keeping up ---------------------------------------------------------------------------------------------
 
@@ -145,8 +145,8 @@ class TargetTree:
         leads_there = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
-        wants_skeleton = self.strategy.thins_far_cells and self._skeleton is None
-        return growth_job(self._new_ground, pace_snapshot, target_cell, map_version, offered, wants_skeleton)
+        wants_corridors = self.strategy.thins_far_cells and self._corridors is None
+        return growth_job(self._new_cost_grid, pace_snapshot, target_cell, map_version, offered, wants_corridors)
 
     def adopt(
         self,
@@ -166,10 +166,10 @@ class TargetTree:
         changes = self._learn(pace, dirty)
         self.map_version = map_version
         if grown.offered is not None:
-            self.last_gaps = offered_gaps(self._ground, grown, self._inside(followed_cells))
+            self.last_gaps = offered_gaps(self._costs, grown, self._inside(followed_cells))
         if not self._set_target(target_cell, changes):
             return Update("none")
-        since = self._ground.difference(grown.weight, [self._grid.window] if first else dirty)
+        since = self._costs.difference(grown.cell_cost, [self._grid.window] if first else dirty)
         if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
             return self._grow_full(target_cell)
         tree = self._tree
@@ -178,9 +178,9 @@ class TargetTree:
         self._bounds.take(grown.cost.copy())
         self._bounds.learn(since)
         self._stale = False
-        if grown.skeleton is not None:
-            fresh = not since.cells.size or grown.skeleton.learn(self._ground, since)
-            self._skeleton = grown.skeleton if fresh else None
+        if grown.corridors is not None:
+            fresh = not since.cells.size or grown.corridors.learn(self._costs, since)
+            self._corridors = grown.corridors if fresh else None
         moved = target_cell != tree.root
         if moved and self.strategy.on_move is OnMove.WHOLE_TREE:
             return self._grow_full(target_cell)
@@ -245,7 +245,7 @@ class TargetTree:
         costs: Floats = np.full(asked.size, np.inf, np.float32)
         if self.ready:
             inside = (asked >= 0) & (asked < self._grid.cells)
-            starts = self._ground.pad_all(asked[inside])
+            starts = self._costs.pad_all(asked[inside])
             self._tree.tighten(starts)
             costs[inside] = np.maximum(self._tree.cost[starts] + np.float32(self._tree.offset), 0)
         return costs
@@ -269,20 +269,20 @@ class TargetTree:
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
         """Take the map's changes. None the first time: everything is new."""
         if not self._loaded:
-            self._ground.load(pace)
+            self._costs.load(pace)
             self._loaded = True
             return None
-        changes = self._ground.apply(pace, dirty)
-        if changes.cells.size and self._skeleton is not None and not self._skeleton.learn(self._ground, changes):
-            self._skeleton = None
+        changes = self._costs.apply(pace, dirty)
+        if changes.cells.size and self._corridors is not None and not self._corridors.learn(self._costs, changes):
+            self._corridors = None
         if changes.any_lower:
-            self._tree.near = None
+            self._tree.window_bound = None
         self._bounds.learn(changes)
         return changes
 
     def _set_target(self, target_cell: int, changes: Changes | None) -> bool:
         """Whether the target stands where a tree can lead. If not, the tree is stale as soon as the map changes."""
-        self.ready = can_be_root(self._ground, target_cell)
+        self.ready = can_be_root(self._costs, target_cell)
         self.target_cell = target_cell if self.ready else None
         if not self.ready and (changes is None or changes.cells.size):
             self._stale = True
@@ -299,7 +299,7 @@ class TargetTree:
     def _note_full_growth(self, root: int) -> None:
         self._moves = 0
         self._full_root = root
-        self._rungs.grown(root, self._side)
+        self._schedule.note_grown(root, self._side)
 
     def _repair(self, changes: Changes | None) -> Update | None:
         """Bring the tree up to date with the map; None if it must be grown instead."""
@@ -308,13 +308,13 @@ class TargetTree:
         if changes.cells.size == 0:
             return Update("none")
         tree = self._tree
-        if not tree.fine or not self._ground.weight[self._ground.pad(tree.root)] < np.inf:
+        if not tree.fine or not self._costs.cell_cost[self._costs.pad(tree.root)] < np.inf:
             return None
         visited = tree.repair(changes)
         if visited < 0 or not tree.fine:
             return None
-        rows = changes.cells // self._ground.stride - 1
-        cols = changes.cells % self._ground.stride - 1
+        rows = changes.cells // self._costs.stride - 1
+        cols = changes.cells % self._costs.stride - 1
         window = Window(int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1)
         return Update("repair", window, visited)
 
@@ -332,20 +332,20 @@ class TargetTree:
             grown = tree.move(target_cell, window)
             cells += window.cells
             if grown and corridors is not None:
-                self._rungs.grown(target_cell, self._side)
-                return Update("coarse", self._grid.window, cells + tree.grow_rings(window, corridors))
+                self._schedule.note_grown(target_cell, self._side)
+                return Update("coarse", self._grid.window, cells + tree.grow_corridors(window, corridors))
             if grown:
-                self._rungs.grown(target_cell, half)
+                self._schedule.note_grown(target_cell, half)
                 return Update("window", window, cells)
             half *= 2
             window = self._grid.around(target_cell, half)
         return self._grow_full(target_cell)
 
-    def _window_reach(self, target_cell: int) -> tuple[int, Skeleton | None]:
+    def _window_reach(self, target_cell: int) -> tuple[int, CorridorGraph | None]:
         """How far to every side of the target the tree is grown now, and over which corridors beyond; None for not
         at all."""
         row, old = self.strategy, self._tree.root
-        corridors = self._skeleton if row.thins_far_cells else None
+        corridors = self._corridors if row.thins_far_cells else None
         least = 2 * self._grid.distance_cells(old, target_cell)
         if row.on_move is OnMove.BLOCK_WINDOW:
             half = block_half(self._grid, old, target_cell, self._config.k_min)
@@ -353,16 +353,16 @@ class TargetTree:
                 return half, None
             return max(self._narrowest, least), corridors
         widest = self._widest
-        if corridors is not None and self._rungs.beyond(target_cell, widest):
+        if corridors is not None and self._schedule.beyond(target_cell, widest):
             return max(widest, least), corridors
-        return max(self._rungs.half(target_cell, widest), least), None
+        return max(self._schedule.half(target_cell, widest), least), None
 
     def _is_full_due(self, done: Update) -> bool:
         """Whether to ask for a full growth after what was done: the row says when, unless one is under way."""
         if done.kind == "full" or self._job_out:
             return False
         row = self.strategy
-        if row.thins_far_cells and self._skeleton is None:
+        if row.thins_far_cells and self._corridors is None:
             return True
         if row.full_growth is FullGrowth.EVERY_FEW_MOVES:
             # On a small map a full growth is due as soon as windows have cost half as much.

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.target_tree import TargetTree
-from planner_service.tree.corridors import find_skeleton
-from planner_service.tree.cost_grid import Ground
+from planner_service.tree.corridors import find_corridors
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.climb import climb_of
 from swarm.config.scenario import CostConfig, PlannerConfig, Strategy
@@ -37,14 +37,14 @@ def warm_up() -> None:
             _live(TargetTree(grid, config), pace)
     level = climb_of(grid, np.zeros_like(pace), CostConfig(directional=True))
     _live(TargetTree(grid, configs[0], level), pace)
-    ground = Ground(grid, configs[0])
+    ground = CostGrid(grid, configs[0])
     ground.load(pace)
     tree = CostToGoTree(ground)
     tree.grow(_SIDE)
     tree.relabel()
     window = grid.around(_SIDE + 1, 4)
     tree.move(_SIDE + 1, window)
-    tree.grow_rings(window, find_skeleton(ground))
+    tree.grow_corridors(window, find_corridors(ground))
     tree.tighten(np.array([ground.pad(0)]))
 
 

@@ -1,4 +1,4 @@
-"""What the arrays of a terrain are called in signatures; shapes and units are said where they are used."""
+"""Short names of array types for signatures; docstrings there give shapes and units."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""The composite cost map of one process: prior ground, marks over it, inflation around what is lethal.
+"""The composite cost map of one process: the prior ground, the marks over it, and inflation.
 
-Marks replace the ground cell by cell; then a cell is lethal where a vehicle in its middle would touch lethal
-ground.
-After any sequence of `apply`, the composite equals one made from scratch of the last statement about each cell.
+A mark replaces the ground of its cell. Then a cell is lethal where a vehicle in its middle would touch lethal
+ground. After any sequence of `apply` the composite equals one built from the last statement about each cell.
 """
 
 from __future__ import annotations
@@ -30,7 +29,11 @@ _MANY_BOXES = 8 * MAX_WINDOWS
 
 
 class CostSnapshot(NamedTuple):
-    """A copy that another thread may keep."""
+    """A copy of a `CostMap`, which another thread may keep.
+
+    pace_s_per_m  float32 (rows, cols)
+    version       of the cost map when it was copied
+    """
 
     pace_s_per_m: Floats
     version: int
@@ -57,9 +60,13 @@ class CostMap:
         self._dirty: list[Window] = []
 
     def apply(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
-        """Make these the current statements about these cells (flat indices). Of a repeated cell the last counts.
+        """Make these the current statements about these cells; of a repeated cell the last counts. PACE sets the
+        pace, even where the prior is lethal; LETHAL makes the cell lethal; CLEAR restores the prior.
 
-        PACE sets the pace, also where the prior is lethal; LETHAL forbids; CLEAR gives back the prior."""
+        cells  uint32 (n,)   flat indices in the grid; raises OutsideGridError if one is not in it
+        kinds  uint8 (n,)    MarkKind
+        paces  float32 (n,)  s/m; read where the kind is PACE
+        """
         if len(cells) <= _FEW:
             self._apply_few(cells, kinds, paces)
             return
@@ -82,8 +89,7 @@ class CostMap:
             self._note_dirty(where)
 
     def _apply_few(self, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: NDArray[np.float32]) -> None:
-        """As `apply` of the handful of cells that a set changes as a rule: an array of one cell costs as much as
-        one of a thousand, and somebody waits."""
+        """`apply` of few cells, as most sets change: an array of one cell costs as much as one of a thousand."""
         places: list[int] = cells.tolist()
         if places and not 0 <= min(places) <= max(places) < self.grid.cells:
             raise OutsideGridError(f"a mark is on cell {max(places)} of {self.grid.rows} x {self.grid.cols}")
@@ -111,7 +117,8 @@ class CostMap:
         self._dirty = merged(boxes.values(), self._dirty)
 
     def take_dirty(self) -> list[Window]:
-        """Windows that cover every cell whose pace changed since the last call; they do not touch each other."""
+        """Windows which cover every cell whose pace changed since the last call, 32 at most; none touches
+        another."""
         windows, self._dirty = self._dirty, []
         return windows
 
@@ -166,8 +173,11 @@ class CostMap:
 
 
 def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
-    """Few windows that cover all cells: the bounding box per tile, boxes that touch merged; one box around all of
-    very many."""
+    """Few windows which cover all cells: bounding boxes by tile, merged where they touch; one box if there are very
+    many.
+
+    cells  int64 (n,)  flat indices in a grid of so many columns
+    """
     if len(cells) == 0:
         return []
     rows = cells // cols  # with the next line half the time of divmod
@@ -186,9 +196,9 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
 
 
 def merged(windows: Iterable[Window], others: Iterable[Window] = ()) -> list[Window]:
-    """Windows that touch made one, until none touch; one window for all beyond MAX_WINDOWS.
+    """Merges windows which touch until none do; beyond MAX_WINDOWS all of them.
 
-    others  windows of which none touch each other: they need not be compared again
+    others  windows of which none touch each other
     """
     apart = list(others)
     for window in windows:

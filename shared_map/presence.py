@@ -1,7 +1,7 @@
-"""Presence: where everybody's vehicles are now, as a room of the shared map that is not stored.
+"""Presence: where all vehicles are now. Not stored.
 
-An author tells the vehicles of one region in one message, which replaces its earlier one; what has not been said
-again for the length of a lease is forgotten. So presence needs no merging, and a lost message no repair.
+A message lists an author's vehicles in one region, and replaces the author's last message of that region. A message
+expires with its lease. So presence needs no merging, and a lost message needs no repair.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.filter import Reading
+from shared_map.replication.filter import MarkFilter
 from swarm.grid import GridSpec
 from swarm.liveness import Leases
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 
 PARKED = frozenset({VehicleState.IDLE, VehicleState.ARRIVED, VehicleState.STRANDED})
-"""States of a vehicle that will not leave its cell by itself."""
+"""States of a vehicle which stays on its cell until it gets a new goal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vehicles:
-    """Some vehicles, in columns of one length.
+    """Vehicles, in columns of one length.
 
     ids, groups  str
     cells        int64    flat index in the grid
@@ -53,24 +53,25 @@ class Vehicles:
 
 
 class Presence:
-    """The newest word of each (author, region), for as long as its lease lasts.
+    """The newest message of each (author, region), until its lease ends.
 
-    bucket_m   side of the squares by which neighbours are looked up: about the radius that is asked for most
-    reading    whose vehicles count; None for everybody's
+    lease_ns  a message is forgotten so long after it came
+    bucket_m  side of the squares of the spatial index: about the usual radius of `near`
+    filter    whose vehicles count; None: everybody's
     """
 
-    def __init__(self, grid: GridSpec, lease_ns: int, bucket_m: float, reading: Reading | None = None) -> None:
+    def __init__(self, grid: GridSpec, lease_ns: int, bucket_m: float, filter: MarkFilter | None = None) -> None:
         self._grid = grid
         self._bucket_m = bucket_m
-        self._reading = reading
+        self._filter = filter
         self._leases = Leases(lease_ns)
         self._newest: dict[str, Fleet] = {}
         self._index: _Index | None = None
         self._parked: dict[int, str] | None = None
 
     def hear(self, fleet: Fleet, now_ns: int) -> None:
-        """Take in where an author's vehicles of one region are; late and repeated messages change nothing."""
-        if self._reading is not None and not self._reading.hears(fleet.author, fleet.group):
+        """Take in a message; late and repeated ones change nothing."""
+        if self._filter is not None and not self._filter.accepts_author(fleet.author, fleet.group):
             return
         key = f"{fleet.author}/{fleet.region}"
         known = self._newest.get(key)
@@ -81,7 +82,7 @@ class Presence:
         self._forget_index()
 
     def expire(self, now_ns: int) -> None:
-        """Forget what has not been said again for the length of a lease."""
+        """Forget messages whose lease has ended."""
         late = self._leases.expired(now_ns)
         for key in late:
             del self._newest[key]
@@ -90,16 +91,17 @@ class Presence:
 
     @property
     def count(self) -> int:
-        """How many reports of vehicles are held."""
+        """Number of reports held; a vehicle which crosses a border may have two."""
         return sum(len(fleet.ids) for fleet in self._newest.values())
 
     @property
     def vehicles(self) -> Vehicles:
-        """Everybody's."""
+        """All vehicles, in no particular order."""
         return self._indexed().vehicles
 
     def near(self, east_m: float, south_m: float, radius_m: float) -> Vehicles:
-        """Those within a radius of a place, at most one metre of rounding away, the nearest first."""
+        """Vehicles within a radius of a place, the nearest first. Places are metres from the grid's west and north
+        border, rounded to float32."""
         index = self._indexed()
         found = index.candidates(east_m, south_m, radius_m)
         distance_m = np.hypot(index.vehicles.east_m[found] - east_m, index.vehicles.south_m[found] - south_m)
@@ -107,7 +109,7 @@ class Presence:
         return index.vehicles.taken(found[inside][np.argsort(distance_m[inside], kind="stable")])
 
     def parked_on(self, cell: int) -> str | None:
-        """Who stands on a cell and will not leave it by itself."""
+        """Id of the parked vehicle on a cell; None if there is none."""
         if self._parked is None:
             self._parked = self._find_parked()
         return self._parked.get(cell)
@@ -131,7 +133,8 @@ class Presence:
 
 
 def _gathered(fleets: list[Fleet]) -> Vehicles:
-    """Many messages as columns. Of a vehicle that crosses a border two regions may tell: the newer counts."""
+    """The columns of all messages. If two regions list a vehicle, which crosses a border, the newer message
+    counts."""
     ids = [id for fleet in fleets for id in fleet.ids]
     groups = [fleet.group for fleet in fleets for _ in fleet.ids]
     cells = np.frombuffer(b"".join(fleet.cells for fleet in fleets), "<u4").astype(np.int64)
@@ -150,7 +153,8 @@ def _gathered(fleets: list[Fleet]) -> Vehicles:
 
 
 class _Index:
-    """Vehicles in order of the square that they are in: those of a row of squares lie together."""
+    """A spatial index: vehicles sorted by square, row by row, so that those in neighbouring squares are
+    adjacent."""
 
     def __init__(self, vehicles: Vehicles, grid: GridSpec, bucket_m: float) -> None:
         self.vehicles = vehicles
@@ -165,7 +169,7 @@ class _Index:
         return (south_m // self._bucket_m).astype(np.int64) * self._across + cols
 
     def candidates(self, east_m: float, south_m: float, radius_m: float) -> NDArray[np.intp]:
-        """The vehicles of all squares that a circle touches."""
+        """Numbers (intp) of the vehicles in all squares that a circle touches."""
         size_m, last = self._bucket_m, self._across - 1
         west = min(max(int((east_m - radius_m) // size_m), 0), last)
         east = min(max(int((east_m + radius_m) // size_m), 0), last)

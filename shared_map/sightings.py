@@ -1,33 +1,36 @@
-"""Where targets were seen: marks that say nothing about the ground and end by themselves.
+"""Sightings: where vehicles saw targets. They expire, and change no pace.
 
-Of each author the newest word about a target counts, and of all authors' about one target the newest that has not
-ended. So merging depends on neither order, grouping nor repetition, as with other marks; they change no pace.
+Of each author's sightings of a target the newest counts, and of all authors' the newest that has not expired. So,
+as with marks, merging depends on neither order, grouping nor repetition.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from shared_map.replication.filter import Reading
+from shared_map.replication.filter import MarkFilter
 from swarm.wire.messages.targets import Sighted, TargetPose
 
 _MOST = 10_000
 
 
 class Sightings:
-    """The newest word of each (target, author), as long as it lasts."""
+    """The newest sighting of each (target, author), 10,000 at most.
 
-    def __init__(self, reading: Reading) -> None:
-        self._reading = reading
+    filter  which authors count
+    """
+
+    def __init__(self, filter: MarkFilter) -> None:
+        self._filter = filter
         self._newest: dict[tuple[str, str], Sighted] = {}
 
     def hear(self, sighted: Sighted) -> bool:
-        """Take in what was seen, also what has ended by now. False of what is not read, no news, or too much."""
+        """Take in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit."""
         key = (sighted.target, sighted.author)
         known = self._newest.get(key)
         if known is not None and (sighted.stamp_ns, sighted.seq) <= (known.stamp_ns, known.seq):
             return False
-        if not self._reading.hears(sighted.author, sighted.group):
+        if not self._filter.accepts_author(sighted.author, sighted.group):
             return False
         if known is None and len(self._newest) >= _MOST:
             return False
@@ -35,11 +38,11 @@ class Sightings:
         return True
 
     def expire(self, now_ns: int) -> None:
-        """Forget what has ended by itself."""
+        """Forget expired sightings."""
         self._newest = {key: each for key, each in self._newest.items() if each.until_ns > now_ns}
 
     def best(self, now_ns: int) -> Mapping[str, Sighted]:
-        """Target -> the newest sighting of it; of two at one time the surer, then that of the larger author."""
+        """Target -> its newest sighting; of two with one stamp the surer, then that of the larger author id."""
         best: dict[str, Sighted] = {}
         for (target, _), each in self._newest.items():
             if each.until_ns > now_ns and (target not in best or _rank(each) > _rank(best[target])):
@@ -52,7 +55,7 @@ def _rank(sighted: Sighted) -> tuple[int, float, str]:
 
 
 def pose_of(sighted: Sighted) -> TargetPose:
-    """A sighting in the place of a tracker's word: the later it was made, the higher its number."""
+    """A sighting in the form of a tracker's message, numbered by its stamp."""
     return TargetPose(
         target=sighted.target,
         incarnation=0,

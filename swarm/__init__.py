@@ -1,1 +1,1 @@
-"""What everybody agrees on: grid, words, wire, clock and loop. Imports none of the other packages."""
+"""What all processes agree on: grid, wire, bus, settings, clock and loop. Imports none of the other packages."""

@@ -1,4 +1,4 @@
-"""Time as an argument: whoever needs the time is handed a clock."""
+"""Time as an argument: code that needs the time is given a clock, so that a simulation can decide it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ NS_PER_S = 1_000_000_000
 
 
 class Clock(Protocol):
+    """What tells the time."""
+
     def now_ns(self) -> int:
         """Nanoseconds since 1970, never running backwards."""
         ...
 
 
 class MonotonicClock:
-    """The machine's time at the start, carried on by its monotonic counter.
+    """The machine's time at the start of the process, continued by its monotonic counter.
 
-    Comparable across machines as well as their clocks are set, and safe to subtract within one process.
+    Two readings in one process may be subtracted. Readings of two machines differ as their clocks did at the start.
     """
 
     def __init__(self) -> None:
@@ -28,7 +30,7 @@ class MonotonicClock:
 
 
 class ManualClock:
-    """A clock that stands still until it is told to move: for tests and the simulation."""
+    """A clock that only `advance_to` moves: for tests and simulations."""
 
     def __init__(self, now_ns: int = 0) -> None:
         self._now_ns = now_ns
@@ -37,6 +39,7 @@ class ManualClock:
         return self._now_ns
 
     def advance_to(self, now_ns: int) -> None:
+        """Set the time. Raises ValueError on a time before the present one."""
         if now_ns < self._now_ns:
             raise ValueError(f"time does not run backwards: {now_ns} < {self._now_ns}")
         self._now_ns = now_ns

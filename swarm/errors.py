@@ -1,10 +1,12 @@
-"""The errors a person may see. Each carries one clear sentence and an exit code; none shows a traceback."""
+"""The errors that a user may see: each has one clear sentence and an exit code, and is shown without a
+traceback."""
 
 from __future__ import annotations
 
 
 class SwarmError(Exception):
-    """Something the user, a file or the network did that a sentence can explain."""
+    """A fault of the input, a file or the network, explained in one sentence. A fault of ours is any other
+    exception."""
 
     exit_code = 1
 
@@ -16,19 +18,19 @@ class ConfigError(SwarmError):
 
 
 class TerrainError(SwarmError):
-    """A terrain or photo that cannot be read, or that no vehicle could stand on."""
+    """A terrain or photo that cannot be read, or on which every cell is lethal."""
 
     exit_code = 3
 
 
 class BusError(SwarmError):
-    """The network cannot be opened or reached: port taken, nobody listening, certificate refused."""
+    """The network cannot be opened or reached: port taken, no router, certificate rejected."""
 
     exit_code = 4
 
 
 class RunMismatchError(SwarmError):
-    """Two processes in one namespace that do not belong to the same run, or see different terrain."""
+    """Two processes in one namespace belong to different runs, or have different terrain or cost rules."""
 
     exit_code = 5
 
@@ -40,8 +42,9 @@ class StoreError(SwarmError):
 
 
 class ProtocolError(SwarmError):
-    """A payload from the network that does not parse. Counted and dropped at the door, never raised past it."""
+    """A payload that is no message, or a message that breaks its rules. The bus counts and drops it; no service
+    sees it."""
 
 
 class OutsideGridError(ValueError):
-    """A cell outside the grid reached code that was promised a cell inside it: a bug of ours."""
+    """A cell outside the grid where one inside it is required: a bug, not a fault of the input."""

@@ -1,4 +1,4 @@
-"""The grid that everybody shares: cells, metres, tiles, regions and windows.
+"""The grid of a run: cells, metres, tiles, regions and windows.
 
 Row 0 is north. A cell is the flat index `row * cols + col`. Metres are in the terrain's own projected frame:
 x grows to the east, y to the north; `west_m` and `north_m` are the outer corner of cell (0, 0).
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from swarm.errors import OutsideGridError
 
 TILE_CELLS = 32
-"""Side of a tile in cells: what an author knows about one tile travels as one value."""
+"""Side of a tile, in cells. The marks of one author on one tile travel as one message."""
 REGION_TILES = 8
-"""Side of a region in tiles: the unit of interest on the wire."""
+"""Side of a region, in tiles. Processes subscribe to positions and marks by region."""
 
 STEP_ROW = (-1, -1, 0, 1, 1, 1, 0, -1)
 STEP_COL = (0, 1, 1, 1, 0, -1, -1, -1)
@@ -23,7 +23,7 @@ STEP_COL = (0, 1, 1, 1, 0, -1, -1, -1)
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """A rectangle of cells: rows row0 <= row < row1 and columns col0 <= col < col1."""
+    """A rectangle of cells: rows row0 <= row < row1 and columns col0 <= col < col1. It may lie outside a grid."""
 
     row0: int
     col0: int
@@ -36,6 +36,7 @@ class Window:
 
     @property
     def cells(self) -> int:
+        """How many cells it holds."""
         return 0 if self.empty else (self.row1 - self.row0) * (self.col1 - self.col0)
 
     def union(self, other: Window) -> Window:
@@ -55,7 +56,7 @@ class Window:
         return self.row0 <= row < self.row1 and self.col0 <= col < self.col1
 
     def touches(self, other: Window) -> bool:
-        """Whether the two overlap or share a border, so that merging them wastes little."""
+        """Whether the two overlap or share a border or corner."""
         return (
             self.row0 <= other.row1
             and other.row0 <= self.row1
@@ -66,7 +67,15 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class GridSpec:
-    """Shape and place of the terrain: `rows` x `cols` cells of `resolution_m` metres."""
+    """Shape and place of the terrain.
+
+    rows, cols       cells from north to south and from west to east, 1 or more
+    resolution_m     side of a cell, above 0
+    west_m, north_m  outer corner of cell (0, 0) in the frame of `crs`
+    crs              coordinate system, such as "EPSG:32632"; "local" is metres from anywhere
+
+    Raises ValueError on a shape or resolution that no grid has.
+    """
 
     rows: int
     cols: int
@@ -83,6 +92,7 @@ class GridSpec:
 
     @property
     def cells(self) -> int:
+        """How many cells there are; valid cells are 0 to one less."""
         return self.rows * self.cols
 
     @property
@@ -130,34 +140,31 @@ class GridSpec:
         return divmod(cell, self.cols)
 
     def centre_m(self, cell: int) -> tuple[float, float]:
-        """(x_m, y_m) of the middle of a cell."""
+        """(x_m, y_m) of the middle of a cell. Raises OutsideGridError outside the grid."""
         row, col = self.row_col(cell)
         return (
             self.west_m + (col + 0.5) * self.resolution_m,
             self.north_m - (row + 0.5) * self.resolution_m,
         )
 
-    def cell_at_m(self, x_m: float, y_m: float) -> int:
-        """The cell that holds a point. Raises OutsideGridError outside the grid."""
-        row = int((self.north_m - y_m) // self.resolution_m)
-        col = int((x_m - self.west_m) // self.resolution_m)
-        return self.cell(row, col)
-
     def tile_of(self, cell: int) -> int:
+        """The tile that holds a cell. Raises OutsideGridError outside the grid."""
         row, col = self.row_col(cell)
         return (row // TILE_CELLS) * self.tile_cols + col // TILE_CELLS
 
     def region_of_tile(self, tile: int) -> int:
+        """The region that holds a tile. Raises OutsideGridError on a tile that there is not."""
         if not 0 <= tile < self.tiles:
             raise OutsideGridError(f"tile {tile} is not in 0..{self.tiles - 1}")
         tile_row, tile_col = divmod(tile, self.tile_cols)
         return (tile_row // REGION_TILES) * self.region_cols + tile_col // REGION_TILES
 
     def region_of(self, cell: int) -> int:
+        """The region that holds a cell. Raises OutsideGridError outside the grid."""
         return self.region_of_tile(self.tile_of(cell))
 
     def tile_window(self, tile: int) -> Window:
-        """The cells of a tile; tiles at the east and south border may be cut off."""
+        """The cells of a tile; at the east and south border it may be smaller. Raises OutsideGridError."""
         if not 0 <= tile < self.tiles:
             raise OutsideGridError(f"tile {tile} is not in 0..{self.tiles - 1}")
         tile_row, tile_col = divmod(tile, self.tile_cols)
@@ -165,7 +172,7 @@ class GridSpec:
         return Window(row0, col0, min(row0 + TILE_CELLS, self.rows), min(col0 + TILE_CELLS, self.cols))
 
     def around(self, cell: int, half: int) -> Window:
-        """The window of `half` cells to every side of a cell, cut at the border."""
+        """The window of `half` cells to each side of a cell, clipped to the grid. Raises OutsideGridError."""
         row, col = self.row_col(cell)
         return Window(
             max(row - half, 0),
@@ -183,7 +190,7 @@ class GridSpec:
                 yield direction, r * self.cols + c
 
     def distance_cells(self, a: int, b: int) -> int:
-        """Chebyshev distance: king's moves between two cells."""
+        """Chebyshev distance: the fewest steps between two cells where all are passable."""
         row_a, col_a = self.row_col(a)
         row_b, col_b = self.row_col(b)
         return max(abs(row_a - row_b), abs(col_a - col_b))

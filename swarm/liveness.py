@@ -1,4 +1,4 @@
-"""Who is alive, whose lease ran out. Pure: time is an argument."""
+"""Which processes are alive and which leases have run out. Pure: time is an argument."""
 
 from __future__ import annotations
 
@@ -15,18 +15,25 @@ class Peer:
 
 
 class Roster:
-    """The peers whose tokens are up. The order of tokens coming and going does not matter."""
+    """The peers whose liveliness tokens are up.
+
+    A token of a new incarnation may appear before that of the old one falls, so all incarnations of a process are
+    kept, and the order in which tokens come and go does not matter. Repeated and unknown ones change nothing.
+    """
 
     def __init__(self) -> None:
         self._alive: dict[tuple[str, str], list[int]] = {}
+        """(role, id) -> incarnations whose token is up, rising; without processes that have none."""
 
     def appeared(self, peer: Peer) -> None:
+        """A token is up."""
         incarnations = self._alive.setdefault((peer.role, peer.id), [])
         if peer.incarnation not in incarnations:
             incarnations.append(peer.incarnation)
             incarnations.sort()
 
     def gone(self, peer: Peer) -> None:
+        """A token has fallen."""
         incarnations = self._alive.get((peer.role, peer.id), [])
         if peer.incarnation in incarnations:
             incarnations.remove(peer.incarnation)
@@ -38,25 +45,24 @@ class Roster:
         return {id: incarnations[-1] for (r, id), incarnations in sorted(self._alive.items()) if r == role}
 
     def is_alive(self, role: str, id: str) -> bool:
+        """Whether any incarnation of the process is alive."""
         return (role, id) in self._alive
 
 
 class Leases:
-    """When each key was last heard of; `expired` names and forgets those silent for longer than the lease."""
+    """When each key was last heard of. `expired` forgets keys that have been silent for longer than the lease."""
 
     def __init__(self, lease_ns: int) -> None:
         self._lease_ns = lease_ns
-        self._seen_ns: dict[str, int] = {}
+        self._heard_ns: dict[str, int] = {}
 
     def heard(self, key: str, now_ns: int) -> None:
-        self._seen_ns[key] = now_ns
-
-    def holds(self, key: str, now_ns: int) -> bool:
-        seen_ns = self._seen_ns.get(key)
-        return seen_ns is not None and now_ns - seen_ns <= self._lease_ns
+        """Renew the lease of a key."""
+        self._heard_ns[key] = now_ns
 
     def expired(self, now_ns: int) -> list[str]:
-        late = [key for key, seen_ns in self._seen_ns.items() if now_ns - seen_ns > self._lease_ns]
+        """The keys whose lease has run out since the last call, in the order in which they were first heard."""
+        late = [key for key, heard_ns in self._heard_ns.items() if now_ns - heard_ns > self._lease_ns]
         for key in late:
-            del self._seen_ns[key]
+            del self._heard_ns[key]
         return late

@@ -1,4 +1,4 @@
-"""Many vehicles behind one session: who drives where, who asks whom. Events in, actions out."""
+"""The core of an agent: drives its vehicles, and decides what to ask of planners."""
 
 from __future__ import annotations
 
@@ -18,39 +18,19 @@ from swarm.config.scenario import AgentPlan, Scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Claims, VehicleState
 from swarm.wire.routes import Route, RouteStatus
-from vehicle_agent.assignment import choose
+from vehicle_agent.assignment import AskCosts, Assignment
 from vehicle_agent.driving.route_follower import route_cells
-from vehicle_agent.driving.vehicle import (
-    AskRoute,
-    Assigned,
-    Follow,
-    NoAnswer,
-    NoWay,
-    PlannerBack,
-    PlannerGone,
-    RouteCut,
-    RouteGiven,
-    RouteRefused,
-    TargetJumped,
-    TargetLeft,
-    TargetReached,
-    Vehicle,
-    VehicleAction,
-)
-from vehicle_agent.placement import nearest_free
+from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.deadlock import Traffic
-from vehicle_agent.traffic.resumption import Resumption
+from vehicle_agent.traffic.resumption import Placement, Unplaced
 from vehicle_agent.traffic.right_of_way import RightOfWay
-from vehicle_agent.traffic.territory import SharedGround
+from vehicle_agent.traffic.territory import Territory
 
 _LONGEST_STEP_S = 0.5
-_RETRY_NS = NS_PER_S // 2
-_STRANDED_RETRY_NS = 3 * NS_PER_S
 _STALE_CELLS = 8
-"""A route that ends so far from where the target was last seen is of an older tree: ask again."""
+"""A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,26 +45,18 @@ class AskRoutes:
     reroutes: int
 
 
-@dataclass(frozen=True, slots=True)
-class AskCosts:
-    """One request to every planner: the cost-to-go of these cells."""
-
-    request: int
-    vehicles: tuple[str, ...]
-    cells: tuple[int, ...]
-
-
-AgentAction = AskRoutes | AskCosts | Follow
+AgentAction = AskRoutes | AskCosts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalMap:
-    """What an agent looks at; all float32 (rows, cols) in s/m and changed in place by their owners.
+    """The map of an agent: float32 (rows, cols) in s/m, inf is lethal. Their owners change them in place.
 
-    pace    what may be driven, with marks and inflation
-    ground  the same without inflation; prior is the ground without marks
-    physics the pace at which the ground is really driven
-    climb   what a step costs for what it climbs; None if it costs the same both ways
+    pace     cost of a cell, with marks and inflation
+    ground   as pace, before inflation
+    prior    as ground, without marks
+    physics  the pace at which vehicles really drive
+    climb    factor of a step's cost by its slope; None if steps cost the same both ways
     """
 
     grid: GridSpec
@@ -96,8 +68,17 @@ class LocalMap:
 
 
 class Agent:
-    """The vehicles of one agent process. Call `placed_by` once, then in each tick `drive` until it returns None,
-    writing down what it found, and `decide`."""
+    """The vehicles of one agent process.
+
+    Call `place` once. Then in each tick call `begin_drive`, `drive` until it returns None, writing what it found
+    into the map each time, and `decide`.
+
+    plan       which vehicles, of which group
+    ground     the agent's map
+    spawns     agent -> vehicle -> cell where the vehicles of the run first start
+    presence   where all vehicles are; None to know of none but our own
+    territory  which agents share plots with us; None if all do
+    """
 
     def __init__(
         self,
@@ -108,14 +89,13 @@ class Agent:
         spawns: Mapping[str, Mapping[str, int]],
         incarnation: int,
         presence: Presence | None = None,
-        shared_ground: SharedGround | None = None,
+        territory: Territory | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
         self.targets = list(plan.group.targets) or scenario.target_ids
-        self.rights = RightOfWay(plan.id, incarnation, spawns, shared_ground)
+        self.rights = RightOfWay(plan.id, incarnation, spawns, territory)
         self.blocked_ticks = 0
-        self._spawns = spawns[plan.id]
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = ground
@@ -125,67 +105,34 @@ class Agent:
         self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance, presence)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
-        self._homeless: dict[str, int] = {}
+        self._unplaced = Unplaced(ground.grid, self.rights, self._traffic.closed)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
-        self._cost_request: AskCosts | None = None
-        self._costs: dict[str, NDArray[np.float32]] = {}
-        # Agents ask one after the other, not all at once.
-        self._reassign_ns = int(self._config.reassign_s * NS_PER_S)
-        self._assign_due_ns = 0
-        self._stagger_ns = int(chance.random() * self._reassign_ns)
+        self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
         self._driven_ns: int | None = None
         self._left_s: dict[str, float] = {}
         self._look_from: dict[int, None] = {}
 
-    # --- where everybody starts -----------------------------------------------------------------------------
+    # --- where vehicles start -------------------------------------------------------------------------------
 
-    def placed_by(self, known: Resumption) -> None:
-        """Put the vehicles where they last stood, as far as anybody knows, else where they start."""
-        for claims in known.others:
-            self.rights.heard(claims)
-        last = known.last_words
-        if last is not None:
-            self.rights.heard(last)
-        for id in self.plan.vehicle_ids:
-            cell, known_there = self._spawns[id], last is None
-            if last is not None and last.holds.get(id):
-                cell, known_there = last.holds[id][0], True
-            # Whoever spoke of itself without this vehicle had not found a place for it: others may be there.
-            if known_there and 0 <= cell < self._map.grid.cells and self.rights.holder(cell) is None:
-                self._place(id, cell)
-            else:
-                self._homeless[id] = min(cell, self._map.grid.cells - 1)
-
-    def _place(self, id: str, cell: int) -> None:
-        if not self.rights.holds(id):
+    def place(self, placement: Placement) -> None:
+        """Put the vehicles where they stand, and take in the reservations of all agents."""
+        for reservations in placement.reservations:
+            self.rights.hear(reservations)
+        for id, cell in placement.cells.items():
             self.rights.place(id, cell)
+            self._enter(id, cell)
+        self._unplaced.add(placement.unplaced)
+
+    def _enter(self, id: str, cell: int) -> None:
         self.vehicles[id] = Vehicle(id, self._map.grid, cell)
         self._look_from[cell] = None
 
-    def _house(self) -> None:
-        """Those whose last place somebody else may stand on take the nearest cell that they are granted."""
-        for id, wish in list(self._homeless.items()):
-            held = self.rights.holds(id)
-            if held:
-                del self._homeless[id]
-                self._place(id, held[0])
-                continue
-            wanted = self.rights.wants(id)
-            if wanted and self.rights.holder(wanted[0]) is None:
-                continue
-            free = nearest_free(self._map.grid, wish, self._is_free)
-            if free is not None:
-                self.rights.ask(id, [free])
-
-    def _is_free(self, cell: int) -> bool:
-        return not self._traffic.closed(cell) and self.rights.holder(cell) is None
-
     @property
     def places(self) -> list[int]:
-        """The cells on which we claim something or mean to: our ground has to cover them."""
-        claimed = [cell for id in self.vehicles for cell in (*self.rights.holds(id), *self.rights.wants(id))]
-        return [*claimed, *self._homeless.values()]
+        """The cells that our vehicles hold, request, or will request: the territory has to cover them."""
+        reserved = [cell for id in self.vehicles for cell in (*self.rights.held(id), *self.rights.requested(id))]
+        return [*reserved, *self._unplaced.cells]
 
     # --- driving --------------------------------------------------------------------------------------------
 
@@ -197,8 +144,8 @@ class Agent:
         self._left_s = dict.fromkeys(self.vehicles, seconds)
 
     def drive(self, now_ns: int) -> Findings | None:
-        """Let vehicles drive until they come to another cell; returns what they find there, to be written down
-        before they drive on. None when the time is over."""
+        """Let vehicles drive until they come to another cell; returns what they find there, to be written into
+        the map before they drive on. None when their time is over."""
         for id in list(self._left_s):
             vehicle = self.vehicles[id]
             left_s = self._drive(vehicle, self._left_s[id], now_ns)
@@ -213,13 +160,13 @@ class Agent:
         return compare(sight, self._map.ground, self._map.prior)
 
     def _drive(self, vehicle: Vehicle, left_s: float, now_ns: int) -> float:
-        """One vehicle up to its next cell. Returns the seconds it has left then."""
+        """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
         motion = vehicle.motion
         physics = self._map.physics.reshape(-1)
         while left_s > 0.0:
             if motion.at_rest:
                 cell = self._traffic.next_cell(vehicle, now_ns)
-                if cell is None or self.rights.holds(vehicle.id)[1:2] != [cell] or self._traffic.closed(cell):
+                if cell is None or self.rights.held(vehicle.id)[1:2] != [cell] or self._traffic.closed(cell):
                     return 0.0
                 motion.set_out(cell)
             before = vehicle.cell
@@ -236,31 +183,32 @@ class Agent:
         return 0.0
 
     def map_changed(self, now_ns: int, *, look: bool = False) -> None:
-        """The map is another: end routes before what is closed now.
+        """End routes before cells that are lethal now.
 
-        look  somebody else changed it, so what is in sight may need another look
+        look  another agent changed the map: compare what is in sight with it again
         """
         pace = self._map.pace.reshape(-1)
         for vehicle in self.vehicles.values():
             ahead = vehicle.route.ahead()
             if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._traffic.closed):
-                vehicle.handle(RouteCut(), now_ns)
+                vehicle.cut_route(now_ns)
             if look:
                 self._look_from[vehicle.cell] = None
 
     # --- deciding -------------------------------------------------------------------------------------------
 
     def decide(self, now_ns: int) -> list[AgentAction]:
-        """What each vehicle does next: whom to ask, which cells to claim."""
-        self._house()
+        """Reserve what each vehicle needs next; returns the requests to planners."""
+        for id, cell in self._unplaced.settle():
+            self._enter(id, cell)
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0
         for vehicle in self.vehicles.values():
-            self._check_reach(vehicle, now_ns)
-            for action in vehicle.tick(now_ns):
-                if isinstance(action, AskRoute):
-                    asks.setdefault((action.target, action.force), []).append(action)
+            self._check_reach(vehicle)
+            ask = vehicle.route_request(now_ns)
+            if ask is not None:
+                asks.setdefault((ask.target, ask.force), []).append(ask)
             in_reach = partial(self._in_reach, vehicle.target)
             self.blocked_ticks += self._traffic.steer(vehicle, in_reach, now_ns)
         for (target_id, force), batch in asks.items():
@@ -275,18 +223,10 @@ class Agent:
             )
             self._route_requests[request.request] = request
             actions.append(request)
-        if now_ns >= self._assign_due_ns and self._cost_request is None and self.vehicles:
-            actions.append(self._ask_costs(now_ns))
+        if self.vehicles and self._assignment.due(now_ns):
+            self._requests += 1
+            actions.append(self._assignment.ask(self._requests, self.vehicles, now_ns))
         return actions
-
-    def _ask_costs(self, now_ns: int) -> AskCosts:
-        self._requests += 1
-        self._costs = {}
-        cells = tuple(vehicle.cell for vehicle in self.vehicles.values())
-        self._cost_request = AskCosts(self._requests, tuple(self.vehicles), cells)
-        first = self._assign_due_ns == 0
-        self._assign_due_ns = now_ns + (self._stagger_ns if first else self._reassign_ns)
-        return self._cost_request
 
     def _in_reach(self, target: str | None, cell: int) -> bool:
         pose = self._poses.get(target) if target is not None else None
@@ -297,17 +237,15 @@ class Agent:
         cols = cell % grid.cols - pose.cell % grid.cols
         return math.hypot(rows, cols) * grid.resolution_m <= self._config.capture_range_m
 
-    def _check_reach(self, vehicle: Vehicle, now_ns: int) -> None:
+    def _check_reach(self, vehicle: Vehicle) -> None:
         near = self._in_reach(vehicle.target, vehicle.cell)
         if near != vehicle.in_reach:
-            vehicle.handle(TargetReached() if near else TargetLeft(), now_ns)
+            vehicle.set_in_reach(near)
 
     # --- what is heard --------------------------------------------------------------------------------------
 
-    def hear_claims(self, claims: Claims) -> None:
-        self.rights.heard(claims)
-
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
+        """Where a target is. Of each target the newest pose counts; one outside the grid is ignored."""
         known = self._poses.get(pose.target)
         if known is not None and (pose.incarnation, pose.seq) <= (known.incarnation, known.seq):
             return
@@ -317,29 +255,30 @@ class Agent:
         if known is not None and pose.jumps != known.jumps:
             for vehicle in self.vehicles.values():
                 if vehicle.target == pose.target:
-                    self._check_reach(vehicle, now_ns)
-                    vehicle.handle(TargetJumped(), now_ns)
-            self._assign_due_ns = min(self._assign_due_ns, now_ns + _RETRY_NS)
+                    self._check_reach(vehicle)
+                    vehicle.target_jumped(now_ns)
+            self._assignment.ask_soon(now_ns)
 
     def set_planners(self, alive: Mapping[str, int], now_ns: int) -> None:
-        """Which planners are there now, and in which incarnation."""
+        """Which planners live: target -> incarnation."""
         before, self._planners = self._planners, dict(alive)
         for vehicle in self.vehicles.values():
             target = vehicle.target
             if target is None:
                 continue
             if target not in alive and not vehicle.planner_gone:
-                vehicle.handle(PlannerGone(), now_ns)
+                vehicle.lose_planner(now_ns)
             elif target in alive and (vehicle.planner_gone or before.get(target) != alive[target]):
-                vehicle.handle(PlannerBack(), now_ns)
+                vehicle.regain_planner(now_ns)
         if any(target not in before for target in alive):
-            self._assign_due_ns = min(self._assign_due_ns, now_ns + _RETRY_NS)
+            self._assignment.ask_soon(now_ns)
 
-    def routes_given(self, request: int, reply: RouteReply, now_ns: int) -> list[VehicleAction]:
+    def routes_given(self, request: int, reply: RouteReply, now_ns: int) -> list[Follow]:
+        """A planner's answer to `AskRoutes`; returns the routes that vehicles have begun."""
         asked = self._route_requests.pop(request, None)
         if asked is None:
             return []
-        actions: list[VehicleAction] = []
+        begun: list[Follow] = []
         pose = self._poses.get(asked.target)
         stale = (
             pose is not None
@@ -350,63 +289,49 @@ class Agent:
         for index, id in enumerate(asked.vehicles):
             vehicle = self.vehicles[id]
             if index >= len(reply.routes) or stale:
-                vehicle.handle(NoAnswer(), now_ns)
+                vehicle.no_answer(now_ns)
             else:
-                actions += self._take(vehicle, asked.target, reply.routes[index], now_ns, pushed=False)
-        return actions
+                begun += self._take(vehicle, asked.target, reply.routes[index], now_ns, pushed=False)
+        return begun
 
     def routes_ended(self, request: int, now_ns: int) -> None:
-        """Nobody will answer any more."""
+        """No more answers to `AskRoutes` will come."""
         asked = self._route_requests.pop(request, None)
         for id in asked.vehicles if asked is not None else ():
-            self.vehicles[id].handle(NoAnswer(), now_ns)
+            self.vehicles[id].no_answer(now_ns)
 
-    def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[VehicleAction]:
+    def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[Follow]:
+        """A newer route from a planner, unasked; returns it if the vehicle has begun it."""
         vehicle = self.vehicles.get(pushed.vehicle)
         if vehicle is None:
             return []
         return self._take(vehicle, pushed.target, pushed.route, now_ns, pushed=True)
 
-    def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[VehicleAction]:
-        if route.status is not RouteStatus.OK:
-            return [] if pushed else vehicle.handle(RouteRefused(target, route.status), now_ns)
-        cells = route_cells(self._map.grid, route.start, route.directions)
+    def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Follow]:
+        cells = (
+            route_cells(self._map.grid, route.start, route.directions) if route.status is RouteStatus.OK else None
+        )
         if cells is None:
-            return [] if pushed else vehicle.handle(NoAnswer(), now_ns)
-        goes_on = route.remaining_s > 0.0
-        given = RouteGiven(target, cells, route.cost_s, route.lower_bound_s, goes_on, pushed)
-        actions = vehicle.handle(given, now_ns)
-        if actions and vehicle.route.cut(self._traffic.closed):
-            vehicle.handle(RouteCut(), now_ns)
-        return actions
+            if not pushed and route.status is RouteStatus.OK:
+                vehicle.no_answer(now_ns)
+            elif not pushed:
+                vehicle.refuse_route(target, route.status, now_ns)
+            return []
+        partial = route.remaining_s > 0.0
+        given = GivenRoute(target, cells, route.cost_s, route.lower_bound_s, partial, pushed)
+        begun = vehicle.give_route(given, now_ns)
+        if begun is None:
+            return []
+        if vehicle.route.cut(self._traffic.closed):
+            vehicle.cut_route(now_ns)
+        return [begun]
+
+    # --- which target ---------------------------------------------------------------------------------------
 
     def costs_given(self, request: int, target: str, costs_s: NDArray[np.float32]) -> None:
-        asked = self._cost_request
-        if asked is not None and asked.request == request and len(costs_s) == len(asked.cells):
-            self._costs[target] = costs_s
+        """One planner's answer to `AskCosts`: float32 seconds, one per vehicle asked for."""
+        self._assignment.costs_given(request, target, costs_s)
 
     def costs_ended(self, request: int, now_ns: int) -> None:
-        """All planners have answered that will: each vehicle takes the cheapest target."""
-        asked = self._cost_request
-        if asked is None or asked.request != request:
-            return
-        self._cost_request = None
-        stuck = not self._costs
-        for index, id in enumerate(asked.vehicles):
-            vehicle = self.vehicles[id]
-            costs = {target: float(column[index]) for target, column in self._costs.items()}
-            given_up = vehicle.planner_gone and not vehicle.route.left
-            given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
-            choice = choose(
-                costs, self.targets, self._planners, vehicle.target, self._config.hysteresis, not given_up
-            )
-            if choice.target is not None:
-                vehicle.handle(Assigned(choice.target), now_ns)
-                if vehicle.target not in self._planners and not vehicle.planner_gone:
-                    vehicle.handle(PlannerGone(), now_ns)
-            elif choice.settled:
-                vehicle.handle(NoWay(), now_ns)
-            stuck = stuck or vehicle.state in (VehicleState.IDLE, VehicleState.STRANDED)
-        if stuck:
-            retry_ns = _RETRY_NS if not self._costs else _STRANDED_RETRY_NS
-            self._assign_due_ns = min(self._assign_due_ns, now_ns + retry_ns)
+        """No more answers to `AskCosts` will come."""
+        self._assignment.costs_ended(request, self.vehicles, self._planners, now_ns)

@@ -1,4 +1,4 @@
-"""Where an agent's vehicles are, as it is told: one message per region."""
+"""The messages in which an agent publishes where its vehicles are: one per region."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ _MOST_TARGETS = NO_TARGET
 
 
 class FleetReport:
-    """Makes the messages of one author. A region that its vehicles have left gets one empty message."""
+    """Makes the messages of one author. A region that its vehicles have left gets one empty message.
+
+    author, group  stand in each message; seq grows by one with each call of `reports`
+    """
 
     def __init__(self, grid: GridSpec, author: str, group: str) -> None:
         self._grid = grid
@@ -24,7 +27,7 @@ class FleetReport:
         self._regions: list[int] = []
 
     def reports(self, vehicles: Iterable[Vehicle], now_ns: int) -> Iterator[tuple[int, Fleet]]:
-        """(region, message) of every region where vehicles are, or were the last time."""
+        """(region, message) of every region where vehicles are, or were at the last call."""
         self._seq += 1
         by_region: dict[int, list[Vehicle]] = {region: [] for region in self._regions}
         for vehicle in vehicles:
@@ -58,7 +61,7 @@ class FleetReport:
 
 
 def directions_of(cells: Sequence[int], cols: int) -> bytes:
-    """The direction codes that lead from each cell to the next."""
+    """The direction code (0..7, clockwise from north) of each step between neighbouring cells, one byte each."""
     return bytes(
         _CODES[after // cols - before // cols, after % cols - before % cols] for before, after in pairwise(cells)
     )

@@ -14,7 +14,10 @@ from vehicle_agent.service import AgentService
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
-    """Drive the vehicles of one agent until told to stop."""
+    """Drive the vehicles of one agent until it is told to stop.
+
+    stop_when  blocks until the process has to end; None to run until a signal comes
+    """
     terrain = load_terrain(setup)
     truth = load_truth(setup, terrain)
     with open_bus(setup.scenario.network) as bus:

@@ -1,9 +1,8 @@
-"""Where every vehicle of a run starts: the same answer in every process, so that no two choose one cell."""
+"""Where every vehicle of a run first starts. Every process computes the same, so that all cells differ."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +12,19 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 
 _STREAM = 77
-"""Of the scenario's seed: apart from what terrain and targets draw from it."""
+"""Stream of the scenario's seed: terrain and targets draw from others."""
 
 
 def spawn_cells(
     scenario: Scenario, grid: GridSpec, prior: NDArray[np.float32], truth: NDArray[np.float32]
 ) -> dict[str, dict[str, int]]:
-    """agent -> vehicle -> cell, of the whole fleet; all cells differ and lie in one connected part.
+    """agent -> vehicle -> cell, of the whole run. All cells differ and lie in the largest connected passable part,
+    except those that the scenario names.
 
-    Raises ConfigError for a place outside the terrain or on lethal ground, or if there is not enough room.
+    prior, truth  float32 (rows, cols), s/m; inf is lethal
+
+    Raises ConfigError for a cell outside the terrain, lethal or given twice, and if there are too few passable
+    cells.
     """
     passable = np.isfinite(prior) & np.isfinite(truth)
     homes = _largest_part(passable).reshape(-1)
@@ -45,20 +48,9 @@ def spawn_cells(
     }
 
 
-def nearest_free(grid: GridSpec, wish: int, is_free: Callable[[int], bool], reach: int = 8) -> int | None:
-    """The free cell next to `wish`, in rings around it; None if there is none within reach."""
-    for half in range(reach + 1):
-        near = grid.around(wish, half)
-        for row in range(near.row0, near.row1):
-            for cell in range(row * grid.cols + near.col0, row * grid.cols + near.col1):
-                if grid.distance_cells(wish, cell) == half and is_free(cell):
-                    return cell
-    return None
-
-
 def _along_a_curve(grid: GridSpec, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Each cell's place on Morton's curve. Along it, those who come one after the other are near each other: so
-    the vehicles of one agent start in few regions, and it has few others to come to terms with."""
+    """Each cell's index on the Morton curve (Z-order). Cells that follow each other on it are near each other, so
+    the vehicles of one agent start in few plots, and it has few neighbours."""
     rows, cols = np.divmod(cells, grid.cols)
     place = np.zeros(len(cells), np.int64)
     for bit in range(max(grid.rows, grid.cols).bit_length()):
@@ -107,7 +99,7 @@ def _choose(group: GroupConfig, count: int, grid: GridSpec, homes: NDArray[np.bo
     centre = int(rng.choice(free))
     south = np.abs(free // grid.cols - centre // grid.cols)
     east = np.abs(free % grid.cols - centre % grid.cols)
-    # Every other cell first, so that whoever stands in the middle can get out.
+    # Every other cell first, so that a vehicle in the middle can get out.
     crowded = (south % 2 + east % 2) > 0
     distance = np.hypot(south, east) + np.where(crowded, 2.0 * np.sqrt(count), 0.0)
     return [int(cell) for cell in free[np.argsort(distance, kind="stable")[:count]]]

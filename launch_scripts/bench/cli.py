@@ -1,26 +1,21 @@
-"""`swarm bench`: figures, each from one command. With --json one object on standard output, progress on stderr."""
+"""`swarm bench`: one command per measurement. With --json one object on standard output; progress on stderr."""
 
 from __future__ import annotations
 
-import json
 import typing
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
 
-from launch_scripts.bench.tables import on_machine
+from launch_scripts.bench.show import progress_of, show
 from swarm.config.scenario import Strategy
 from swarm.errors import ConfigError
 
 app = typer.Typer(
     name="bench",
-    help="Measure: trees against other libraries, the paper's tables, scale, gaps, terrain, the wire.",
+    help="Measure: trees beside other libraries, the paper's tables, scale, gaps, terrain, the wire.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -39,63 +34,14 @@ _ALLOWED = typing.get_args(Strategy)
 _ALL = ",".join(_ALLOWED)
 
 
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-def _show(
-    report: dict[str, Any],
-    as_json: bool,
-    tables: Callable[[dict[str, Any]], Iterable[Table | str]] | None = None,
-) -> None:
-    """As one JSON object; or as its tables and sentences, and where it was measured."""
-    if as_json:
-        typer.echo(json.dumps(report, allow_nan=False))
-        return
-    console = Console(soft_wrap=False, highlight=False)
-    if tables is None:
-        tables = _plain_tables
-    for part in tables(report):
-        console.print(part)
-    if "load" in report:
-        console.print(on_machine(report))
-
-
-def _plain_tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    """Every list of rows as a table, then what is left as lines, but for the machine, of which `_show` tells."""
-    plain = {}
-    for name, value in report.items():
-        if name in ("cores", "machine", "python", "load"):
-            continue
-        rows = value if isinstance(value, list) and value and isinstance(value[0], dict) else None
-        if rows is None:
-            plain[name] = value
-            continue
-        columns = list(dict.fromkeys(key for row in rows for key in row))
-        table = Table(*columns, title=name)
-        for row in rows:
-            table.add_row(*(_cell(row.get(key)) for key in columns))
-        yield table
-    for name, value in plain.items():
-        yield f"{name}: {_cell(value)}"
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {item}" for key, item in value.items())
-    return "" if value is None else str(value)
-
-
-def _strategies(names: str) -> tuple[Any, ...]:
-    chosen = tuple(name.strip() for name in names.split(",") if name.strip())
+def _names(text: str, what: str, allowed: Sequence[str]) -> tuple[Any, ...]:
+    """Names separated by commas. Raises ConfigError on none, and on one which is not allowed."""
+    chosen = tuple(name.strip() for name in text.split(",") if name.strip())
     if not chosen:
-        raise ConfigError(f"--strategies is {names!r}, expected some of {', '.join(_ALLOWED)}")
+        raise ConfigError(f"--{what} is {text!r}, expected some of {', '.join(allowed)}")
     for name in chosen:
-        if name not in _ALLOWED:
-            raise ConfigError(f"strategy {name!r} is not one of {', '.join(_ALLOWED)}")
+        if name not in allowed:
+            raise ConfigError(f"--{what}: {name!r} is not one of {', '.join(allowed)}")
     return chosen
 
 
@@ -110,7 +56,7 @@ def _numbers(text: str, name: str, least: int = 1) -> tuple[int, ...]:
 
 
 def _check_picture(picture: Path | None) -> None:
-    """Before minutes are spent on what could not be written."""
+    """Raises ConfigError now, not after minutes of measuring."""
     if picture is None:
         return
     if picture.suffix.lower() != ".png":
@@ -147,16 +93,16 @@ def peers(
     if as_json:
         for package in missing_packages():
             typer.echo(missing_sentence(package), err=True)
-    with _progress("peers") as progress:
+    with progress_of("peers") as progress:
         report = run(size, field, repeats, seed, edge, memory, progress)  # type: ignore[arg-type]
-    _show(report, as_json, tables)
+    show(report, as_json, tables)
 
 
 @app.command()
 def start(
     size: Annotated[int, typer.Option(min=2, max=8192, help="Cells a side of the first tree.")] = 512,
     runs: Annotated[int, typer.Option(min=1, help="Processes with a warm cache.")] = 7,
-    cold_runs: Annotated[int, typer.Option(min=1, help="Processes that compile everything.")] = 1,
+    cold_runs: Annotated[int, typer.Option(min=1, help="Processes that compile all kernels.")] = 1,
     kernels: Annotated[bool, typer.Option(help="Measure all kernels of a planner too.")] = True,
     as_json: AsJson = False,
 ) -> None:
@@ -169,9 +115,9 @@ def start(
     """
     from launch_scripts.bench.planning.cold_start import run_start, tables
 
-    with _progress("start") as progress:
+    with progress_of("start") as progress:
         report = run_start(size, cold_runs, runs, kernels, progress)
-    _show(report, as_json, tables)
+    show(report, as_json, tables)
 
 
 @app.command()
@@ -190,9 +136,9 @@ def paper(
     """
     from launch_scripts.bench.planning.paper_tables import run_paper, tables
 
-    with _progress("paper") as progress:
+    with progress_of("paper") as progress:
         report = run_paper(size, field, frames, seed, progress)
-    _show(report, as_json, tables)
+    show(report, as_json, tables)
 
 
 @app.command()
@@ -232,9 +178,9 @@ def scale(
     if sizes is None:
         sizes = "512,1024,2048,4096" if full else "512,1024,2048"
     axes = (_numbers(sizes, "sizes", 16), _numbers(targets, "targets"), _numbers(vehicles, "vehicles"))
-    chosen = _strategies(strategies)
+    chosen = _names(strategies, "strategies", _ALLOWED)
     _check_picture(picture)
-    with _progress("scale") as progress:
+    with progress_of("scale") as progress:
         report = run_scale(
             points_of(*axes, full),
             base_of(*axes),
@@ -247,7 +193,7 @@ def scale(
             picture,
             progress,
         )
-    _show(report, as_json, tables)
+    show(report, as_json, tables)
 
 
 @app.command()
@@ -269,7 +215,7 @@ def gap(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Driven cost over optimum for a moving target, and what the certificates prove of it.
+    """Driven cost over optimum for a moving target, and the gap that certificates prove.
 
     \b
     swarm bench gap --dem ridge.tif --walk random,evade --picture gap.png
@@ -277,19 +223,16 @@ def gap(
     """
     from launch_scripts.bench.planning.gap import WALKS, run_gap, tables
 
-    walks = tuple(name.strip() for name in walk.split(","))
-    for name in walks:
-        if name not in WALKS:
-            raise ConfigError(f"--walk {name!r} is not one of {', '.join(WALKS)}")
-    chosen = _strategies(strategies)
+    walks = _names(walk, "walk", WALKS)
+    chosen = _names(strategies, "strategies", _ALLOWED)
     _check_picture(picture)
-    with _progress("gap") as progress:
+    with progress_of("gap") as progress:
         report = run_gap(
             dem,
             frames,
             vehicles,
             chosen,
-            walks,  # type: ignore[arg-type]
+            walks,
             runs,
             speed,
             seed,
@@ -299,7 +242,7 @@ def gap(
             full_every=full_every,
             cpu_budget=cpu_budget,
         )
-    _show(report, as_json, tables)
+    show(report, as_json, tables)
 
 
 @app.command()
@@ -312,19 +255,19 @@ def directed(
     """A full tree where uphill is not downhill (cost.directional), beside one where it is."""
     from launch_scripts.bench.planning.directed import run
 
-    _show(run(_numbers(sizes, "sizes", 16), repeats, seed), as_json)
+    show(run(_numbers(sizes, "sizes", 16), repeats, seed), as_json)
 
 
 @app.command()
 def kernels(
     size: Annotated[int, typer.Option(min=64, max=8192, help="Cells a side; a file has its own.")] = 512,
     field: FieldOption = "terrain",
-    repeats: Annotated[int, typer.Option(min=1, help="Roots, each with all that is measured, in turn.")] = 15,
+    repeats: Annotated[int, typer.Option(min=1, help="Roots; every measurement is taken from each.")] = 15,
     side: Annotated[int, typer.Option(min=1, max=32, help="Cells a side of a patch that changes.")] = 17,
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """What a frame is made of: routes by the batch, windows, and repairs beside the growth that they stand for.
+    """The parts of a frame: batches of routes, windows, and repairs beside the growth that they replace.
 
     \b
     swarm bench kernels
@@ -332,9 +275,9 @@ def kernels(
     """
     from launch_scripts.bench.planning.kernels import run, tables
 
-    with _progress("kernels") as progress:
+    with progress_of("kernels") as progress:
         report = run(size, field, repeats, side, seed, progress)
-    _show(report, as_json, tables)
+    show(report, as_json, tables)
 
 
 @app.command()
@@ -347,16 +290,16 @@ def terrain(
     """Elevation and photo to cost: seconds and memory, beside a plain pass."""
     from launch_scripts.bench.terrain import run
 
-    with _progress("terrain") as progress:
+    with progress_of("terrain") as progress:
         report = run(size, repeats, degrees=degrees, progress=progress)
-    _show(report, as_json)
+    show(report, as_json)
 
 
 @app.command()
 def wire(
     parts: Annotated[
-        str, typer.Option(help="latency, flood, join, route, positions, replica; several with commas.")
-    ] = "latency,flood,join,route,positions,replica",
+        str, typer.Option(help="latency, flood, join, route, positions, replica, codec; several with commas.")
+    ] = "latency,flood,join,route,positions,replica,codec",
     marks: Annotated[int, typer.Option(min=10, help="latency: marks, and as many raw puts.")] = 400,
     sets: Annotated[int, typer.Option(min=100, help="flood: sets in a round.")] = 20_000,
     rounds: Annotated[int, typer.Option(min=1, help="flood: rounds of ours and raw, in turn.")] = 3,
@@ -376,11 +319,8 @@ def wire(
     """
     from launch_scripts.bench.wire.overview import PARTS, run, tables
 
-    chosen = tuple(name.strip() for name in parts.split(","))
-    for name in chosen:
-        if name not in PARTS:
-            raise ConfigError(f"--parts: {name!r} is not one of {', '.join(PARTS)}")
-    with _progress("wire") as progress:
+    chosen = _names(parts, "parts", PARTS)
+    with progress_of("wire") as progress:
         report = run(
             chosen,
             marks=marks,
@@ -391,4 +331,61 @@ def wire(
             seconds=seconds,
             progress=progress,
         )
-    _show(report, as_json, tables)
+    show(report, as_json, tables)
+
+
+@app.command()
+def compaction(
+    lives: Annotated[int, typer.Option(min=1, help="Lives of one agent, each with 100 writes.")] = 200,
+    seed: Seed = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Size of a keeper's store after many lives of an agent, with and without folding of dead authors.
+
+    \b
+    swarm bench compaction --lives 1000
+    """
+    from launch_scripts.bench.wire.compaction import run
+
+    with progress_of("compaction") as progress:
+        report = run(lives, seed, progress)
+    show(report, as_json)
+
+
+@app.command()
+def partition(
+    rounds: Annotated[int, typer.Option(min=1, help="Partitions, one after the other.")] = 20,
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long each lasts, with writes on both sides.")] = 30.0,
+    as_json: AsJson = False,
+) -> None:
+    """How soon all replicas are equal after a partition heals. Needs root and iproute2; some eleven minutes.
+
+    \b
+    swarm bench partition --rounds 2 --seconds 5
+
+    Two network namespaces stand for two machines, each with a router, a keeper,
+    two authors and a listener; they meet over mutual TLS.
+    """
+    from launch_scripts.bench.wire.partition import run
+
+    with progress_of("partition") as progress:
+        report = run(rounds, seconds, progress)
+    show(report, as_json)
+
+
+@app.command()
+def presence(
+    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles, multiples of 25.")] = "1000,5000",
+    rounds: Annotated[int, typer.Option(min=1, help="Ticks; the median counts.")] = 50,
+    as_json: AsJson = False,
+) -> None:
+    """CPU time per tick that an agent spends on the positions of all other vehicles.
+
+    \b
+    swarm bench presence --vehicles 10000
+    """
+    from launch_scripts.bench.wire.presence import run
+
+    with progress_of("presence") as progress:
+        report = run(_numbers(vehicles, "vehicles", 25), rounds, progress)
+    show(report, as_json)

@@ -1,4 +1,4 @@
-"""What can only be measured in a process of its own: the memory that one tree takes, and a first call.
+"""Measurements that need a process of their own: memory of one tree, and a first call.
 
     python -m launch_scripts.bench.isolated memory FIELD.npy TOOL ROOT EDGE
     python -m launch_scripts.bench.isolated start WHAT SIZE STARTED_NS
@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,17 +51,26 @@ def memory(field: Path, name: str, root: int, edge: str) -> dict[str, float | No
     small = np.ones((24, 24), np.float32)
     make(small, edge).grow(5)  # type: ignore[arg-type]  # libraries are loaded, kernels compiled
     pace = np.load(field)
-    try:
-        # Linux: the highest mark starts again at what is resident now.
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-        before = _status_bytes("VmRSS")
+
+    def grow() -> object:
         tool = make(pace, edge)  # type: ignore[arg-type]
-        kept = tool.grow(root)
-        peak = _status_bytes("VmHWM")
-        del kept
+        return tool, tool.grow(root)
+
+    try:
+        return {"mb": round(peak_bytes(grow) / MB, 1)}
     except OSError:
         return {"mb": None}
-    return {"mb": round((peak - before) / MB, 1)}
+
+
+def peak_bytes(work: Callable[[], object]) -> int:
+    """By how much the resident memory of this process rises at most. Raises OSError where it is not known."""
+    # Linux: the highest mark starts again at what is resident now.
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    before = _status_bytes("VmRSS")
+    kept = work()
+    peak = _status_bytes("VmHWM")
+    del kept
+    return peak - before
 
 
 def _status_bytes(key: str) -> int:
@@ -76,12 +86,12 @@ def start(what: str, size: int, started_ns: int) -> dict[str, float]:
     if what == "tree":
         import numpy as np
 
-        from planner_service.tree.cost_grid import Ground
+        from planner_service.tree.cost_grid import CostGrid
         from planner_service.tree.cost_to_go import CostToGoTree
         from swarm.config.scenario import PlannerConfig
         from swarm.grid import GridSpec
 
-        ground = Ground(GridSpec(size, size, 1.0), PlannerConfig())
+        ground = CostGrid(GridSpec(size, size, 1.0), PlannerConfig())
         ground.load(np.ones((size, size), np.float32))
         CostToGoTree(ground).grow(size * size // 2)
     else:

@@ -1,4 +1,4 @@
-"""On what a figure was measured."""
+"""The machine on which a figure was measured."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def machine() -> dict[str, Any]:
-    """Cores, processor, Python, and how busy the machine is with whatever else it does."""
+    """Cores, processor, Python version and load."""
     return {
         "cores": os.cpu_count(),
         "machine": _processor(),
@@ -19,7 +19,7 @@ def machine() -> dict[str, Any]:
 
 
 def memory_free() -> int:
-    """Bytes that can still be taken without swapping; 4 GB where the system does not tell."""
+    """Bytes available without swapping; 4 GB where the system does not say."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):

@@ -1,4 +1,4 @@
-"""Pictures of benchmarks, in the colours and letters of the report's."""
+"""Plots of benchmarks, in the style of the report's."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ COLOURS: dict[Strategy, str] = {
 }
 DPI = 150
 EXACT_PERCENT = 0.01
-"""Gaps below are drawn here, at the foot of a logarithmic axis that has no zero."""
+"""Smaller gaps are drawn here: a logarithmic axis has no zero."""
 
 
 def save_scale(report: dict[str, Any], path: Path) -> None:
@@ -178,7 +178,7 @@ def _gap_axis(axis: Any) -> None:
 
 
 def _label_ends(axes: Axes, at: float, ends: Sequence[tuple[float, Strategy]]) -> None:
-    """Names beside the lines' ends, in their colours, pushed apart where they would lie on each other."""
+    """Labels beside the ends of the lines, in their colours, pushed apart where they would overlap."""
     axes.figure.canvas.draw()
     low, high = axes.get_ylim()
     span = np.log(high / low)

@@ -1,4 +1,4 @@
-"""Tables of figures that fit into 80 columns, how a figure is written in them, and how progress is told."""
+"""Tables which fit 80 columns, the format of figures, and the type of progress callbacks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.table import Table
 from swarm.config.scenario import Strategy
 
 Progress = Callable[[int, int], None]
-"""Told how many steps are done, of how many."""
+"""Called with (steps done, steps in all)."""
 
 LABELS: dict[Strategy, str] = {
     "full": "full",
@@ -21,7 +21,7 @@ LABELS: dict[Strategy, str] = {
     "multi_resolution": "multi-resolution",
     "variable_range+multi_resolution": "both, the paper's",
 }
-"""Strategies by the paper's words where it has any."""
+"""Strategies in the paper's words, where it has any."""
 NARROW: dict[Strategy, str] = {
     **LABELS,
     "variable_range": "variable\nrange",
@@ -30,11 +30,15 @@ NARROW: dict[Strategy, str] = {
 }
 
 
-def table(title: str, *columns: str, tight: bool = False) -> Table:
-    """Columns of numbers; a name that begins with < is one of words. A tight one saves a space between columns."""
-    padding = (0, 0) if tight else (0, 1, 0, 0)
+def table(title: str, *columns: str) -> Table:
+    """A table with right-aligned columns; a name which begins with < is left-aligned."""
     found = Table(
-        title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, padding=padding, pad_edge=False
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
     )
     for name in columns:
         words = name.startswith("<")
@@ -43,7 +47,7 @@ def table(title: str, *columns: str, tight: bool = False) -> Table:
 
 
 def number(value: float | None) -> str:
-    """Three digits that count."""
+    """Three significant digits."""
     if value is None:
         return "-"
     decimals = 0 if value >= 99.95 else 1 if value >= 9.995 else 2 if value >= 0.995 else 3
@@ -55,7 +59,7 @@ def times(value: float | None) -> str:
 
 
 def percent(gap: float | None) -> str:
-    """What a gap, cost over optimum, is above 1."""
+    """Per cent by which a gap, cost over optimum, exceeds 1."""
     if gap is None:
         return "-"
     above = 100 * (gap - 1)

@@ -25,7 +25,7 @@ RESOLUTION_M = 10.0
 RESOLUTION_DEG = 0.0001
 PASSES = ("plain", "swarm", "swarm without photo", "swarm with wide vehicles")
 WIDE_M = 2.5 * RESOLUTION_M
-"""Radius of vehicles that do not fit into their cell: lethal ground is inflated by three cells for them."""
+"""Radius of vehicles larger than a cell: lethal cells are inflated by three cells."""
 
 
 def run(
@@ -35,7 +35,7 @@ def run(
     degrees: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Seconds and peak memory of our passes and of the plain one.
+    """Measures seconds and peak memory of our passes and of the plain one.
 
     degrees  the files are in degrees: ours are warped onto metres, the plain pass takes them as they are
     """
@@ -92,7 +92,7 @@ def _make(folder: Path, size: int, degrees: bool) -> None:
 
 
 def _plain(folder: Path) -> None:
-    """What anybody would write first: read everything, numpy.gradient, degrees, a quadratic, a colour threshold."""
+    """The obvious implementation: read all, numpy.gradient, degrees, a quadratic, a colour threshold."""
     import numpy as np
     import rasterio
 
@@ -132,7 +132,7 @@ def _only(name: str, folder: Path) -> None:
     else:
         _swarm(folder, name)
     done = time.perf_counter()
-    # Not ru_maxrss: that is at least what the parent held when it forked.
+    # Not ru_maxrss, which starts at what the parent held at the fork.
     peak_kb = Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0]
     cpu_s = time.process_time() - cpu
     print(

@@ -1,4 +1,4 @@
-"""`swarm deploy`: what a swarm on several machines needs."""
+"""`swarm deploy`: certificates, and zenohd's configuration, for several machines."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from launch_scripts.commands.roles import Namespace, TlsCa, TlsCert, TlsKey
+from launch_scripts.commands.shared_options import Namespace, Tls, spread
 from swarm.errors import ConfigError, StoreError
 
 app = typer.Typer(help="Certificates and configurations for a swarm on several machines.", no_args_is_help=True)
@@ -16,18 +16,18 @@ app = typer.Typer(help="Certificates and configurations for a swarm on several m
 
 @app.command()
 def certs(
-    folder: Annotated[Path, typer.Argument(help="Where the authority's and all other certificates are kept.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of the authority and of all certificates.")],
     names: Annotated[
         list[str],
         typer.Argument(
             metavar="NAME[=HOST,...]...",
-            help="Whom to make a certificate for. A router needs the names or addresses that others connect to.",
+            help="Names to make certificates for. A router needs the hosts that others connect to.",
         ),
     ],
-    days: Annotated[int, typer.Option(min=1, max=3650, help="How long they are good for.")] = 365,
-    renew: Annotated[bool, typer.Option(help="Replace those that are there.")] = False,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="Days until they expire.")] = 365,
+    renew: Annotated[bool, typer.Option(help="Replace existing certificates.")] = False,
 ) -> None:
-    """Make certificates for mutual TLS, signed by an authority of the swarm's own, made when it is not there.
+    """Make certificates for mutual TLS, signed by the folder's own authority, which is made if missing.
 
     swarm deploy certs certs router=10.0.0.1,base.local car1 car2
 
@@ -51,19 +51,18 @@ def certs(
 
 
 @app.command()
+@spread
 def zenohd(
     out: Annotated[Path, typer.Argument(help="The file to write, for `zenohd -c FILE`.")],
+    tls: Tls,
     listen: Annotated[
         list[str] | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447; several times if need be.")
     ] = None,
     peer: Annotated[list[str] | None, typer.Option(help="Another router to connect to.")] = None,
     namespace: Namespace = None,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
     trust: Annotated[
         list[str] | None,
-        typer.Option(help="Name of a certificate whose bearer may do everything in the namespace."),
+        typer.Option(help="Name of a certificate which allows everything in the namespace."),
     ] = None,
     agent: Annotated[
         list[str] | None,
@@ -75,7 +74,7 @@ def zenohd(
         Path | None, typer.Option(help="Folder with libzenoh_plugin_storage_manager.so, to store marks, too.")
     ] = None,
     volume: Annotated[
-        str, typer.Option(help="Of the storage: memory, or one whose backend is installed.")
+        str, typer.Option(help="Volume of the storage: memory, or one whose backend is installed.")
     ] = "memory",
 ) -> None:
     """Write a configuration for zenohd as the router of a swarm, with its marks in zenohd's own storages.
@@ -85,15 +84,15 @@ def zenohd(
     import msgspec
 
     from launch_scripts.deploy.zenohd import zenohd_config
-    from launch_scripts.launcher.options import tls_of, with_network
+    from launch_scripts.launcher.options import with_network
     from swarm.config.load import check_endpoint
     from swarm.config.scenario import Scenario
 
-    if (trust or agent) and tls_ca is None:
+    if (trust or agent) and tls.tls_ca is None:
         raise ConfigError(
             "--trust and --agent go by the names in certificates: give --tls-ca, --tls-cert, --tls-key"
         )
-    network = with_network(Scenario(), namespace=namespace, tls=tls_of(tls_ca, tls_cert, tls_key)).network
+    network = with_network(Scenario(), namespace=namespace, tls=tls.config()).network
     for option, endpoints in (("--listen", listen), ("--peer", peer)):
         for endpoint in endpoints or ():
             check_endpoint(endpoint, network.tls is not None, option)
@@ -101,8 +100,8 @@ def zenohd(
     if network.tls is not None:  # zenohd may run elsewhere than here
         files = (network.tls.ca, network.tls.certificate, network.tls.key)
         ca, certificate, key = (str(Path(file).resolve()) for file in files)
-        tls = msgspec.structs.replace(network.tls, ca=ca, certificate=certificate, key=key)
-        network = msgspec.structs.replace(network, tls=tls)
+        absolute = msgspec.structs.replace(network.tls, ca=ca, certificate=certificate, key=key)
+        network = msgspec.structs.replace(network, tls=absolute)
     config = zenohd_config(
         network,
         trusted=trust or (),

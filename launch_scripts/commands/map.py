@@ -1,4 +1,4 @@
-"""`swarm map`: look into the keeper's store, take marks out of it and put them into another."""
+"""`swarm map`: inspect a keeper's store, export its marks, import them into another."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from launch_scripts.commands.shared_options import AsJson
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
 from swarm.errors import StoreError
@@ -31,8 +32,8 @@ def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
 
 
 @app.command()
-def inspect(store: Store, as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False) -> None:
-    """Say what a store holds, by author."""
+def inspect(store: Store, as_json: AsJson = False) -> None:
+    """Show what a store holds, by author."""
     terrain, grid, sets = _read(store)
     _, kind = stored_marks.to_bands(grid, sets, time.time_ns())
     authors: dict[str, list[MarkSet]] = {}
@@ -101,10 +102,10 @@ def export(store: Store, out: Annotated[Path, typer.Argument(help=".json: every 
 
 @app.command("import")
 def import_(
-    file: Annotated[Path, typer.Argument(help="What `swarm map export` wrote as .json.")],
-    store: Annotated[Path, typer.Argument(help="The store to put it into; made if it is not there.")],
+    file: Annotated[Path, typer.Argument(help="A .json file of `swarm map export`.")],
+    store: Annotated[Path, typer.Argument(help="The store; made if missing.")],
 ) -> None:
-    """Put exported marks into a store, where they merge with those that are there. No keeper may be using it."""
+    """Import exported marks into a store, where they merge with those it holds. No keeper may use it meanwhile."""
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.commands.roles import TlsCa, TlsCert, TlsKey
+from launch_scripts.commands.shared_options import AsJson, Tls, spread
 
 if TYPE_CHECKING:
     from swarm.config.scenario import NetworkConfig
@@ -24,33 +26,37 @@ _CONNECT_S = 3.0
 _ROUTE_TIMEOUT_S = 5.0
 _STATUS_LISTEN_S = 1.5
 
-Connect = Annotated[str, typer.Option(help="The router's endpoint.")]
-Namespace = Annotated[str, typer.Option(help="Prefix of all keys.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
+@dataclass(frozen=True)
+class Where:
+    """Router and namespace of the swarm that a command asks."""
 
-def _network(connect: str, namespace: str, tls: tuple[str | None, str | None, str | None]) -> NetworkConfig:
-    import msgspec
+    connect: Annotated[str, typer.Option(help="The router's endpoint.")] = "tcp/127.0.0.1:7447"
+    namespace: Annotated[str, typer.Option(help="Prefix of all keys.")] = "swarm"
 
-    from launch_scripts.launcher.options import tls_of, with_network
-    from swarm.config.scenario import Scenario
+    def network(self, tls: Tls) -> NetworkConfig:
+        import msgspec
 
-    chosen = with_network(Scenario(), connect=connect, namespace=namespace, tls=tls_of(*tls)).network
-    return msgspec.structs.replace(chosen, connect_timeout_s=_CONNECT_S)
+        from launch_scripts.launcher.options import with_network
+        from swarm.config.scenario import Scenario
+
+        chosen = with_network(Scenario(), connect=self.connect, namespace=self.namespace, tls=tls.config()).network
+        return msgspec.structs.replace(chosen, connect_timeout_s=_CONNECT_S)
+
+    def __str__(self) -> str:
+        return f"in namespace {self.namespace!r} at {self.connect}"
 
 
 @app.command(rich_help_panel=_PANEL)
+@spread
 def route(
-    target: Annotated[str, typer.Option(help="To which target, such as t3.")],
-    row: Annotated[int, typer.Option(help="From this row, counted from the north.")],
-    col: Annotated[int, typer.Option(help="From this column, counted from the west.")],
-    connect: Connect = "tcp/127.0.0.1:7447",
-    namespace: Namespace = "swarm",
-    steps: Annotated[int, typer.Option(min=0, help="At most so many steps, 1 for the next; 0 is all.")] = 0,
-    cost: Annotated[bool, typer.Option("--cost", help="Only what it costs, or that there is no way.")] = False,
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
+    target: Annotated[str, typer.Option(help="The target, such as t3.")],
+    row: Annotated[int, typer.Option(help="Row of the start, counted from the north.")],
+    col: Annotated[int, typer.Option(help="Column of the start, counted from the west.")],
+    where: Where,
+    tls: Tls,
+    steps: Annotated[int, typer.Option(min=0, help="Most steps to show; 1 is the next, 0 is all.")] = 0,
+    cost: Annotated[bool, typer.Option("--cost", help="Only the cost, or that there is no way.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Ask a planner for the cheapest route from a cell to its target.
@@ -65,11 +71,11 @@ def route(
     from swarm.bus.zenoh_bus import open_bus
     from swarm.errors import BusError, ConfigError
     from swarm.runtime.inbox import Inbox
-    from swarm.wire.codec import encode_readable
     from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+    from swarm.wire.readable import encode_readable
     from swarm.wire.topics import COST, ROUTE
 
-    network = _network(connect, namespace, (tls_ca, tls_cert, tls_key))
+    network = where.network(tls)
     inbox = Inbox()
     reply: RouteReply | CostReply | None = None
     failure: str | None = None
@@ -88,7 +94,7 @@ def route(
     if reply is None:
         if failure is not None and failure != "timeout":
             raise ConfigError(failure)
-        raise BusError(f"no planner of target {target!r} answers in namespace {namespace!r} at {connect}")
+        raise BusError(f"no planner of target {target!r} answers {where}")
     if as_json:
         typer.echo(encode_readable(reply).decode())
         return
@@ -140,7 +146,7 @@ def _strides(directions: bytes) -> str:
     """Runs of equal steps: 12 N, 3 NE, ..."""
     from itertools import groupby
 
-    from swarm.wire.codec import COMPASS
+    from swarm.wire.readable import COMPASS
 
     return (
         ", ".join(f"{len(list(steps))} {COMPASS[code]}" for code, steps in groupby(directions)) or "already there"
@@ -148,14 +154,8 @@ def _strides(directions: bytes) -> str:
 
 
 @app.command(rich_help_panel=_PANEL)
-def status(
-    connect: Connect = "tcp/127.0.0.1:7447",
-    namespace: Namespace = "swarm",
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
-    as_json: AsJson = False,
-) -> None:
+@spread
+def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Show who takes part in the running swarm and how the planners are doing."""
     from launch_scripts.launcher.watcher import ask_run
     from swarm.bus.bus import Heard
@@ -169,24 +169,36 @@ def status(
     inbox = Inbox()
     stats: dict[tuple[str, str], Stats] = {}
     planners: dict[str, PlannerStatus] = {}
-    with open_bus(_network(connect, namespace, (tls_ca, tls_cert, tls_key))) as bus:
+    with open_bus(where.network(tls)) as bus:
         bus.subscribe(STATS, inbox.post)
         bus.subscribe(STATUS, inbox.post)
         until_s = time.monotonic() + _STATUS_LISTEN_S
-        members = ask_run(bus)
+        found = ask_run(bus, routers=True)
         while (left_s := until_s - time.monotonic()) > 0:
             match inbox.take(left_s):
                 case Heard(message=Stats() as message):
                     stats[message.role, message.id] = message
                 case Heard(message=PlannerStatus() as message):
                     planners[message.target] = message
-    if not members:
-        raise BusError(f"nobody answers in namespace {namespace!r} at {connect}: is the swarm running?")
-    members.sort(key=lambda info: (info.role, info.id))
+    if not found:
+        raise BusError(f"nobody answers {where}: is the swarm running?")
+    # The run is that of most; routers belong to none; whoever answers with another is a stranger.
+    runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
+    run = runs.most_common(1)[0][0] if runs else ("", "")
+    found.sort(key=lambda info: (not info.run_id, info.role, info.id))
+    strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
+    members = [info for info in found if info not in strangers]
     if as_json:
-        typer.echo(json.dumps(_status_fields(members, stats, planners), indent=2))
+        fields = _status_fields(members, stats, planners)
+        fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
+        typer.echo(json.dumps(fields, indent=2))
     else:
         _print_status(members, stats, planners)
+        for info in strangers:
+            typer.secho(
+                f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}",
+                fg="yellow",
+            )
 
 
 def _status_fields(
@@ -213,7 +225,7 @@ def _status_fields(
 
 
 def _throttled(stats: dict[tuple[str, str], Stats]) -> list[str]:
-    """Authors of whom a keeper says that their sets wait."""
+    """Authors which a keeper throttles."""
     from shared_map.keeper.service import THROTTLED
 
     gauges = {name for each in stats.values() for name in each.gauges}
@@ -228,9 +240,11 @@ def _print_status(
 
     first = members[0]
     console = Console()
-    console.print(
-        f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells", highlight=False
-    )
+    if first.run_id:
+        run = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells"
+    else:
+        run = "no run yet: only routers answer"
+    console.print(run, highlight=False)
     now_ns = time.time_ns()
     crew = Table("process", "up s", "messages out", "in", "dropped", pad_edge=False)
     for info in members:
@@ -261,16 +275,16 @@ def _print_status(
 
 
 def simulate(name: str, seed: int | None, seconds: float | None, trace: Path | None, as_json: bool) -> None:
-    """See `swarm simulate`."""
+    """Runs `swarm simulate`."""
     import contextlib
 
     from launch_scripts.launcher.options import find_scenario
-    from launch_scripts.launcher.terminal import Screen
+    from launch_scripts.launcher.terminal import Terminal
     from launch_scripts.simulation.simulate import simulate as run_simulation
     from swarm.errors import StoreError
 
     scenario = find_scenario(name)
-    screen = Screen(as_json, plain=True)
+    terminal = Terminal(as_json, plain=True)
     with contextlib.ExitStack() as stack:
         try:
             log = None if trace is None else stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
@@ -280,8 +294,8 @@ def simulate(name: str, seed: int | None, seconds: float | None, trace: Path | N
     if as_json:
         typer.echo(json.dumps(result.report, indent=2))
     else:
-        screen.report(result.report)
-    screen.say(
+        terminal.report(result.report)
+    terminal.say(
         f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
         f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
     )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from launch_scripts.commands.shared_options import Namespace, Runs, Tls, spread
 
 if TYPE_CHECKING:
     from swarm.config.scenario import NetworkConfig
@@ -16,49 +18,43 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-Scenario = Annotated[
-    str,
-    typer.Argument(metavar="SCENARIO", help="A .toml file or a built-in name: the same for all of a run."),
-]
-Connect = Annotated[
-    str | None, typer.Option(help="The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.")
-]
-RunId = Annotated[str | None, typer.Option(help="The run to take part in; if not given, the one in the namespace.")]
-Namespace = Annotated[str | None, typer.Option(help="Prefix of all keys.")]
-Runs = Annotated[Path, typer.Option(help="Folder for what the process keeps: RUNS/RUN_ID/.")]
-TlsCa = Annotated[str | None, typer.Option("--tls-ca", help="Certificate of the authority, PEM.")]
-TlsCert = Annotated[str | None, typer.Option("--tls-cert", help="Our certificate, PEM.")]
-TlsKey = Annotated[str | None, typer.Option("--tls-key", help="Our private key, PEM.")]
-
 _PANEL = "One role, by hand"
 
 
+@dataclass(frozen=True)
+class Part:
+    """In which run a process takes part, and where it finds it."""
+
+    scenario: Annotated[
+        str,
+        typer.Argument(metavar="SCENARIO", help="A .toml file or a built-in name: the same for all of a run."),
+    ] = "jacksboro"
+    connect: Annotated[
+        str | None, typer.Option(help="The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.")
+    ] = None
+    run_id: Annotated[
+        str | None, typer.Option(help="The run to take part in; if not given, the one in the namespace.")
+    ] = None
+    namespace: Namespace = None
+    runs: Runs = Path("runs")
+
+
 @app.command(rich_help_panel=_PANEL)
+@spread
 def router(
-    scenario: Scenario = "jacksboro",
+    part: Part,
+    tls: Tls,
     listen: Annotated[str | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447.")] = None,
-    connect: Annotated[str | None, typer.Option(help="Another router to connect to.")] = None,
-    run_id: RunId = None,
-    namespace: Namespace = None,
-    runs: Runs = Path("runs"),
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
 ) -> None:
-    """Pass everybody's messages on: the process that all others connect to."""
-    _run("router", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key), listen)
+    """Pass everybody's messages on: the process that all others connect to. --connect names another router."""
+    _run("router", "0", part, tls, listen=listen)
 
 
 @app.command(rich_help_panel=_PANEL)
+@spread
 def keeper(
-    scenario: Scenario = "jacksboro",
-    connect: Connect = None,
-    run_id: RunId = None,
-    namespace: Namespace = None,
-    runs: Runs = Path("runs"),
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
+    part: Part,
+    tls: Tls,
     store: Annotated[
         Path | None, typer.Option(help="The SQLite file of marks; if not given, RUNS/RUN_ID/map.sqlite.")
     ] = None,
@@ -73,107 +69,69 @@ def keeper(
 
     swarm keeper jacksboro --id east --store /var/lib/swarm/east.sqlite
     """
-    kept = {"store_path": store, "rebuild": rebuild}
-    _run("keeper", id, scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key), more=kept)
+    _run("keeper", id, part, tls, store_path=store, rebuild=rebuild)
 
 
 @app.command(rich_help_panel=_PANEL)
+@spread
 def planner(
     target: Annotated[str, typer.Option(help="The target whose tree this planner keeps, such as t0.")],
-    scenario: Scenario = "jacksboro",
-    connect: Connect = None,
-    run_id: RunId = None,
-    namespace: Namespace = None,
-    runs: Runs = Path("runs"),
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
+    part: Part,
+    tls: Tls,
 ) -> None:
     """Plan for one target.
 
     swarm planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
-    _run("planner", target, scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+    _run("planner", target, part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
+@spread
 def agent(
     id: Annotated[str, typer.Option("--id", help="The agent, such as a0: it hosts that part of the vehicles.")],
-    scenario: Scenario = "jacksboro",
-    connect: Connect = None,
-    run_id: RunId = None,
-    namespace: Namespace = None,
-    runs: Runs = Path("runs"),
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
+    part: Part,
+    tls: Tls,
 ) -> None:
     """Drive the vehicles of one agent process."""
-    _run("agent", id, scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+    _run("agent", id, part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
-def targets(
-    scenario: Scenario = "jacksboro",
-    connect: Connect = None,
-    run_id: RunId = None,
-    namespace: Namespace = None,
-    runs: Runs = Path("runs"),
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
-) -> None:
+@spread
+def targets(part: Part, tls: Tls) -> None:
     """Move the simulated targets and referee the run."""
-    _run("targets", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+    _run("targets", "0", part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
-def monitor(
-    scenario: Scenario = "jacksboro",
-    connect: Connect = None,
-    run_id: RunId = None,
-    namespace: Namespace = None,
-    runs: Runs = Path("runs"),
-    tls_ca: TlsCa = None,
-    tls_cert: TlsCert = None,
-    tls_key: TlsKey = None,
-) -> None:
+@spread
+def monitor(part: Part, tls: Tls) -> None:
     """Show and record the run."""
-    _run("monitor", "0", scenario, connect, run_id, namespace, runs, (tls_ca, tls_cert, tls_key))
+    _run("monitor", "0", part, tls)
 
 
-def _run(
-    role: str,
-    id: str,
-    scenario_name: str,
-    connect: str | None,
-    run_id: str | None,
-    namespace: str | None,
-    runs: Path,
-    tls: tuple[str | None, str | None, str | None],
-    listen: str | None = None,
-    more: Mapping[str, Any] | None = None,
-) -> None:
+def _run(role: str, id: str, part: Part, tls: Tls, *, listen: str | None = None, **role_options: Any) -> None:
     import msgspec
 
     from launch_scripts.launcher import options
     from launch_scripts.launcher.child import load_entry, log_to
-    from launch_scripts.launcher.progress import bars
+    from launch_scripts.launcher.progress import progress
     from launch_scripts.launcher.run_terrain import fetch_if_missing
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import ENTRIES, processes_of
-    from swarm.errors import ConfigError, StoreError
+    from swarm.errors import ConfigError
     from swarm.runtime.role import RoleSetup
 
     scenario = options.with_network(
-        options.find_scenario(scenario_name),
-        connect=None if role == "router" else connect,
+        options.find_scenario(part.scenario),
+        connect=None if role == "router" else part.connect,
         listen=listen,
-        namespace=namespace,
-        tls=options.tls_of(*tls),
+        namespace=part.namespace,
+        tls=tls.config(),
     )
-    if role == "router" and connect is not None:
-        network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, connect))
+    if role == "router" and part.connect is not None:
+        network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, part.connect))
         scenario = msgspec.structs.replace(scenario, network=network)
     ids = [spec.id for spec in processes_of(scenario, (role,))]
     if role == "keeper":
@@ -182,23 +140,20 @@ def _run(
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
     log_to(None)
     found: list[RunInfo] = []
+    run_id = part.run_id
     if role != "router":
         found = _found(scenario.network)
         check_vacant(found, role, id)
         run_id = run_id or (found[0].run_id if found else None)
-    run_id = run_id or options.new_run_id()
-    run_dir = runs / run_id
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"cannot make {run_dir}: {error.strerror or error}") from error
+    run_id = run_id or options.common_run_id(scenario)
+    run_dir = options.make_run_dir(part.runs, run_id)
     if role != "router":
-        with bars() as progress:
-            fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=progress)
+        with progress() as tell:
+            fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
     now_ns = time.time_ns()
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
-    setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir.resolve())
-    load_entry(ENTRIES[role])(setup, None, **(more or {}))
+    setup = RoleSetup(scenario, run_id, role, id, incarnation=now_ns, started_ns=now_ns, run_dir=run_dir)
+    load_entry(ENTRIES[role])(setup, None, **role_options)
 
 
 def _check_id(id: str) -> None:
@@ -212,7 +167,7 @@ def _check_id(id: str) -> None:
 
 
 def _found(network: NetworkConfig) -> list[RunInfo]:
-    """Who is in the namespace."""
+    """Members of the run in the namespace."""
     from launch_scripts.launcher.watcher import ask_run
     from swarm.bus.zenoh_bus import open_bus
 

@@ -1,4 +1,4 @@
-"""`swarm terrain`: look at elevation and photo, see what they cost, make synthetic ones, classify a photo."""
+"""`swarm terrain`: inspect elevation and photo, build costs, make synthetic landscapes, classify a photo."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.launcher.progress import bars
+from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.launcher.progress import progress
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass, slope_deg
 from swarm.config.scenario import Scenario, TerrainConfig
@@ -58,7 +59,7 @@ PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png)
 
 
 def _check_target(path: Path | None, option: str, *endings: str) -> None:
-    """Before all the work: a file that cannot be written is refused now. Raises ConfigError."""
+    """Raises ConfigError now, not after the work, if a file cannot be written."""
     if path is None:
         return
     if path.is_dir():
@@ -82,7 +83,7 @@ def info(
     resolution_m: Resolution = None,
     height_scale: Scale = None,
     fill: Fill = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for programs.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say what a terrain file holds, and what was done to bring it onto a metric grid.
 
@@ -107,7 +108,7 @@ def info(
             "nodata": nodata,
         }
         config = msgspec.convert(raw, TerrainConfig)
-    with bars() as tell:
+    with progress() as tell:
         source = load_source(config, 1, tell)
     facts = _facts(source.grid, source.elevation_m)
     if source.factor is not None:
@@ -173,7 +174,7 @@ def cost(
     _check_target(out, "--out", *_TIFF)
     _check_target(picture, "--picture", ".png")
     loaded = _scenario(scenario)
-    with bars() as tell:
+    with progress() as tell:
         started = time.perf_counter()
         terrain = build_terrain(loaded, tell)
         seconds = time.perf_counter() - started
@@ -269,7 +270,7 @@ def synth(
         rivers=rivers,
         roads=roads,
     )
-    with bars() as tell:
+    with progress() as tell:
         terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
     if out.suffix.lower() == ".npz":
@@ -326,7 +327,7 @@ def classify(
         crs=crs,
         resolution_m=resolution_m,
     )
-    with bars() as tell:
+    with progress() as tell:
         terrain = build_terrain(Scenario(terrain=terrain_config), tell)
     _print_shares(terrain.classes)
     if labels is not None:

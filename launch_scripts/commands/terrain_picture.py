@@ -1,4 +1,4 @@
-"""What a terrain looks like and costs, in one picture with metres and seconds per metre."""
+"""Picture of a terrain: elevation, photo, classes and cost."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from shared_map.terrain.terrain import Terrain
 from swarm.errors import TerrainError
 
 MOST_CELLS = 1 << 21
-"""Of a panel: larger terrains are shown by a coarser level of their pyramid."""
+"""Most cells of a panel's side; larger terrains are shown by a coarser level of their pyramid."""
 _PANEL_IN = 6.6
 """Longer side of a panel, in inches."""
 _KEY_IN = 1.7
 _DPI = 120
 _LETHAL = "#3b1a5a"
 _VOID = "#9a9a9a"
-# Muted greens to rock to snow: no blue, so that valleys are no lakes.
+# Muted greens to rock to snow. No blue: valleys must not look like lakes.
 _HEIGHTS = LinearSegmentedColormap.from_list(
     "heights", ["#6d9a6b", "#a9bd85", "#e3d9a8", "#c9a77c", "#9a7a62", "#b5aaa3", "#ffffff"]
 )
 _PACES = LinearSegmentedColormap.from_list("paces", ["#fbf7dc", "#f6d27a", "#ee9140", "#cf4a2c", "#7d1626"])
 _CLASS_TINT: dict[TerrainClass, str] = {TerrainClass.ROAD: "#ffe9b0", TerrainClass.BUILT: "#c0625a"}
-"""Where a photograph's own colours would not tell one class from another."""
+"""Colours of classes which a photo's own colours do not tell apart."""
 
 
 def draw(terrain: Terrain, path: Path, title: str) -> None:
@@ -77,7 +77,7 @@ def draw(terrain: Terrain, path: Path, title: str) -> None:
 
 
 def _panel_inches(level: Level) -> tuple[float, float]:
-    """(width, height) as the terrain's; a ribbon is given some breadth."""
+    """(width, height) in the terrain's proportions, with a least breadth."""
     ratio = min(max(level.grid.rows / level.grid.cols, 0.3), 3.0)
     return (_PANEL_IN, _PANEL_IN * ratio) if ratio <= 1 else (_PANEL_IN / ratio, _PANEL_IN)
 
@@ -120,7 +120,7 @@ def _named(panel: Axes, name: str) -> None:
 
 
 def _lit(colours: Any, shade: Floats, share: float) -> Any:
-    """Colours under the light of the relief; `share` of them is light."""
+    """Colours shaded by the relief; `share` is the strength of the shading."""
     light = np.float32(1 - share) + np.float32(share / 0.7) * shade[..., None]
     return np.clip(np.asarray(colours, np.float32)[..., :3] * light, 0, 1)
 
@@ -176,7 +176,7 @@ def _cost(panel: Axes, key: Axes, terrain: Terrain, level: Level, shade: Floats)
     low, high = (float(value) for value in np.percentile(paces, (0, 99))) if paces.size else (0.0, 1.0)
     scale = Normalize(low, max(high, low * 1.01))
     colours = _lit(_PACES(scale(np.where(driven, level.pace_s_per_m, low))), shade, 0.3)
-    # A pixel of which a part is lethal is part lethal in colour: walls thinner than a pixel are seen.
+    # A partly lethal pixel is tinted in part, so that walls thinner than a pixel are seen.
     share = np.sqrt(np.where(driven, level.lethal_share, np.float32(1)))[..., None]
     _show(panel, level, colours * (1 - share) + np.array(to_rgb(_LETHAL), np.float32) * share)
     _named(panel, "cost" if terrain.climb is None else "cost of level ground (steps cost by their climb too)")

@@ -1,1 +1,1 @@
-"""What a swarm on several machines needs: certificates, and a configuration for zenohd."""
+"""Deployment on several machines: certificates, and a configuration for zenohd."""

@@ -1,4 +1,4 @@
-"""A certificate authority of the swarm's own, and a certificate per machine or process, for mutual TLS."""
+"""A private certificate authority, and a certificate per machine or process, for mutual TLS."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """Who signs: its own certificate, and the key that never leaves its folder."""
+    """A certificate authority: its certificate, and the key that never leaves its folder."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
@@ -61,7 +61,7 @@ def authority(folder: Path) -> Authority:
 
 
 def issue(folder: Path, name: str, hosts: Sequence[str], days: int, *, renew: bool = False) -> Path:
-    """Write `NAME.pem` and `NAME.key`, which nobody else may read. Returns the certificate's path.
+    """Writes `NAME.pem`, and `NAME.key` readable by its owner only. Returns the certificate's path.
 
     name   what access control knows its bearer by (the common name): a machine, or an agent such as all.a0
     hosts  names and addresses under which others connect to it; none for those that only connect
@@ -136,7 +136,7 @@ def _read_authority(folder: Path) -> Authority:
 
 
 def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
-    """The key first, so that a certificate never lies there without one."""
+    """Writes the key first: a certificate never exists without its key."""
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )

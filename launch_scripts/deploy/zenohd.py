@@ -1,14 +1,25 @@
-"""A configuration for zenohd: router of a swarm, its marks in zenohd's own storages, who may do what."""
+"""Configuration for zenohd as the router of a swarm: storages for marks, and access control."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-from swarm.bus.zenoh_bus import tls_settings
+from swarm.bus.zenoh_config import tls_settings
 from swarm.config.scenario import NetworkConfig
 from swarm.wire.codec import MAX_PAYLOAD_BYTES
-from swarm.wire.topics import ALIVE_KEY, CLAIMS, DIGEST, FLEET, FOLLOWED, GROUNDS, MARKS, NOTE, SIGHTED, STATS
+from swarm.wire.topics import (
+    ALIVE_KEY,
+    DIGEST,
+    FLEET,
+    FOLLOWED,
+    MARKS,
+    NOTE,
+    RESERVATIONS,
+    SIGHTED,
+    STATS,
+    TERRITORY,
+)
 
 ANSWERS = ("declare_queryable", "reply")
 PUTS = ("put", "delete", *ANSWERS, "liveliness_token")
@@ -23,7 +34,7 @@ def zenohd_config(
     plugins: str | None = None,
     volume: str = "memory",
 ) -> dict[str, Any]:
-    """What `zenohd -c FILE` reads, as JSON.
+    """The configuration that `zenohd -c FILE` reads, as JSON.
 
     trusted  certificate names that may do everything in the namespace: keepers, planners, routers
     agents   certificate names of agents, each its group and id (all.a0): may write only what is their own
@@ -60,24 +71,24 @@ def zenohd_config(
 
 
 def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]) -> dict[str, Any]:
-    """Zenoh's rules, by the common name of the certificate at the other end of a link.
+    """Access control rules, by the common name of the certificate at the other end of a link.
 
     An agent hears everything and writes under its own name only: authors are called `GROUP.ID.INCARNATION`. It
-    answers for others, too, where it is asked for the last claims of those that are gone.
+    answers for others, too, where it is asked for the newest reservations of those that are gone.
     """
     whole = [f"{namespace}/**"]
     rules = [_rule("all", (*PUTS, *READS), whole), _rule("hear", READS, whole)]
-    # What others said must reach those that may hear it: the way out to them is a matter of its own.
+    # Egress is a rule of its own: messages of others must reach those that may hear them.
     rules.append(_rule("told", PUTS, whole, flows=["egress"]))
     rules.append(_rule("asked", READS, whole, flows=["egress"]))
-    # Where the vehicles of an agent stand that is gone, only those that heard it last can tell.
-    rules.append(_rule("words", ANSWERS, [CLAIMS.expression(namespace)]))
+    # Only those which heard a dead agent last know where its vehicles stand.
+    rules.append(_rule("relayed", ANSWERS, [RESERVATIONS.expression(namespace)]))
     policies = [{"rules": ["all"], "subjects": ["trusted"]}] if trusted else []
     subjects = [{"id": "trusted", "cert_common_names": list(trusted)}] if trusted else []
     for agent in agents:
         rules.append(_rule(f"own-{agent}", PUTS, [f"{namespace}/{key}" for key in own_keys(agent)]))
         subjects.append({"id": agent, "cert_common_names": [agent]})
-        policies.append({"rules": ["hear", "told", "asked", "words", f"own-{agent}"], "subjects": [agent]})
+        policies.append({"rules": ["hear", "told", "asked", "relayed", f"own-{agent}"], "subjects": [agent]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -88,15 +99,15 @@ def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]
 
 
 def own_keys(name: str) -> list[str]:
-    """What the agent of a name such as all.a0 may write, below the namespace."""
+    """Keys below the namespace that an agent with a name such as all.a0 may write."""
     author, agent = f"{name}.$*", name.rpartition(".")[2]
     return [
         MARKS.key.format(region="*", tile="*", author=author),
         DIGEST.key.format(author=author),
         FLEET.key.format(region="*", author=author),
         SIGHTED.key.format(target="*", author=author),
-        CLAIMS.key.format(agent=agent),
-        GROUNDS.key.format(agent=agent),
+        RESERVATIONS.key.format(agent=agent),
+        TERRITORY.key.format(agent=agent),
         FOLLOWED.key.format(agent=agent, vehicle="*"),
         STATS.key.format(role="agent", id=agent),
         NOTE.key.format(role="agent", id=agent),

@@ -1,4 +1,4 @@
-"""What the launcher runs in each of its processes: output into a log file, a role, and word of how it ended."""
+"""Main function of each process of the launcher: logs to a file, runs a role, reports why it ended."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from swarm.errors import SwarmError
 from swarm.runtime.role import RoleSetup
 
 CRASHED = 70
-"""Exit code of a process that ended by a bug."""
+"""Exit code of a process that crashed by a bug."""
 
 _GRACE_S = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class LastWords:
-    """Why a process ended, in one sentence. `refused`: it was a SwarmError, no bug, so a restart may not help."""
+class ExitReason:
+    """Why a process ended. `refused`: by a SwarmError, not a bug, so that a restart may not help."""
 
     sentence: str
     exit_code: int
     refused: bool
 
 
-def run_child(entry: str, setup: RoleSetup, log_path: Path, words: Connection) -> None:
-    """Run a role until it is told to stop. Ends the process with the role's exit code."""
+def run_child(entry: str, setup: RoleSetup, log_path: Path, pipe: Connection) -> None:
+    """Runs a role until it is told to stop. Ends the process with the role's exit code."""
     _redirect(log_path)
-    # The launcher alone decides when to stop: it keeps SIGINT blocked for all of us, and SIGTERM until here.
+    # The launcher alone decides when to stop: it blocks SIGINT for all its processes, and SIGTERM until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     _watch_launcher()
     log = logging.getLogger(__name__)
@@ -45,11 +45,11 @@ def run_child(entry: str, setup: RoleSetup, log_path: Path, words: Connection) -
         load_entry(entry)(setup, wait_for_launcher)
     except SwarmError as error:
         log.error("%s", error)
-        words.send(LastWords(str(error), error.exit_code, refused=True))
+        pipe.send(ExitReason(str(error), error.exit_code, refused=True))
         _leave(error.exit_code)
     except BaseException as error:
         log.critical("crashed", exc_info=True)
-        words.send(LastWords(f"{type(error).__name__}: {error}", CRASHED, refused=False))
+        pipe.send(ExitReason(f"{type(error).__name__}: {error}", CRASHED, refused=False))
         _leave(CRASHED)
     log.info("ended as asked")
     _leave(0)
@@ -62,7 +62,7 @@ def load_entry(entry: str) -> Any:
 
 
 def wait_for_launcher() -> None:
-    """Block until the process that started us is gone."""
+    """Blocks until the launcher is gone."""
     parent = multiprocessing.parent_process()
     if parent is None:
         threading.Event().wait()
@@ -71,7 +71,7 @@ def wait_for_launcher() -> None:
 
 
 def _watch_launcher() -> None:
-    """Even a role that hangs in its start must not outlive the launcher."""
+    """Ends this process after the launcher, even if a role hangs in its start."""
 
     def watch() -> None:
         wait_for_launcher()
@@ -83,7 +83,7 @@ def _watch_launcher() -> None:
 
 
 def _redirect(log_path: Path) -> None:
-    """Everything that this process says, native libraries included, goes to its log file."""
+    """Sends all output of this process, that of native libraries included, to its log file."""
     file = os.open(log_path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     sys.stdout.flush()
     sys.stderr.flush()
@@ -95,7 +95,7 @@ def _redirect(log_path: Path) -> None:
 
 
 def log_to(path: Path | None) -> None:
-    """Log into a file, or where there is none on standard error."""
+    """Logs to a file, or to standard error if there is none."""
     handler = logging.StreamHandler(sys.stderr) if path is None else logging.FileHandler(path, encoding="utf-8")
     handler.setFormatter(
         logging.Formatter("%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
@@ -104,7 +104,7 @@ def log_to(path: Path | None) -> None:
 
 
 def _leave(code: int) -> None:
-    """End now: a thread that a crash left waiting must not keep the process alive."""
+    """Ends the process now: threads left waiting after a crash must not keep it alive."""
     logging.shutdown()
     sys.stdout.flush()
     sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""What a person sees in the terminal while the swarm runs: a table, or plain lines where there is no terminal."""
+"""The live table in the terminal, and its one-line form where there is no terminal."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def live_table(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], r
 
 
 def plain_line(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], restarts: int) -> str:
-    """The same in one line."""
+    """The summary in one line."""
     alive = sum(count for count, _ in processes.values())
     every = sum(count for _, count in processes.values())
     following = sum(line.following for line in summary.targets)

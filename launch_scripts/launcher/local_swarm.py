@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
-from launch_scripts.launcher.child import LastWords, run_child
+from launch_scripts.launcher.child import ExitReason, run_child
 from launch_scripts.process_table import STOP_ORDER, ProcessSpec
 from swarm.runtime.role import RoleSetup
 
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 SETTLED_S = 10.0
-"""A process that ran for so long starts again after the shortest wait."""
+"""After a run of so many seconds the wait starts at its shortest again."""
 STOP_GRACE_S = 5.0
 REFUSALS_ALLOWED = 5
 
@@ -36,7 +36,7 @@ _HELD_BACK = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 @dataclass(slots=True)
 class Backoff:
-    """How long to wait before the next start: doubled at each crash, short again after a good run."""
+    """Wait before the next start: doubled at each crash, short again after a long run."""
 
     wait_s: float = FIRST_WAIT_S
 
@@ -51,7 +51,7 @@ class Backoff:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """A process that was not asked to end has ended."""
+    """End of a process that was not asked to end."""
 
     spec: ProcessSpec
     sentence: str
@@ -63,11 +63,11 @@ class Ending:
 
 @dataclass(slots=True, eq=False)
 class Running:
-    """A row of the table, as it is on this machine."""
+    """A process of the table and its state on this machine."""
 
     spec: ProcessSpec
     process: ForkServerProcess | None = None
-    words: Connection | None = None
+    pipe: Connection | None = None
     began_s: float = 0.0
     due_s: float | None = None
     restarts: int = 0
@@ -106,13 +106,13 @@ class LocalSwarm:
         return counts
 
     def start(self, role: str | None = None) -> None:
-        """Start the processes of a role, or all that have not been started."""
+        """Starts the processes of a role, or all that have not been started."""
         for running in self.running:
             if running.process is None and running.due_s is None and role in (None, running.spec.role):
                 self._start(running)
 
     def poll(self) -> list[Ending]:
-        """Reap what ended, start again what is due."""
+        """Reaps processes which ended, and starts those which are due."""
         endings = []
         for running in self.running:
             if running.process is not None and running.process.exitcode is not None:
@@ -126,9 +126,9 @@ class LocalSwarm:
         self,
         while_waiting: Callable[[], None] = lambda: None,
         before_role: Callable[[str], None] = lambda _: None,
-        hurry: Callable[[], bool] = lambda: False,
+        force: Callable[[], bool] = lambda: False,
     ) -> list[str]:
-        """End everything, role by role. Returns a sentence for each process that did not end as asked."""
+        """Ends all processes, role by role. Returns a sentence for each that did not end as asked."""
         for running in self.running:
             running.due_s = None
         roles = [*STOP_ORDER, *sorted({r.spec.role for r in self.running} - set(STOP_ORDER))]
@@ -137,11 +137,11 @@ class LocalSwarm:
             of_role = [running for running in self.running if running.spec.role == role and running.alive]
             if of_role:
                 before_role(role)
-                failures += self._stop(of_role, while_waiting, hurry)
+                failures += self._stop(of_role, while_waiting, force)
         return failures
 
     def kill(self) -> None:
-        """End everything at once and without asking."""
+        """Kills all processes."""
         for running in self.running:
             running.due_s = None
             if running.process is not None:
@@ -161,49 +161,49 @@ class LocalSwarm:
         with _without_main():
             process.start()
         tell.close()
-        running.process, running.words = process, listen
+        running.process, running.pipe = process, listen
         running.began_s, running.due_s = time.monotonic(), None
 
     def _ended(self, running: Running, process: ForkServerProcess) -> Ending:
-        """Decide what follows on an end that nobody asked for."""
-        words = self._last_words(running, process)
+        """Decides what follows an unexpected end."""
+        reason = self._exit_reason(running, process)
         self._forget(running)
         now_s = time.monotonic()
         restart = running.spec.restart == "always"
-        if words.refused:
+        if reason.refused:
             running.refusals += 1
-            # Whatever the first start refuses, the next will refuse too; later it may be the network.
+            # A refused first start will be refused again; a later refusal may be the network's.
             restart = restart and running.restarts > 0 and running.refusals < REFUSALS_ALLOWED
         wait_s = running.backoff.crashed(now_s - running.began_s) if restart else None
         if wait_s is not None:
             running.due_s = now_s + wait_s
-        return Ending(running.spec, words.sentence, words.exit_code, words.refused, wait_s, running.restarts + 1)
+        return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)
 
-    def _last_words(self, running: Running, process: ForkServerProcess) -> LastWords:
+    def _exit_reason(self, running: Running, process: ForkServerProcess) -> ExitReason:
         code = process.exitcode if process.exitcode is not None else 1
         if code == 255 and process.pid is not None:
-            # The forkserver is gone, and with it the word of how its children fare: two of one id must not run.
+            # The forkserver is gone and reports no more ends: kill, because two processes of one id must not run.
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL)
         with contextlib.suppress(EOFError, OSError):
-            if running.words is not None and running.words.poll():
-                words = running.words.recv()
-                assert isinstance(words, LastWords)
-                return words
+            if running.pipe is not None and running.pipe.poll():
+                reason = running.pipe.recv()
+                assert isinstance(reason, ExitReason)
+                return reason
         if code < 0:
-            return LastWords(f"killed by {signal.Signals(-code).name}", 1, refused=False)
+            return ExitReason(f"killed by {signal.Signals(-code).name}", 1, refused=False)
         how = "ended by itself" if code == 0 else f"ended with exit code {code}"
-        return LastWords(how, 1, refused=False)
+        return ExitReason(how, 1, refused=False)
 
     def _stop(
-        self, of_role: list[Running], while_waiting: Callable[[], None], hurry: Callable[[], bool]
+        self, of_role: list[Running], while_waiting: Callable[[], None], force: Callable[[], bool]
     ) -> list[str]:
         for running in of_role:
             assert running.process is not None
             running.process.terminate()
         deadline_s = time.monotonic() + STOP_GRACE_S
         waiting = list(of_role)
-        while waiting and time.monotonic() < deadline_s and not hurry():
+        while waiting and time.monotonic() < deadline_s and not force():
             while_waiting()
             waiting = [running for running in waiting if running.process and running.process.exitcode is None]
         failures = []
@@ -215,17 +215,17 @@ class LocalSwarm:
                 process.join(1.0)
                 failures.append(f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed")
             elif process.exitcode not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
-                words = self._last_words(running, process)
-                failures.append(f"{running.spec.name} was asked to end, but {words.sentence}")
+                reason = self._exit_reason(running, process)
+                failures.append(f"{running.spec.name} was asked to end, but {reason.sentence}")
             self._forget(running)
         return failures
 
     def _forget(self, running: Running) -> None:
-        if running.words is not None:
-            running.words.close()
+        if running.pipe is not None:
+            running.pipe.close()
         if running.process is not None:
             running.process.join(1.0)
-        running.process = running.words = None
+        running.process = running.pipe = None
 
 
 class WarmUp:
@@ -249,7 +249,7 @@ class WarmUp:
         self._thread.start()
 
     def done(self, timeout_s: float) -> bool:
-        """True when the next process starts without delay."""
+        """Whether the forkserver has loaded everything."""
         self._thread.join(timeout_s)
         if self._failure is not None:
             raise self._failure
@@ -266,12 +266,12 @@ class WarmUp:
 
 
 def _nothing() -> None:
-    """What the probe runs."""
+    """Does nothing; the probe's target."""
 
 
 @contextlib.contextmanager
 def _without_main() -> Iterator[None]:
-    """Keep multiprocessing from running the launcher's own script again in each child."""
+    """Keeps multiprocessing from running the launcher's own script in each child."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")
     try:

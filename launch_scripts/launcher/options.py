@@ -1,10 +1,11 @@
-"""From what a user typed to a scenario: names, overrides, endpoints and ports."""
+"""Turns command-line options into a scenario: names, overrides, endpoints, ports."""
 
 from __future__ import annotations
 
 import contextlib
 import difflib
 import errno
+import hashlib
 import secrets
 import socket
 import time
@@ -13,14 +14,15 @@ from pathlib import Path
 import msgspec
 
 from swarm.config.load import check_endpoint, load_scenario
-from swarm.config.scenario import NetworkConfig, Scenario, TlsConfig
+from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
+from swarm.wire.fields import check_id
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
 def find_scenario(name: str) -> Scenario:
-    """A built-in scenario by its name, or one from a file."""
+    """Loads a built-in scenario by name, or one from a file."""
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         return load_scenario(path)
@@ -41,7 +43,7 @@ def with_network(
     namespace: str | None = None,
     tls: TlsConfig | None = None,
 ) -> Scenario:
-    """The scenario with other endpoints. Raises ConfigError where they would leave the machine in the clear."""
+    """The scenario with other endpoints. Raises ConfigError where they would leave the machine unencrypted."""
     network = scenario.network
     tls = tls or network.tls
     changes: dict[str, object] = {"tls": tls}
@@ -86,7 +88,7 @@ def with_port(scenario: Scenario, port: int) -> Scenario:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports of 127.0.0.1 that nobody listens on now."""
+    """Ports of 127.0.0.1 which are free now."""
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
         for each in sockets:
@@ -95,7 +97,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
-    """Raises BusError where something listens already on a port that this machine is to listen on."""
+    """Raises BusError if a port that this machine needs is taken."""
     wanted: list[tuple[str, str, int]] = []
     if "router" in roles:
         wanted += [("the router", *host_port(endpoint)) for endpoint in scenario.network.listen]
@@ -111,7 +113,7 @@ def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
 
 
 def host_port(endpoint: str) -> tuple[str, int]:
-    """Of an endpoint such as tcp/[::1]:7447."""
+    """Host and port of an endpoint such as tcp/[::1]:7447."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     return host.strip("[]"), int(port)
 
@@ -137,21 +139,29 @@ def _taken(host: str, port: int) -> bool:
 
 
 def new_run_id() -> str:
-    """Names a run: when it began, and four digits that tell it from another of the same second."""
+    """Id of a new run: the time, and four hexadecimal digits."""
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
 
 
-def make_run_dir(runs: Path, name: str) -> Path:
-    """A new folder for a run. Raises StoreError if it cannot be made."""
+def common_run_id(scenario: Scenario) -> str:
+    """Names the run that parts of a swarm belong to which are started on several machines, each by itself: the same
+    for the same scenario, wherever it meets."""
+    same = msgspec.structs.replace(scenario, network=NetworkConfig(), monitor=MonitorConfig())
+    digest = hashlib.blake2b(msgspec.json.encode(same, order="deterministic"), digest_size=4).hexdigest()
+    return f"{scenario.name}-{digest}"
+
+
+def make_run_dir(runs: Path, run_id: str) -> Path:
+    """The folder of a run on this machine: what belongs to the run, such as a keeper's store, is found there again
+    when its processes are started anew. Raises ConfigError on an id that no folder may have, StoreError where the
+    folder cannot be made."""
     try:
-        for suffix in ("", *(f"-{n}" for n in range(2, 100))):
-            run_dir = runs / f"{name}{suffix}"
-            try:
-                run_dir.mkdir(parents=True)
-                return run_dir.resolve()
-            except FileExistsError:
-                if not runs.is_dir():
-                    break
+        check_id("run id", run_id)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    run_dir = runs / run_id
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(f"cannot make a run folder in {runs}: {error.strerror or error}") from error
-    raise StoreError(f"cannot make a run folder in {runs}: it is no folder or holds this second's runs already")
+    return run_dir.resolve()

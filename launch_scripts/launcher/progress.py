@@ -15,8 +15,8 @@ _PATIENCE_S = 1.0
 
 
 @contextlib.contextmanager
-def bars() -> Iterator[Tell]:
-    """A bar per kind of work, on a terminal only."""
+def progress() -> Iterator[Tell]:
+    """Yields what draws one bar per kind of work, on a terminal only and after the first second."""
     started_s = time.monotonic()
     columns = (
         TextColumn("{task.description}"),
@@ -24,14 +24,14 @@ def bars() -> Iterator[Tell]:
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         tasks: dict[str, TaskID] = {}
 
         def tell(what: str, share: float) -> None:
             if what not in tasks:
                 if time.monotonic() - started_s < _PATIENCE_S:
                     return
-                tasks[what] = progress.add_task(what, total=1.0)
-            progress.update(tasks[what], completed=share)
+                tasks[what] = shown.add_task(what, total=1.0)
+            shown.update(tasks[what], completed=share)
 
         yield tell

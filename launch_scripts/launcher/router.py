@@ -1,29 +1,29 @@
-"""The router: a zenoh session in router mode that passes everybody's messages on, and a member of the run."""
+"""The router: a Zenoh session in router mode that passes on all messages."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 
-from shared_map.terrain.terrain import load_terrain
 from swarm.bus.bus import Bus, Event, Post
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
-from swarm.errors import RunMismatchError
+from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.membership import Member
+from swarm.runtime.membership import NO_RUN, Member
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.processes import RunInfo
 
-log = logging.getLogger(__name__)
-
 
 class RouterService:
-    """Answers which run this is. A stranger in the namespace ends by itself: the router only tells of it."""
+    """Belongs to no run, so it may be stopped, started again and replaced while runs go on around it."""
 
-    def __init__(self, info: RunInfo, bus: Bus, post: Post) -> None:
+    def __init__(self, peer: Peer, bus: Bus, post: Post) -> None:
+        info = RunInfo(
+            run_id=NO_RUN, role=peer.role, id=peer.id, incarnation=peer.incarnation, scenario="", terrain="",
+            rows=0, cols=0, resolution_m=0.0, started_ns=peer.incarnation,
+        )  # fmt: skip
         self._member = Member(info, bus, post)
 
     @property
@@ -34,12 +34,7 @@ class RouterService:
         self._member.join()
 
     def handle(self, event: Event, now_ns: int) -> None:
-        try:
-            self._member.handle(event)
-        except RunMismatchError as error:
-            log.warning("%s", error)
-            self.counters.count("strangers")
-            self._member.note(now_ns, "stranger", str(error))
+        self._member.handle(event)
 
     def tick(self, now_ns: int) -> None:
         self._member.tick(now_ns)
@@ -49,10 +44,9 @@ class RouterService:
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
-    terrain = load_terrain(setup)
     clock, inbox = MonotonicClock(), Inbox()
     with open_bus(setup.scenario.network, mode="router") as bus:
-        service = RouterService(setup.info(terrain.grid, terrain.digest), bus, inbox.post)
+        service = RouterService(Peer(setup.role, setup.id, setup.incarnation), bus, inbox.post)
         process = Process(service, inbox, clock, tick_hz=2.0)
         process.stop_on_signals()
         if stop_when is not None:

@@ -1,4 +1,4 @@
-"""The terrain of a run on this machine: from the scenario's files, or where they are missing from a keeper."""
+"""Terrain of a run on this machine: from the scenario's files, or from a keeper where they are missing."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from swarm.wire.messages.processes import RunInfo
 log = logging.getLogger(__name__)
 
 _LOOK = frozenset(("monitor", "keeper"))
-"""Roles that want the photo, too: a keeper hands on what it fetched."""
+"""Roles that need the photo too. A keeper hands it on."""
 
 
 def missing_files(scenario: Scenario) -> list[str]:
-    """The files that the terrain is made of and that are not here."""
+    """Files of the terrain which are missing on this machine."""
     terrain = scenario.terrain
     source = None if terrain.source in BUILT_IN_TERRAINS else terrain.source
     masks = [zone.mask for zone in scenario.cost.zones]
@@ -56,7 +56,7 @@ def fetch_if_missing(
         raise TerrainError(f"{why}, and nobody in the namespace could send the base map: start the keeper first")
     key = scenario_key(scenario)
     looks = not _LOOK.isdisjoint(roles)
-    with _alone(run_dir):
+    with _locked(run_dir):
         here = load_prepared(run_dir, key)
         if here is not None and (here.photo.any() or not looks):
             return True
@@ -72,8 +72,8 @@ def fetch_if_missing(
 
 
 @contextlib.contextmanager
-def _alone(run_dir: Path) -> Iterator[None]:
-    """Of processes that share a run's folder one fetches, the others wait for it."""
+def _locked(run_dir: Path) -> Iterator[None]:
+    """Lets one process at a time fetch into a run's folder."""
     try:
         lock = (run_dir / "terrain.lock").open("wb")
     except OSError as error:

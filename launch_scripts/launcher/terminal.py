@@ -44,8 +44,8 @@ REPORTED = {
 }
 
 
-class Screen:
-    """Shows how a run goes. With `as_json`, standard output stays free for the report."""
+class Terminal:
+    """Shows the progress of a run. With `as_json`, standard output stays free for the report."""
 
     def __init__(self, as_json: bool, plain: bool) -> None:
         self._console = Console(stderr=as_json, highlight=False, soft_wrap=True)
@@ -54,7 +54,7 @@ class Screen:
         self._due_s = 0.0
 
     def say(self, text: str, style: str | None = None) -> None:
-        """One line, above the table if there is one, and in the launcher's log."""
+        """Prints one line, above the table if there is one, and logs it."""
         log.info("%s", text)
         self._console.print(Text(text, style=style or ""))
         if not self._console.is_terminal:
@@ -78,7 +78,7 @@ class Screen:
         self._live.update(table, refresh=True)
 
     def report(self, numbers: Mapping[str, Any]) -> None:
-        """What a run came to."""
+        """Prints the numbers of a finished run."""
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():
             if name in REPORTED:
@@ -86,7 +86,7 @@ class Screen:
         self._console.print(table)
 
     def close(self) -> None:
-        """Leave the table as it stands."""
+        """Ends the live table and leaves its last state on the terminal."""
         if self._live is not None:
             self._live.stop()
             self._live = None

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from launch_scripts.launcher.child import log_to
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
-from launch_scripts.launcher.options import check_ports, listening, make_run_dir, new_run_id
-from launch_scripts.launcher.progress import bars
+from launch_scripts.launcher.options import check_ports, common_run_id, listening, make_run_dir, new_run_id
+from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
-from launch_scripts.launcher.terminal import Screen
+from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import ROLES, ProcessSpec, processes_of
 from launch_scripts.report.recorder import Recorder
@@ -28,7 +28,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, SwarmError
-from swarm.runtime.membership import check_same_run
+from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -44,10 +44,10 @@ _QUIET_NOTES = frozenset({"live_view"})
 
 @dataclass(frozen=True, slots=True)
 class UpOptions:
-    """What a user chose.
+    """Options of a run.
 
     joins      there is a router elsewhere: none is started here
-    run_id     the run to take part in; if None, a new one, or that of the namespace where only `roles` are started
+    run_id     the run to take part in; if None it is made or found
     began_s    time.monotonic() at which the command was given
     table      other processes than the scenario's
     """
@@ -65,7 +65,7 @@ class UpOptions:
 
 
 class _RefusedError(SwarmError):
-    """One of our processes said why it cannot run."""
+    """A process of this run refused to start, with its reason."""
 
     def __init__(self, ending: Ending) -> None:
         super().__init__(f"{ending.spec.name}: {ending.sentence}")
@@ -86,7 +86,7 @@ class _StopAsked:
     def __bool__(self) -> bool:
         return self.times > 0
 
-    def hurry(self) -> bool:
+    def force(self) -> bool:
         return self.times > 1
 
 
@@ -94,29 +94,44 @@ def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     if not options.joins:
         check_ports(options.scenario, options.roles)
-    run_dir = make_run_dir(options.runs, time.strftime("%Y%m%d-%H%M%S"))
+    run_id = _run_id(options)
+    run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / "launcher.log")
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
-    return _Run(options, run_dir).run()
+    return _Run(options, run_id, run_dir).run()
+
+
+def _run_id(options: UpOptions) -> str:
+    """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario."""
+    if options.run_id is not None:
+        return options.run_id
+    if set(ROLES[1:]) <= set(options.roles):
+        return new_run_id()
+    if options.joins:
+        with open_bus(options.scenario.network) as bus:
+            found = ask_run(bus)
+        if found:
+            return found[0].run_id
+    return common_run_id(options.scenario)
 
 
 class _Run:
-    """The run in hand, all of it on the main thread."""
+    """A run in progress; all of it happens on the main thread."""
 
-    def __init__(self, options: UpOptions, run_dir: Path) -> None:
+    def __init__(self, options: UpOptions, run_id: str, run_dir: Path) -> None:
         self._options = options
         self._scenario = options.scenario
         self._run_dir = run_dir
-        self._run_id = options.run_id or new_run_id()
+        self._run_id = run_id
         self._started_ns = time.time_ns()
-        self._screen = Screen(options.as_json, options.plain)
+        self._terminal = Terminal(options.as_json, options.plain)
         self._stop_asked = _StopAsked()
         specs = list(options.table or processes_of(self._scenario, options.roles))
         self._swarm = LocalSwarm(specs, self._setup_of, run_dir)
         self._startup_s: float | None = None
 
     def run(self) -> int:
-        # One thread each: the processes share the cores already, and idle helpers would be in the way of forking.
+        # One thread each: the processes share the cores already, and idle threads make a fork unsafe.
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         warm_up = WarmUp(list(self._options.preload))
         warm_up.begin()
@@ -146,22 +161,22 @@ class _Run:
                 finally:
                     failures = self._stop(watcher)
         finally:
-            self._screen.close()
+            self._terminal.close()
             self._swarm.kill()
         self._report(watcher.recorder, seconds)
         if self._startup_s is None and not self._stop_asked:
             failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
         for failure in failures:
-            self._screen.say(failure, "red")
+            self._terminal.say(failure, "red")
         return 1 if failures else 0
 
     def _prepared(self) -> tuple[Terrain, Floats]:
-        """Built of its files; where one is missing and there is a swarm to join, as its keeper has it."""
+        """Builds the terrain from its files, or fetches it from a keeper where one is missing and a swarm runs."""
         if self._options.joins and missing_files(self._scenario):
             with open_bus(self._scenario.network) as bus:
                 found = ask_run(bus)
-            with bars() as progress:
-                fetch_if_missing(self._scenario, self._run_dir, found, roles=self._options.roles, progress=progress)
+            with progress() as tell:
+                fetch_if_missing(self._scenario, self._run_dir, found, roles=self._options.roles, progress=tell)
             setup = self._setup_of(ProcessSpec("launcher", "0", ""))
             terrain = load_terrain(setup)
             return terrain, load_truth(setup, terrain)
@@ -179,7 +194,7 @@ class _Run:
         )
 
     def _wait(self, text: str, done: Callable[[float], bool], within_s: float = 600.0) -> None:
-        """Until `done(timeout_s)` or a signal; says what for if it takes long."""
+        """Waits for `done(timeout_s)` or a signal, and says so if it takes long."""
         began_s = time.monotonic()
         said = False
         while not self._stop_asked and not done(_TURN_S):
@@ -188,7 +203,7 @@ class _Run:
                 raise BusError(f"gave up {text} after {within_s:g} s; see {self._run_dir}")
             if not said and waited_s > _PATIENCE_S:
                 said = True
-                self._screen.say(f"{text} ...")
+                self._terminal.say(f"{text} ...")
 
     def _router_listens(self, timeout_s: float) -> bool:
         self._raise_refusals(self._swarm.poll())
@@ -198,20 +213,17 @@ class _Run:
         return False
 
     def _join(self, bus: Bus) -> None:
-        """Refuse to share a namespace with another run; a part of a swarm belongs to the run that it finds."""
+        """Refuses to share a namespace with another run, or to start a process that runs already."""
         if not self._options.joins:
             return
         found = ask_run(bus)
-        if found and self._options.run_id is None and not set(ROLES[1:]) <= set(self._options.roles):
-            self._run_id = found[0].run_id
         mine = self._setup_of(ProcessSpec("launcher", "0", "")).info(self._terrain.grid, self._terrain.digest)
-        for other in found:
-            check_same_run(mine, other)
+        check_belongs(mine, found)
         for running in self._swarm.running:
             check_vacant(found, running.spec.role, running.spec.id)
 
     def _watch(self, watcher: Watcher) -> float:
-        """Until the time is over or somebody asks for the end. Returns how long the run lasted."""
+        """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = time.monotonic()
         while not self._stop_asked:
             self._raise_refusals(self._swarm.poll())
@@ -221,10 +233,10 @@ class _Run:
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 began_s = now_s
-                self._screen.say(
+                self._terminal.say(
                     f"all processes are alive and routes are served, {self._startup_s:.1f} s after launch"
                 )
-            # The time counts from when the swarm is up, but a swarm that never is must end, too.
+            # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
             if now_s - began_s >= limit_s:
                 break
@@ -243,15 +255,15 @@ class _Run:
     def _tell(self, watcher: Watcher) -> None:
         for note in watcher.take_notes():
             if note.kind == "live_view":
-                self._screen.say(f"live view: {note.text}", "bold")
+                self._terminal.say(f"live view: {note.text}", "bold")
             elif note.kind not in _QUIET_NOTES:
-                self._screen.say(f"{note.role}-{note.id}: {note.text}", "cyan")
-        if self._screen.due():
+                self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
+        if self._terminal.due():
             summary = watcher.recorder.summary(watcher.now_ns())
             title = f"{self._scenario.name}, {summary.elapsed_s:.0f} s" + (
                 f", live view {watcher.live_view}" if watcher.live_view else ""
             )
-            self._screen.show(title, summary, self._swarm.by_role(), self._swarm.restarts)
+            self._terminal.show(title, summary, self._swarm.by_role(), self._swarm.restarts)
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:
@@ -261,20 +273,20 @@ class _Run:
                 again = f"starts again in {ending.restart_in_s:g} s" + (
                     f", time {ending.times}" * (ending.times > 1)
                 )
-                self._screen.say(f"{ending.spec.name}: {ending.sentence}; {again}", "yellow")
+                self._terminal.say(f"{ending.spec.name}: {ending.sentence}; {again}", "yellow")
 
     def _stop(self, watcher: Watcher) -> list[str]:
-        """In order, hearing everybody's last words except the router's, which carries them."""
-        self._screen.say("stopping")
-        return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), hurry=self._stop_asked.hurry)
+        """Stops all roles in order, and records their last messages."""
+        self._terminal.say("stopping")
+        return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
 
     def _say_begin(self) -> None:
-        self._screen.say(
+        self._terminal.say(
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
             f"{len(self._swarm.running)} processes, {self._terrain.grid.rows} x {self._terrain.grid.cols} cells"
         )
         router = self._scenario.network.connect[0]
-        self._screen.say(f"router at {router}; logs, recording and report in {self._run_dir}")
+        self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 
     def _report(self, recorder: Recorder, seconds: float) -> None:
         report = write_report(
@@ -292,5 +304,5 @@ class _Run:
         if self._options.as_json:
             print(json.dumps(numbers, indent=2))
         else:
-            self._screen.report(numbers)
-            self._screen.say(f"report: {self._run_dir / 'report.json'}, picture: {self._run_dir / 'report.png'}")
+            self._terminal.report(numbers)
+            self._terminal.say(f"report: {self._run_dir / 'report.json'}, picture: {self._run_dir / 'report.png'}")

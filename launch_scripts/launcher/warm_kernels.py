@@ -1,4 +1,4 @@
-"""Imported by the forkserver before it forks: loads what the roles need, so that each of them starts in a blink.
+"""Imported by the forkserver before it forks: loads all roles, so that each starts at once.
 
 Compiling on import is this module's whole job. Kernels that numba has cached on disk take seconds, new ones up to
 a minute; either is paid once for all processes instead of once for each.
@@ -26,7 +26,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def _die_with_launcher() -> None:
-    """kill -9 of the launcher while kernels compile must not leave this process behind."""
+    """Ends this process with the launcher, even after kill -9 while kernels compile."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 

@@ -1,4 +1,4 @@
-"""The launcher's ears: what it hears of the swarm, fed to the recorder."""
+"""Subscribes the launcher's recorder to the swarm."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Re
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.membership import NO_RUN
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo
@@ -20,14 +21,14 @@ _ASK_TIMEOUT_S = 1.0
 
 
 class Watcher:
-    """Hears without being heard: no member of the run, so that its absence changes nothing."""
+    """Listens only. It is no member of the run, so that its absence changes nothing."""
 
     def __init__(self, bus: Bus, recorder: Recorder, clock: Clock) -> None:
         self.recorder = recorder
         self.notes: list[Note] = []
         self.live_view: str | None = None
         self.ever_up: set[tuple[str, str]] = set()
-        """(role, id) of those whose token has been up."""
+        """(role, id) of processes whose liveliness token has been seen."""
         self.routes_served = False
         self._bus = bus
         self._clock = clock
@@ -39,7 +40,7 @@ class Watcher:
         self._bus.watch_alive(self._inbox.post)
 
     def listen(self, for_s: float) -> None:
-        """Take in what arrives, for so long."""
+        """Takes in what arrives for some seconds."""
         until_s = time.monotonic() + for_s
         while True:
             left_s = until_s - time.monotonic()
@@ -53,7 +54,7 @@ class Watcher:
         return self._clock.now_ns()
 
     def take_notes(self) -> list[Note]:
-        """What processes wanted a person to know since the last call."""
+        """Notes of processes to the user since the last call."""
         notes, self.notes = self.notes, []
         return notes
 
@@ -81,8 +82,8 @@ class Watcher:
         self.notes.append(note)
 
 
-def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S) -> list[RunInfo]:
-    """Who is in the namespace, as everybody there answers."""
+def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:
+    """Members of the run in the namespace, as each answers for itself; with `routers` those, too."""
     inbox = Inbox()
     bus.ask(RUN, Nothing(), inbox.post, tag=_TAG, timeout_s=timeout_s)
     found: list[RunInfo] = []
@@ -90,14 +91,15 @@ def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S) -> list[RunInfo]:
     while time.monotonic() < deadline_s:
         match inbox.take(0.1):
             case Replied(message=RunInfo() as info):
-                found.append(info)
+                if routers or info.run_id != NO_RUN:
+                    found.append(info)
             case AskEnded():
                 break
     return found
 
 
 def check_vacant(found: list[RunInfo], role: str, id: str) -> None:
-    """Raises RunMismatchError if that process is in the namespace already: two would move the same vehicles."""
+    """Raises RunMismatchError if that process is running already: two would move the same vehicles."""
     for info in found:
         if (info.role, info.id) == (role, id):
             raise RunMismatchError(f"{role} {id} takes part in run {info.run_id} already; stop it first")

@@ -1,1 +1,1 @@
-"""The live view: subscribes, keeps a replica of the map, and tells rerun."""
+"""The live view: subscribes, keeps a replica of the map, and logs to rerun."""

@@ -1,4 +1,4 @@
-"""How the live view is arranged."""
+"""Layout of the live view."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TRAIL_S = 25.0
 
 
 def make_blueprint(ground: Ground) -> rrb.Blueprint:
-    """The mountains on the left; figures, plots and the log on the right."""
+    """The 3D view on the left; figures, plots and the log on the right."""
     return rrb.Blueprint(
         rrb.Horizontal(
             _view_3d(ground),

@@ -1,4 +1,4 @@
-"""The only place that speaks rerun's language: arrays of the scene in, log calls out.
+"""The only module that logs to rerun: takes the scene's arrays.
 
 Few entities with many instances each, arrays instead of lists, style logged once: see what was measured in
 docs/decisions/0008-the-live-view.md.
@@ -32,7 +32,7 @@ _PLOT_COLOURS = [
 
 
 class Drawing:
-    """Tells one recording stream what the scene is."""
+    """Logs the scene to one recording stream."""
 
     def __init__(self, rec: rr.RecordingStream, ground: Ground, target_ids: Sequence[str]) -> None:
         self._rec = rec
@@ -43,12 +43,12 @@ class Drawing:
         self._target_ids_drawn: list[str] = []
 
     def set_time(self, frame: int, seconds: float) -> None:
-        """When all that follows happened. What is logged before the first call shows on no timeline."""
+        """Sets the time of all that follows. What is logged before the first call is on no timeline."""
         self._rec.set_time("tick", sequence=frame)
         self._rec.set_time("sim_time", duration=seconds)
 
     def begin(self) -> None:
-        """The ground's shape, and how everything will look."""
+        """Logs what never changes: the terrain's mesh and the styles."""
         rec, ground = self._rec, self._ground
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for tile in ground.mesh_tiles():
@@ -89,7 +89,7 @@ class Drawing:
         self._rec.log(f"plots/{plot}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
 
     def texture(self, tile: int, image: Bytes) -> None:
-        """The photo of a tile, marks and all. Not static: a late viewer gets what was sent of late."""
+        """Logs the photo of a tile, with its marks. Not static: a viewer which joins late gets only recent data."""
         height, width, _ = image.shape
         self._rec.log(
             f"world/ground/{tile}",
@@ -102,7 +102,7 @@ class Drawing:
         )
 
     def vehicles(self, points: Points) -> None:
-        """Places each time, colours and ids only where they changed."""
+        """Logs places each time, colours and ids only when they have changed."""
         same = points.ids == self._vehicle_ids
         if same and np.array_equal(points.colours, self._vehicle_colours):
             self._rec.log("world/vehicles", rr.Points3D.from_fields(positions=points.positions))
@@ -115,7 +115,7 @@ class Drawing:
         )
 
     def targets(self, points: Points, poles: list[Floats], names: Floats) -> None:
-        """Balls on poles, and above each its name at `names`."""
+        """Logs balls on poles, each with its name at `names`."""
         rec = self._rec
         rec.log("world/targets/poles", rr.LineStrips3D.from_fields(strips=poles))
         if points.ids == self._target_ids_drawn:
@@ -132,12 +132,12 @@ class Drawing:
             rec.log("world/targets/names", labels)
 
     def sightings(self, points: Points, within_m: Floats) -> None:
-        """Balls as large as nobody knows better where the targets are."""
+        """Logs balls as large as the uncertainty of the sightings."""
         balls = rr.Points3D(points.positions, colors=points.colours, radii=within_m, labels=points.ids)
         self._rec.log("world/targets/sighted", balls)
 
     def trails(self, who: str, strips: list[Floats]) -> None:
-        """The newest piece of everybody's trail; the view shows the pieces of the last seconds together."""
+        """Logs the newest piece of each trail; the view shows those of the last seconds together."""
         if strips:
             self._rec.log(f"world/trails/{who}", rr.LineStrips3D.from_fields(strips=strips))
 
@@ -174,5 +174,5 @@ def _style(archetype: type[rr.LineStrips3D], colours: list[tuple[int, ...]], rad
 
 
 def _screen_points(radius: float) -> float:
-    """A radius that looks the same at every zoom: rerun takes negative ones for points of the screen."""
+    """A radius in points of the viewer's window, the same at every zoom: rerun takes negative radii so."""
     return -radius

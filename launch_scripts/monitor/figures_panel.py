@@ -1,4 +1,4 @@
-"""The figures beside the view, as markdown."""
+"""The figures beside the view, as Markdown."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _SHOWN_TARGETS = 12
 
 
 def level_of(kind: str) -> str:
-    """rerun's log level of a note."""
+    """Log level of a note, as rerun names it."""
     return "WARN" if any(word in kind for word in _WARNINGS) else "INFO"
 
 

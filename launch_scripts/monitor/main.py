@@ -8,7 +8,7 @@ from collections.abc import Callable
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.scene import Ground
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.monitor.sinks import Outlets, new_recording_path
+from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -16,9 +16,12 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
 
+_FRAME_HZ = 10.0
+"""How often the view is drawn: as often as vehicles publish their positions."""
+
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
-    """Record and show the run until SIGTERM, SIGINT or the end of the launcher."""
+    """Records and shows the run until SIGTERM, SIGINT or the end of the launcher."""
     config = setup.scenario.monitor
     terrain = load_terrain(setup)
     ground = Ground(terrain)
@@ -27,12 +30,10 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_bus(setup.scenario.network))
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
-        outlets = Outlets(recording_id, path, config, make_blueprint(ground))
-        stack.callback(outlets.close)
-        service = MonitorService(
-            setup, terrain, bus, inbox.post, outlets.rec, ground=ground, live_url=outlets.live_url
-        )
-        process = Process(service, inbox, MonotonicClock(), config.frame_hz)
+        sinks = Sinks(recording_id, path, config, make_blueprint(ground))
+        stack.callback(sinks.close)
+        service = MonitorService(setup, terrain, bus, inbox.post, sinks.rec, ground=ground, live_url=sinks.live_url)
+        process = Process(service, inbox, MonotonicClock(), _FRAME_HZ)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

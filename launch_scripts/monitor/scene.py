@@ -1,4 +1,4 @@
-"""What the live view shows, as arrays: no rerun, no bus, no clock.
+"""Arrays that the live view shows: no rerun, no bus, no clock.
 
 The view's metres: x to the east and y to the north of the grid's north-west corner, so y is never positive; z up,
 stretched so that gentle land still looks like land.
@@ -25,11 +25,11 @@ Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 MESH_TILE = 64
-"""Side of a mesh tile in texels: a changed mark sends one tile's texture again."""
+"""Side of a mesh tile in texels. A changed mark sends the texture of one tile again."""
 _MOST_TEXELS = 1 << 20
 _MOST_VERTICES = 1 << 17
 _RELIEF = 0.09
-"""The highest peak over the lowest valley, as a share of the terrain's width, that looks like mountains."""
+"""Height of the view, from the lowest to the highest cell, as a share of the terrain's width."""
 
 STATE_COLOURS = {
     VehicleState.IDLE: (150, 178, 158),
@@ -48,7 +48,7 @@ FAST_MARK = (90, 200, 250)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeshTile:
-    """A piece of the ground.
+    """A piece of the terrain's mesh.
 
     window     cells whose photo covers it, one row and column more than its own, so that pieces join without seams
     vertices   float32 (n, 3); triangles uint32 (m, 3); texcoords float32 (n, 2), 0..1 over the window's photo
@@ -100,11 +100,11 @@ class Ground:
 
     @property
     def scale_m(self) -> float:
-        """A length that looks the same share of any terrain."""
+        """Length in metres which is the same share of any terrain's width."""
         return max(self.width_m, self.depth_m) / 100
 
     def place(self, east_m: Floats, south_m: Floats, above_m: float = 0.0) -> Floats:
-        """Points on the ground, lifted by some metres of the view."""
+        """Points on the terrain, float32 (n, 3), lifted by some metres of the view."""
         east_m, south_m = np.asarray(east_m, np.float32), np.asarray(south_m, np.float32)
         seen = self._seen
         rows = np.clip(south_m / seen.resolution_m - 0.5, 0, seen.rows - 1)
@@ -119,7 +119,7 @@ class Ground:
         return np.stack([east_m, -south_m, up], axis=-1).astype(np.float32)
 
     def place_cells(self, cells: NDArray[np.integer], above_m: float = 0.0) -> Floats:
-        """The middles of cells."""
+        """Centres of cells on the terrain, float32 (n, 3)."""
         rows, cols = np.divmod(np.asarray(cells, np.int64), self.grid.cols)
         resolution_m = np.float32(self.grid.resolution_m)
         return self.place(
@@ -129,7 +129,7 @@ class Ground:
         )
 
     def mesh_tiles(self) -> list[MeshTile]:
-        """The whole ground."""
+        """All tiles of the terrain's mesh."""
         return [self._mesh_tile(index) for index in range(self.tile_rows * self.tile_cols)]
 
     def tile_window(self, index: int) -> Window:
@@ -143,7 +143,7 @@ class Ground:
         )
 
     def tiles_touching(self, window: Window) -> list[int]:
-        """Tiles whose photo shows cells of a window."""
+        """Indices of the tiles whose photo shows cells of a window."""
         reach = self.step
         rows = range(max(window.row0 - reach, 0) // self.tile_cells, (window.row1 - 1) // self.tile_cells + 1)
         cols = range(max(window.col0 - reach, 0) // self.tile_cells, (window.col1 - 1) // self.tile_cells + 1)
@@ -170,7 +170,7 @@ class Ground:
         )
 
     def texture(self, window: Window, pace: Floats, prior: Floats) -> Bytes:
-        """The photo of a window with what the map has learnt laid over: `pace` is believed now, `prior` was.
+        """Photo of a window with all marks drawn in: where `pace`, as known now, differs from `prior`.
 
         However many cells a texel shows, a mark on one of them is seen."""
         part = (slice(window.row0, window.row1), slice(window.col0, window.col1))
@@ -236,7 +236,7 @@ def target_points(ground: Ground, places_m: Mapping[str, tuple[float, float]]) -
 
 
 def sighting_points(ground: Ground, seen: Mapping[str, Sighted]) -> tuple[Points, Floats]:
-    """Where targets were seen last, and float32 (n,) within how many metres."""
+    """Where targets were seen last, and their uncertainty in metres, float32 (n,)."""
     grid = ground.grid
     east_m = np.array([each.x_m - grid.west_m for each in seen.values()], np.float32)
     south_m = np.array([grid.north_m - each.y_m for each in seen.values()], np.float32)
@@ -246,19 +246,19 @@ def sighting_points(ground: Ground, seen: Mapping[str, Sighted]) -> tuple[Points
 
 
 def label_places(ground: Ground, targets: Points) -> Floats:
-    """Where the names of targets stand: above them."""
+    """Places of the targets' names: above them."""
     names: Floats = targets.positions + np.array([0, 0, 3.4 * ground.scale_m], np.float32)
     return names
 
 
 def poles(ground: Ground, targets: Points) -> list[Floats]:
-    """A line from each target's place down to the ground."""
+    """A line from each target down to the terrain."""
     feet = ground.place(targets.positions[:, 0], -targets.positions[:, 1])
     return [np.stack([foot, top]) for foot, top in zip(feet, targets.positions, strict=True)]
 
 
 def window_outline(ground: Ground, window: Window) -> Floats:
-    """The border of a window, laid over the ground."""
+    """The border of a window, laid over the terrain."""
     rows = np.clip([window.row0, window.row1 - 1], 0, ground.grid.rows - 1)
     cols = np.clip([window.col0, window.col1 - 1], 0, ground.grid.cols - 1)
     east, west = (np.full(_along(rows), col) for col in (cols[1], cols[0]))
@@ -274,7 +274,7 @@ def _along(ends: NDArray[np.integer]) -> int:
 
 
 def route_strip(ground: Ground, cells: NDArray[np.integer], most: int = 64) -> Floats:
-    """A route over the ground, with few enough points that a hundred of them weigh little."""
+    """A route over the terrain, thinned so that a hundred routes stay cheap to draw."""
     if len(cells) > most:
         cells = cells[np.unique(np.linspace(0, len(cells) - 1, most).astype(int))]
     return ground.place_cells(cells, 0.2 * ground.scale_m)
@@ -282,13 +282,13 @@ def route_strip(ground: Ground, cells: NDArray[np.integer], most: int = 64) -> F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RouteNow:
-    """A route that a vehicle has begun, as the cells it leads over."""
+    """A route that a vehicle has begun: its cells."""
 
     target: str
     cells: NDArray[np.int64]
 
     def ahead_of(self, cell: int) -> NDArray[np.int64]:
-        """What is left of it from a cell on; all of it if the cell is not on it."""
+        """The route from a cell on; the whole route if the cell is not on it."""
         found = np.flatnonzero(self.cells == cell)
         return self.cells[found[-1] :] if len(found) else self.cells
 
@@ -301,14 +301,14 @@ def cell_at(grid: GridSpec, east_m: float, south_m: float) -> int:
 
 
 class Trails:
-    """Where each thing went since it was last drawn: one strip each, that joins the one drawn before."""
+    """Trails since the last drawing: one strip per id, which joins the one before."""
 
     def __init__(self, longest_m: float) -> None:
         self._longest_m = longest_m
         self._last: dict[str, Floats] = {}
 
     def advance(self, ids: Iterable[str], positions: Floats) -> list[Floats]:
-        """Strips from the last places to these; none for what stands still, is new, or jumped."""
+        """Strips from the last places to these; none for ids which stand still, are new, or jumped."""
         strips = []
         for id, position in zip(ids, positions, strict=True):
             last = self._last.get(id)

@@ -1,4 +1,4 @@
-"""A still of a recorded run, as the picture in the README is made. Needs a Vulkan driver; no screen.
+"""Screenshot of a recorded run, such as the README's. Needs a Vulkan driver and no display.
 
 python -m launch_scripts.monitor.screenshot runs/LAST/run.rrd docs/images/live-view.png --at 60
 """
@@ -22,7 +22,7 @@ _START_WITHIN_S = 30.0
 
 
 def take_still(recording: Path, picture: Path, at_s: float | None, size: tuple[int, int], settle_s: float) -> None:
-    """Show a recording in the headless viewer and save what it shows, `at_s` seconds into the run."""
+    """Opens a recording in the headless viewer and saves its view, `at_s` seconds into the run."""
     from rerun.experimental import ViewerClient
 
     with socket.socket() as probe:

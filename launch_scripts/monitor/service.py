@@ -1,4 +1,4 @@
-"""The monitor's shell: everything that is said in the swarm, told to rerun frame by frame.
+"""The monitor's shell: draws what it hears of the swarm, frame by frame.
 
 It only listens. It may be late, stalled, killed or absent; nobody waits for it.
 """
@@ -29,7 +29,7 @@ from launch_scripts.report.latest_state import VehicleNow
 from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder, messages_per_s
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post
@@ -47,7 +47,7 @@ from swarm.wire.topics import MARKS, SIGHTED
 
 _TRAILS_NS = NS_PER_S // 2
 _ROUTES_NS = 3 * NS_PER_S // 2
-"""How long until the routes to every target were drawn anew."""
+"""Period in which the routes to every target are drawn once."""
 _TEXTURES_PER_FRAME = 8
 _REFRESH_NS = NS_PER_S
 _ROUTES_SHOWN = 400
@@ -57,8 +57,8 @@ _ANNOUNCE_NS = NS_PER_S // 2
 class MonitorService:
     """Shows a run on a recording stream.
 
-    rec       whose sinks are set already
-    live_url  where people can watch; told to everybody once
+    rec       a recording stream whose sinks are set
+    live_url  address of the live view; published once
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class MonitorService:
         self.counters: Counters = self._member.counters
         self._cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, self._cost_map)
-        self._feed = MapFeed(replica, bus, post, setup.scenario.map, setup.role)
+        self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role)
         self._ground = ground or Ground(terrain)
         self._target_ids = setup.scenario.target_ids
         self._drawing = Drawing(rec, self._ground, self._target_ids)
@@ -92,7 +92,7 @@ class MonitorService:
         self._target_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
         self._routes: dict[str, RouteNow] = {}
         self._stale_tiles: dict[int, None] = {}
-        self._sightings = Sightings(replica.reading)
+        self._sightings = Sightings(replica.filter)
         self._sighted: Mapping[str, Sighted] = {}
         self._fleets_new = self._targets_new = self._windows_new = False
         self._frame = 0
@@ -110,7 +110,7 @@ class MonitorService:
                 self._bus.subscribe(topic, self._post)
         self._bus.subscribe(SIGHTED, self._post)
         self._bus.watch_alive(self._post)
-        self._feed.start(now_ns)
+        self._sync.start(now_ns)
         self._drawing.set_time(0, 0.0)
         self._drawing.begin()
         self._stale_tiles = dict.fromkeys(range(self._ground.tile_rows * self._ground.tile_cols))
@@ -120,7 +120,7 @@ class MonitorService:
         if isinstance(event, Appeared | Disappeared):
             self._alive(event.peer, isinstance(event, Appeared), now_ns)
             return
-        if self._member.handle(event) or self._feed.handle(event, now_ns):
+        if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         if not isinstance(event, Heard):
             return
@@ -142,8 +142,8 @@ class MonitorService:
                 self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
     def tick(self, now_ns: int) -> None:
-        """One frame."""
-        self._feed.tick(now_ns)
+        """Draws one frame."""
+        self._sync.tick(now_ns)
         self._member.tick(now_ns)
         self._announce(now_ns)
         self._frame += 1
@@ -176,7 +176,7 @@ class MonitorService:
         self._routes[followed.vehicle] = RouteNow(followed.target, np.array(cells, np.int64))
 
     def _announce(self, now_ns: int) -> None:
-        """Say where to watch, once the links have had time to learn who listens."""
+        """Publishes the live view's address, once links have had time to learn of subscribers."""
         if self._live_url is not None and now_ns - self._started_ns >= _ANNOUNCE_NS:
             self._member.note(now_ns, "live_view", self._live_url)
             self._live_url = None
@@ -187,7 +187,7 @@ class MonitorService:
     # --- out ----------------------------------------------------------------------------------------------------
 
     def _refresh(self, now_ns: int) -> None:
-        """Send one texture again: a viewer that joins late has only what the server still holds."""
+        """Sends one texture again: a viewer which joins late has only what the server still holds."""
         self._refresh_due_ns = now_ns + _REFRESH_NS
         self._stale_tiles[self._next_refresh] = None
         self._next_refresh = (self._next_refresh + 1) % (self._ground.tile_rows * self._ground.tile_cols)
@@ -229,14 +229,14 @@ class MonitorService:
             self._draw_windows()
 
     def _draw_windows(self) -> None:
-        """Which part of its tree each planner grew last; the whole terrain is no news."""
+        """Draws the window that each planner grew last, unless it is the whole terrain."""
         told = [status.window for _, status in sorted(self.recorder.observed.status.items())]
         windows = [Window(*window) for window in told if window]
         parts = [window for window in windows if not window.empty and window.cells < self._terrain.grid.cells]
         self._drawing.windows([window_outline(self._ground, window) for window in parts])
 
     def _draw_routes(self, now_ns: int, vehicles: dict[str, VehicleNow]) -> None:
-        """The routes to one target after the other, each what is left of it."""
+        """Draws what is left of the routes, one target after the other."""
         if now_ns < self._routes_due_ns or not self._target_ids:
             return
         self._routes_due_ns = now_ns + _ROUTES_NS // len(self._target_ids)

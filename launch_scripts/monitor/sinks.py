@@ -1,4 +1,4 @@
-"""Where the recording goes: a file, and viewers on this machine."""
+"""Sinks of the recording: a file, and viewers on this machine."""
 
 from __future__ import annotations
 
@@ -22,12 +22,14 @@ log = logging.getLogger(__name__)
 
 APPLICATION = "terrain-swarm"
 _PORT_PATIENCE_S = 3.0
+_MEMORY = "256MiB"
+"""What the stream keeps for viewers that come later; the oldest goes first."""
 
 T = TypeVar("T")
 
 
 def new_recording_path(folder: Path) -> Path:
-    """`run.rrd`, or `run-2.rrd` and so on where an earlier monitor left one: nothing is ever overwritten."""
+    """`run.rrd`, or `run-2.rrd` and so on where an earlier monitor left one: no file is overwritten."""
     for n in range(1, 10_000):
         path = folder / ("run.rrd" if n == 1 else f"run-{n}.rrd")
         try:
@@ -40,8 +42,8 @@ def new_recording_path(folder: Path) -> Path:
     raise StoreError(f"{folder} is full of recordings")
 
 
-class Outlets:
-    """A recording stream and where it flows. `close` takes seconds at most, whatever a disk or a viewer does."""
+class Sinks:
+    """A recording stream and its sinks. `close` takes seconds at most, even if a disk or a viewer hangs."""
 
     def __init__(
         self, recording_id: str, path: Path | None, config: MonitorConfig, blueprint: rrb.Blueprint
@@ -50,23 +52,22 @@ class Outlets:
             APPLICATION, recording_id=recording_id, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.1)
         )
         self.stream_url: str | None = None
-        """What a native viewer connects to."""
+        """Address for a native viewer."""
         self._page: ViewerPage | None = None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         if path is not None:
             sinks.append(rr.FileSink(path, write_footer=True))
         if config.live:
-            grpc_port = _patiently(_free_port, config.grpc_port, "grpc_port")
+            grpc_port = _when_free(_free_port, config.grpc_port, "grpc_port")
             self.stream_url = stream_url = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
-            page = _patiently(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
+            page = _when_free(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
             self._page = page
-            limit = f"{config.memory_mib}MiB"
-            sinks.append(rr.GrpcServerSink(bind_ip=LOOPBACK, port=grpc_port, server_memory_limit=limit))
+            sinks.append(rr.GrpcServerSink(bind_ip=LOOPBACK, port=grpc_port, server_memory_limit=_MEMORY))
         self.rec.set_sinks(*sinks, default_blueprint=blueprint)
 
     @property
     def live_url(self) -> str | None:
-        """Where a browser on this machine sees the run."""
+        """Address for a browser on this machine."""
         return None if self._page is None else self._page.url
 
     def close(self, within_s: float = 3.0) -> None:
@@ -84,8 +85,8 @@ class Outlets:
         self.rec.disconnect()
 
 
-def _patiently(listen: Callable[[int], T], port: int, name: str) -> T:
-    """Listen on a port, also if it only soon becomes free, as after a restart. Raises BusError."""
+def _when_free(listen: Callable[[int], T], port: int, name: str) -> T:
+    """Listens on a port, and waits for one which is still in use, as after a restart. Raises BusError."""
     deadline_s = time.monotonic() + _PORT_PATIENCE_S
     while True:
         try:

@@ -1,4 +1,4 @@
-"""The viewer's page, on loopback only, and with no way out to the internet.
+"""Serves the viewer's page on loopback only; its policy lets it load nothing from the internet.
 
 rerun's own function serves to the whole network, and its page calls home, for usage data among other things. The
 page's files are found only inside the viewer program, so it is started for a moment when the first visitor comes.
@@ -30,7 +30,7 @@ LOOPBACK = "127.0.0.1"
 _FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/sw.js")
 _READY_WITHIN_S = 20.0
 _HEADERS = {
-    # Whatever the page wants of other hosts (usage data, fonts, news of releases) it does not get.
+    # No requests to other hosts: usage data, fonts, release news.
     "Content-Security-Policy": (
         "default-src 'self' blob: data:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
         f"style-src 'self' 'unsafe-inline'; worker-src 'self' blob:; connect-src 'self' http://{LOOPBACK}:*"
@@ -67,7 +67,7 @@ class ViewerPage:
         self._server.server_close()
 
     def entrance(self, path: str) -> str | None:
-        """Where a visitor without a query is to be sent."""
+        """Redirect of a visit without a query."""
         return self._entrance if path == "/" else None
 
     def file(self, path: str) -> _File | None:

@@ -1,1 +1,1 @@
-"""What a run leaves behind: the recorder, report.json, report.png."""
+"""The report of a run: recorder, report.json, report.png."""

@@ -1,4 +1,4 @@
-"""Light on a terrain: what makes mountains look like mountains."""
+"""Hillshade of a terrain."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def hillshade(elevation_m: NDArray[np.float32], resolution_m: float) -> NDArray[np.float32]:
-    """0 to 1: the light of a low sun in the north-west on each cell; 0.7 in voids."""
+    """Light of a low sun in the north-west on each cell, 0 to 1; 0.7 in voids."""
     if min(elevation_m.shape) < 2:
         return np.full(elevation_m.shape, 0.7, np.float32)
     south, east = np.gradient(elevation_m.astype(np.float64), resolution_m)

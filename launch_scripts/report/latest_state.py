@@ -1,4 +1,4 @@
-"""The newest of everything that processes tell about a run: where all are, what they counted, what they marked.
+"""Newest message of every sender of a run: positions, counts, marks.
 
 Pure: the launcher, the monitor and the simulation feed it with what they heard on `RECORDED_TOPICS`.
 """
@@ -26,7 +26,7 @@ from swarm.wire.statements import MarkKind
 
 @dataclass(frozen=True, slots=True)
 class VehicleNow:
-    """Where a vehicle was last heard of. `target` is None while it has none."""
+    """Last reported place of a vehicle. `target` is None while it has none."""
 
     east_m: float
     south_m: float
@@ -37,7 +37,7 @@ class VehicleNow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkedCells:
-    """The newest statement per marked cell, over all authors."""
+    """Newest statement per marked cell, over all authors."""
 
     cells: NDArray[np.int64]
     kinds: NDArray[np.uint8]
@@ -45,7 +45,7 @@ class MarkedCells:
 
 
 class Observed:
-    """Keeps the newest message per sender, so its memory does not grow with time."""
+    """Keeps the newest message per sender, so that its memory does not grow with time."""
 
     def __init__(self, grid: GridSpec) -> None:
         self.grid = grid
@@ -99,10 +99,10 @@ class Observed:
     def _seen(self, role: str, id: str, incarnation: int) -> None:
         self._incarnations.setdefault((role, id), set()).add(incarnation)
 
-    # --- who --------------------------------------------------------------------------------------------------
+    # --- processes ------------------------------------------------------------------------------------------------
 
     def up(self) -> list[tuple[str, str]]:
-        """(role, id) of every process that is alive now."""
+        """(role, id) of all processes which are alive now."""
         return sorted(key for key, incarnations in self._alive.items() if incarnations)
 
     def is_up(self, role: str, id: str) -> bool:
@@ -110,7 +110,7 @@ class Observed:
 
     @property
     def processes(self) -> int:
-        """How many there have been, restarts not counted."""
+        """Number of processes so far, restarts not counted."""
         return len(self._incarnations)
 
     @property
@@ -118,10 +118,10 @@ class Observed:
         """Later incarnations of processes that were there before."""
         return sum(len(incarnations) - 1 for incarnations in self._incarnations.values())
 
-    # --- where ------------------------------------------------------------------------------------------------
+    # --- places ---------------------------------------------------------------------------------------------------
 
     def vehicles(self) -> dict[str, VehicleNow]:
-        """Every vehicle as last heard of, in order of id."""
+        """Last reported state of every vehicle, in order of id."""
         now: dict[str, VehicleNow] = {}
         for fleet in sorted(self._fleets.values(), key=lambda fleet: (fleet.stamp_ns, fleet.seq)):
             rows = zip(
@@ -173,22 +173,22 @@ class Observed:
             np.array([pace for _, _, pace in kept], np.float32),
         )
 
-    # --- how much ---------------------------------------------------------------------------------------------
+    # --- counts ---------------------------------------------------------------------------------------------------
 
     def total(self, name: str) -> int | None:
-        """A count, summed over processes and incarnations; None if no process ever told of it."""
+        """A count, summed over processes and incarnations; None if no process has published it."""
         told = [stats.counts[name] for stats in self._stats.values() if name in stats.counts]
         return sum(told) if told else None
 
     @property
     def messages(self) -> int:
-        """Sent by all processes since each was first heard of: grows evenly, also for who joins late."""
+        """Messages sent by all processes since each was first heard: grows evenly, even for a late observer."""
         return sum(
             stats.counts.get("messages_out", 0) - self._messages_before[key] for key, stats in self._stats.items()
         )
 
     def gauge(self, name: str) -> float | None:
-        """A gauge, summed over the newest incarnation of each process; None if nobody told of it."""
+        """A gauge, summed over the newest incarnation of each process; None if no process has published it."""
         newest: dict[tuple[str, str], Stats] = {}
         for (role, id, incarnation), stats in self._stats.items():
             if (role, id) not in newest or incarnation > newest[role, id].incarnation:
@@ -197,12 +197,12 @@ class Observed:
         return sum(told) if told else None
 
     def histogram(self, name: str) -> Histogram:
-        """What all incarnations of all processes observed under a name."""
+        """Histogram of a name, over all incarnations of all processes."""
         return merged(stats.histograms.get(name, {}) for stats in self._stats.values())
 
 
 def count_states(vehicles: Mapping[str, VehicleNow]) -> tuple[int, ...]:
-    """How many vehicles are in each VehicleState, in its order."""
+    """Number of vehicles in each VehicleState, in its order."""
     counts = [0] * len(VehicleState)
     for vehicle in vehicles.values():
         counts[vehicle.state] += 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from swarm.wire.messages.vehicles import VehicleState
 
-# Okabe and Ito's colours: told apart by nearly everybody, and of different lightness.
+# Okabe and Ito's colours: safe for colour-blind readers, and of different lightness.
 GREEN, DARK_GREEN, RED, BLUE = "#009E73", "#00754f", "#D1330A", "#0072B2"
 ORANGE, SKY, PINK, VIOLET = "#E69F00", "#56B4E9", "#CC79A7", "#4a1486"
 YELLOW, BLACK, GREY = "#FFD21F", "#1b1b1b", "#b8bcc0"

@@ -1,4 +1,4 @@
-"""The one-page picture of a run: the map with all tracks, and the plots that tell how it went."""
+"""One-page picture of a run: the map with all tracks, and plots over time."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _SHOWN_LABELS = 30
 def save_picture(
     path: Path, recorder: Recorder, report: dict[str, Any], terrain: Terrain, truth: NDArray[np.float32] | None
 ) -> None:
-    """Draw the run and write it as PNG."""
+    """Draws the run and writes it as PNG."""
     with mpl.rc_context(STYLE):
         figure = draw(recorder, report, terrain, truth)
         canvas = FigureCanvasAgg(figure)
@@ -60,7 +60,7 @@ def draw(recorder: Recorder, report: dict[str, Any], terrain: Terrain, truth: ND
     return figure
 
 
-# --- the head: what it was, and the figures that matter ---------------------------------------------------------
+# --- the head: scenario and main figures ---------------------------------------------------------
 
 
 def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
@@ -141,7 +141,7 @@ def _draw_map(axes: Axes, recorder: Recorder, terrain: Terrain, truth: NDArray[n
 
 
 def _ground(terrain: Terrain) -> NDArray[np.float32]:
-    """The photo under a sun from the north-west, paled so that tracks stand out."""
+    """The photo with hillshade, paled so that tracks stand out."""
     shade = hillshade(terrain.elevation_m, terrain.grid.resolution_m)
     photo = terrain.photo.astype(np.float32) / 255
     grey = photo.mean(axis=2, keepdims=True)
@@ -151,7 +151,7 @@ def _ground(terrain: Terrain) -> NDArray[np.float32]:
 
 
 def _draw_unknown(axes: Axes, terrain: Terrain, truth: NDArray[np.float32]) -> None:
-    """Outline what is true and not on the map: the marks fill in what was found of it."""
+    """Outlines hidden obstacles of the truth; marks fill in those that were found."""
     hidden = (truth != terrain.ground_s_per_m) & ~(np.isinf(truth) & np.isinf(terrain.pace_s_per_m))
     if not hidden.any():
         return
@@ -221,7 +221,7 @@ def _draw_strips(
 
 
 def _label(axes: Axes, text: str, x: float, y: float, recorder: Recorder) -> None:
-    """Beside the place, on the side where there is room."""
+    """Annotates beside the place, on the side where the text fits."""
     grid = recorder.grid
     right = x * 1000 < 0.94 * grid.cols * grid.resolution_m
     below = y * 1000 < 0.04 * grid.rows * grid.resolution_m

@@ -1,4 +1,4 @@
-"""The plots beside the map: how a run went, over time."""
+"""Plots of a run over time, beside the map."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def _plot_timings(axes: Axes, recorder: Recorder) -> None:
 
 
 def density(histogram: Histogram) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Values and heights (largest 1) of a smoothed histogram, over the logarithm of the value."""
+    """Values and heights (largest 1) of a histogram, smoothed over the logarithm of the value."""
     buckets = {bucket: count for bucket, count in histogram.buckets.items() if bucket > -1000}
     if not buckets:
         return np.array([0.001, 0.002]), np.array([1.0, 0.0])
@@ -185,12 +185,12 @@ def _nothing(axes: Axes) -> None:
 
 
 def duration(milliseconds: float | None) -> str:
-    """As a person would say it."""
+    """A number for a person to read."""
     if milliseconds is None:
         return "–"
     return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1000:.3g} s"
 
 
 def halo() -> list[Any]:
-    """Makes text readable on anything."""
+    """Outline which keeps text readable on any background."""
     return [withStroke(linewidth=2.6, foreground="white")]

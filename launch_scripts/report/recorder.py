@@ -1,6 +1,6 @@
-"""What happened in a run: messages in, numbers out. The launcher, the monitor and the simulation use the same.
+"""Records a run: takes messages, returns numbers. Launcher, monitor and simulation share it.
 
-Pure: time is an argument, and whoever owns a bus feeds it with what it heard on `RECORDED_TOPICS`.
+Pure: time is an argument, and the owner of a bus feeds it with what comes on `RECORDED_TOPICS`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SAMPLE_NS = NS_PER_S
 _SAMPLES_KEPT = 4096
 _NOTES_KEPT = 1000
 _CAPTURES_AT_ONCE = 100
-"""More between two poses is nobody's count: a message must not fill the memory."""
+"""Most captures counted between two poses: a hostile message must not fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Capture:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The run at one instant. `states` counts vehicles per VehicleState; totals are None until anybody tells."""
+    """The run at one instant. `states` counts vehicles per VehicleState; totals are None until published."""
 
     time_s: float
     states: tuple[int, ...]
@@ -64,7 +64,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class TargetLine:
-    """One row of the live table. `nearest_m` is how far the nearest vehicle is."""
+    """One row of the live table. `nearest_m` is the distance of the nearest vehicle."""
 
     id: str
     planner_up: bool
@@ -78,7 +78,7 @@ class TargetLine:
 
 @dataclass(frozen=True, slots=True)
 class LiveSummary:
-    """What the live table shows."""
+    """The figures of the live table."""
 
     elapsed_s: float
     targets: tuple[TargetLine, ...]
@@ -93,7 +93,7 @@ class LiveSummary:
 
 
 class Recorder:
-    """Everything worth keeping of what was heard, in memory that does not grow with the rate of messages."""
+    """Samples, tracks, captures and notes of a run, in memory which does not grow with the rate of messages."""
 
     def __init__(self, scenario: Scenario, grid: GridSpec) -> None:
         self.scenario = scenario
@@ -116,7 +116,7 @@ class Recorder:
         self._unproven = 0
 
     def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
-        """Take note of one message; `fields` are the chunks of its key."""
+        """Records one message; `fields` are the chunks of its key."""
         self._touch(now_ns)
         match message:
             case TargetPose():
@@ -138,11 +138,11 @@ class Recorder:
         self._look(now_ns)
 
     def seconds(self, now_ns: int) -> float:
-        """Since the first thing heard."""
+        """Seconds since the first message."""
         return 0.0 if self.first_ns is None else (now_ns - self.first_ns) / NS_PER_S
 
     def missing(self) -> list[str]:
-        """The processes of the scenario that are not alive now, as `role id`."""
+        """Processes of the scenario which are not alive now, as `role id`."""
         up = self.observed.up()
         roles = {role for role, _ in up}
         return [
@@ -163,7 +163,7 @@ class Recorder:
         known = self.observed.poses.get(pose.target)
         if known is None or known.incarnation != pose.incarnation or pose.captures <= known.captures:
             return
-        # Where it stood before: by now it may already have turned up elsewhere.
+        # The place before the capture: the target may already stand elsewhere.
         capture = Capture(self.seconds(now_ns), pose.target, *self.observed.place_m(known))
         self.captures += [capture] * min(pose.captures - known.captures, _CAPTURES_AT_ONCE)
 
@@ -215,7 +215,7 @@ class Recorder:
         )
 
     def summary(self, now_ns: int) -> LiveSummary:
-        """The numbers of the live table."""
+        """The figures of the live table at a time."""
         observed = self.observed
         vehicles = observed.vehicles()
         rates = messages_per_s(list(self.samples)[-2:])
@@ -259,7 +259,7 @@ class Recorder:
         restarts: int | None = None,
         startup_s: float | None = None,
     ) -> dict[str, Any]:
-        """The numbers of the run. What nobody measured is None; what the caller knows better, it gives."""
+        """The numbers of the run, None where not measured. The caller gives what it knows better."""
         if seconds is None and self.first_ns is not None and self.last_ns is not None:
             seconds = (self.last_ns - self.first_ns) / NS_PER_S
         observed, total = self.observed, self.observed.total
@@ -301,7 +301,7 @@ class Recorder:
         return {name: _rounded(value) for name, value in fields.items()}
 
     def series(self, points: int = 120) -> dict[str, list[Any]]:
-        """How it went, at no more than about so many instants: lists of one value each per `t_s`."""
+        """The run over time, at about `points` instants at most: lists with one value per `t_s`."""
         samples = list(self.samples)
         samples = samples[:: max(1, -(-len(samples) // points))]
         names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
@@ -338,7 +338,7 @@ def quantiles(histogram: Histogram) -> dict[str, float | None]:
 
 
 def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
-    """(time, rate) between successive samples, from when processes began to tell."""
+    """(time, rate) between successive samples, from the first published count on."""
     return [
         (late.time_s, max(late.messages - early.messages, 0) / (late.time_s - early.time_s))
         for early, late in itertools.pairwise(samples)
@@ -347,7 +347,7 @@ def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
 
 
 def _expected(scenario: Scenario) -> list[tuple[str, str]]:
-    """(role, id) of the processes without which a run is not whole; "" stands for any id."""
+    """(role, id) of the processes that a complete run has; "" stands for any id."""
     driven = any(target.walk != "external" for target in scenario.targets)
     return [
         ("keeper", ""),
@@ -358,7 +358,7 @@ def _expected(scenario: Scenario) -> list[tuple[str, str]]:
 
 
 def _excess(histogram: Histogram) -> dict[str, float | None]:
-    """Of a histogram of gap - 1, the gaps."""
+    """Gaps from a histogram of gap - 1."""
     values = {"mean": histogram.mean(), "p95": histogram.quantile(0.95), "max": histogram.quantile(1.0)}
     return {name: None if value is None else 1.0 + value for name, value in values.items()}
 
@@ -377,7 +377,7 @@ def _whole(value: float | None) -> int | None:
 
 
 def _rounded(value: Any) -> Any:
-    """Six digits are more than anything here is measured to; what JSON cannot say is None."""
+    """Rounds to six digits, finer than any measurement here. What JSON cannot express becomes None."""
     if isinstance(value, dict):
         return {name: _rounded(item) for name, item in value.items()}
     if isinstance(value, float):

@@ -1,4 +1,4 @@
-"""Where many things went, in bounded memory."""
+"""Tracks of vehicles and targets, in bounded memory."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 TrackKey = tuple[str, int]
-"""Who, and which piece of its track: a target that turns up elsewhere begins a new piece."""
+"""Id, and piece of its track: a target which jumps begins a new piece."""
 
 
 class Tracks:
@@ -26,7 +26,7 @@ class Tracks:
         return self._due_ns is None or now_ns >= self._due_ns
 
     def add(self, now_ns: int, keys: Sequence[TrackKey], places_m: NDArray[np.float32]) -> None:
-        """One sampling: `places_m` has a row (east, south) per key."""
+        """Adds one sample per key: `places_m` has a row (east, south) for each."""
         self._due_ns = now_ns + self._interval_ns
         if not keys:
             return
@@ -38,7 +38,7 @@ class Tracks:
             self._interval_ns *= 2
 
     def lines(self) -> dict[TrackKey, NDArray[np.float32]]:
-        """Per key its places in order of time: rows (east, south), in metres."""
+        """Places per key in order of time: rows (east, south), in metres."""
         points: dict[TrackKey, list[NDArray[np.float32]]] = {}
         for _, keys, places in self._samplings:
             for key, place in zip(keys, places, strict=True):

@@ -1,4 +1,4 @@
-"""What a run leaves behind for people: `report.json` and `report.png`."""
+"""Writes `report.json` and `report.png`."""
 
 from __future__ import annotations
 
@@ -25,24 +25,15 @@ def write_report(
     terrain: Terrain,
     *,
     truth: NDArray[np.float32] | None = None,
-    run_id: str | None = None,
-    seconds: float | None = None,
-    processes: int | None = None,
-    restarts: int | None = None,
-    startup_s: float | None = None,
-    extra: dict[str, Any] | None = None,
+    **measured: Any,
 ) -> dict[str, Any]:
-    """Write both files and return the numbers. Raises StoreError if the folder cannot be written.
+    """Writes both files and returns the numbers. Raises StoreError if the folder cannot be written.
 
-    truth  what the ground was like, to outline what the map did not know; None if that is a secret or unknown
-    extra  further fields for report.json
+    truth     true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
+    measured  what the caller knows better than the recorder, as `Recorder.report` takes it
     """
-    report = recorder.report(
-        run_id=run_id, seconds=seconds, processes=processes, restarts=restarts, startup_s=startup_s
-    )
     report = {
-        **report,
-        **(extra or {}),
+        **recorder.report(**measured),
         "version": importlib.metadata.version("terrain-swarm"),
         "terrain": {
             "digest": terrain.digest,
@@ -75,7 +66,7 @@ def _draw(
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Whole or not at all."""
+    """Replaces a file atomically."""
     partial = path.with_name(path.name + ".part")
     with partial.open("wb") as file:
         file.write(content)

@@ -15,7 +15,7 @@ from swarm.clock import NS_PER_S
 
 
 class EventLog:
-    """Counts deliveries; writes them if there is somewhere to write to."""
+    """Counts deliveries, and writes them if there is a file."""
 
     def __init__(self, began_ns: int, out: TextIO | None) -> None:
         self.deliveries = 0

@@ -1,4 +1,4 @@
-"""What goes wrong in a simulation: a plan that a seed makes, and the links that follow it.
+"""Faults of a simulation: a plan made from a seed, and the links that follow it.
 
 Nodes are named as processes are: "keeper-0", "planner-t3", "agent-a1". Times are seconds since the run began.
 """
@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 from swarm.clock import NS_PER_S
 
 RELINK_S = 0.3
-"""How long a client needs to find its router again: the retry period, and a session's start."""
+"""Seconds until a client has found its router again: the retry period, and a session's start."""
 OBSERVER = "recorder-0"
-"""The node that writes the report: nothing goes wrong with it, or the report would."""
+"""The node that writes the report. No fault touches it, or the report would be wrong."""
 _NS_PER_MS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Partition:
-    """These nodes and all others do not reach each other for a while; among themselves they do."""
+    """Cuts these nodes off from all others for a while. Among themselves they stay connected."""
 
     from_s: float
     until_s: float
@@ -29,7 +29,7 @@ class Partition:
 
 @dataclass(frozen=True, slots=True)
 class Crash:
-    """A process is killed: nothing is said, nothing saved. It is started again after a backoff."""
+    """Kills a process as kill -9 does. It starts again after a backoff."""
 
     at_s: float
     node: str
@@ -37,14 +37,14 @@ class Crash:
 
 @dataclass(frozen=True, slots=True)
 class FaultPlan:
-    """Everything that goes wrong in one run.
+    """All faults of one run.
 
     drop        share of messages that are lost
     duplicate   share that arrive twice
-    reorder     share that later ones overtake
-    delay_ms    every message takes this long, and up to jitter_ms more
-    quiet_s     from here on messages are neither lost, repeated nor reordered; None is never
-    skews_ms    how far a node's clock is off
+    reorder     share that later messages overtake
+    delay_ms    delay of every message; up to jitter_ms more are added by chance
+    quiet_s     from this second on no message is lost, repeated or reordered; None: never
+    skews_ms    by how much each node's clock is wrong
     """
 
     drop: float = 0.0
@@ -59,7 +59,7 @@ class FaultPlan:
 
 
 class FaultyLinks:
-    """The `LinkModel` of a plan. Messages of one node to another keep their order, but those that are reordered."""
+    """The `LinkModel` of a plan. Messages from one node to another keep their order unless they are reordered."""
 
     def __init__(self, plan: FaultPlan, chance: random.Random, began_ns: int, lease_s: float) -> None:
         self._plan = plan
@@ -101,7 +101,7 @@ class FaultyLinks:
         )
 
     def noticed(self, partition: Partition) -> bool:
-        """Whether it lasts longer than the lease, so that sessions end and tokens fall."""
+        """Whether a partition outlasts the lease, so that sessions end and liveliness tokens fall."""
         return partition.until_s - partition.from_s > self._lease_s
 
     def _cut(self, partition: Partition, at_s: float) -> bool:
@@ -117,7 +117,7 @@ def _apart(partition: Partition, source: str, destination: str) -> bool:
 
 
 def random_plan(seed: int, nodes: Sequence[str], seconds: float) -> FaultPlan:
-    """A plan for a run of these nodes: faults in its first two thirds, quiet in the last."""
+    """Draws a plan for a run of these nodes: faults in the first two thirds, none in the last."""
     chance = random.Random(f"faults/{seed}")
     quiet_s = seconds * 2 / 3
     partitions = []

@@ -33,21 +33,21 @@ from swarm.runtime.role import RoleSetup
 from vehicle_agent.service import AgentService
 
 EPOCH_NS = 1_800_000_000 * NS_PER_S
-"""When every simulation begins: a date, so that times look as they do in a real run."""
+"""Start of every simulation: a date, so that times look as in a real run."""
 SIMULATED_ROLES = ("keeper", "planner", "targets", "agent")
 BOOT_SPREAD_S = 0.3
 BACKOFF_S = 0.5
-"""How long after a crash a process is up again; each further crash within a minute doubles it."""
+"""Seconds from a crash to the next start; each further crash of the same process doubles them."""
 _STOP_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class SimulationResult:
-    """What came of a simulation.
+    """Outcome of a simulation.
 
     report      the numbers of report.json; the same for the same seed
-    deliveries  messages that arrived anywhere
-    wall_s      how long the simulation took on this machine
+    deliveries  number of messages that arrived
+    wall_s      seconds that it took on this machine
     """
 
     report: dict[str, Any]
@@ -64,7 +64,7 @@ class SimulationResult:
 
 
 class Node:
-    """One simulated process: its service, its bus, its ticks, its clock, and what survives it on disk."""
+    """A simulated process: service, bus, ticks, clock, and the store that survives a crash."""
 
     def __init__(self, simulation: Simulation, spec: ProcessSpec, phase_ns: int, skew_ns: int) -> None:
         self.spec = spec
@@ -82,7 +82,7 @@ class Node:
         self._worker: InlineWorker | None = None
 
     def now_ns(self) -> int:
-        """What this node's clock says."""
+        """Time of this node's clock, its skew included."""
         return self._clock.now_ns() + self._skew_ns
 
     def boot(self) -> None:
@@ -132,7 +132,7 @@ class Node:
         self._simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
 
     def crash(self) -> None:
-        """As kill -9: no last words, nothing saved."""
+        """Ends the process as kill -9 does: nothing is published or saved."""
         if self.bus is None:
             return
         self._simulation.log.event(self._clock.now_ns(), "crash", self.name)
@@ -152,9 +152,9 @@ class Node:
 
 
 class Simulation:
-    """A run that can be advanced, looked into and disturbed. `simulate` is the short way.
+    """A run that tests advance, inspect and disturb. `simulate` runs one to its end.
 
-    after_tick  told of a node after each of its ticks, to look into it
+    after_tick  called with a node after each of its ticks
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class Simulation:
         self.scheduler.run_until(EPOCH_NS + int(seconds * NS_PER_S))
 
     def crash(self, name: str) -> None:
-        """Kill a node now, and start it again after its backoff."""
+        """Kills a node now, and starts it again after its backoff."""
         node = self.nodes[name]
         if node.bus is None:
             return
@@ -205,7 +205,7 @@ class Simulation:
         self.scheduler.after(int(backoff_s * NS_PER_S), node.boot)
 
     def finish(self) -> None:
-        """Ask every node to stop, in order, and let their last words arrive."""
+        """Asks every node to stop, in order, and lets their last messages arrive."""
         for role in STOP_ORDER:
             for node in self.nodes.values():
                 if node.spec.role == role:
@@ -221,7 +221,7 @@ class Simulation:
         return {**numbers, "simulated": True, "deliveries": self.log.deliveries}
 
     def _watch(self) -> None:
-        """Let the recorder hear all that it wants."""
+        """Subscribes the recorder to its topics."""
         bus = self.network.bus(OBSERVER, self.scenario.network.namespace)
         clock, recorder = self.scheduler.clock, self.recorder
 
@@ -248,7 +248,7 @@ class Simulation:
             if self.links.noticed(partition):
                 lost_s = partition.from_s + self.scenario.network.lease_s
                 self._at(lost_s, lambda nodes=nodes: self.network.relink(nodes, False))  # type: ignore[misc]
-                # Not a rounding too early: the links would still be cut, and nobody would ever look again.
+                # A rounding too early, the links would still be cut, and no second look follows.
                 found_s = partition.until_s + RELINK_S + 1e-6
                 self._at(found_s, lambda nodes=nodes: self.network.relink(nodes, True))  # type: ignore[misc]
 
@@ -271,11 +271,11 @@ def simulate(
     trace: TextIO | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> SimulationResult:
-    """Run a scenario to its end.
+    """Runs a scenario to its end.
 
     seed      instead of the scenario's own
     trace     where the event log is written
-    progress  told after each simulated second how many have passed
+    progress  called after each simulated second with the seconds that have passed
     """
     if seed is not None:
         scenario = msgspec.structs.replace(scenario, seed=seed)

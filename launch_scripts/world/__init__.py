@@ -1,1 +1,1 @@
-"""What is outside the swarm: targets that move on the true ground, and the referee who sees it."""
+"""The world outside the swarm: targets that move on the true terrain, and the referee."""

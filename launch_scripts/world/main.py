@@ -1,4 +1,4 @@
-"""The driver of the simulated targets, who is also the referee, as a process."""
+"""The process that moves the simulated targets and referees the run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TICK_HZ = 10.0
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
-    """Drive all targets of the scenario until SIGTERM, SIGINT or the end of the launcher."""
+    """Moves all targets of the scenario until SIGTERM, SIGINT or the end of the launcher."""
     terrain = load_terrain(setup)
     truth = load_truth(setup, terrain)
     inbox = Inbox()

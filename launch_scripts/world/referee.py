@@ -1,4 +1,4 @@
-"""The referee: from what vehicles report, who stood where for how long, and who broke a law. Pure.
+"""The referee: finds collisions and lethal entries in what vehicles report. Pure.
 
 A report of a vehicle holds from its stamp until the vehicle's next report. Where reports between two are missing
 (the sequence number jumps) and the vehicle moved meanwhile, the older one is known to hold at its stamp only.
@@ -17,14 +17,14 @@ from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Fleet
 
 _SKEW_NS = NS_PER_S // 200
-"""Overlaps shorter than this are within what the clocks of two processes may differ."""
+"""Shorter overlaps are no collision: the clocks of two processes may differ by as much."""
 _REMEMBER_NS = 5 * NS_PER_S
 _APART_NS = 2 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """Two vehicles on one cell at one time; told once per encounter."""
+    """Two vehicles on one cell at one time; reported once per encounter."""
 
     first: str
     second: str
@@ -34,7 +34,7 @@ class Collision:
 
 @dataclass(frozen=True, slots=True)
 class LethalEntry:
-    """A vehicle came to stand on a cell that is lethal in truth."""
+    """A vehicle entered a cell which is lethal in truth."""
 
     vehicle: str
     cell: int
@@ -43,7 +43,7 @@ class LethalEntry:
 
 @dataclass(slots=True, eq=False)
 class _Stay:
-    """A vehicle on a cell, from its first to its last proven moment there."""
+    """A vehicle on a cell, from the first to the last time at which it is known to be there."""
 
     vehicle: str
     cell: int
@@ -60,7 +60,7 @@ class _Vehicle:
 
 
 class Referee:
-    """Reports in, broken laws out. Repeated and late reports change nothing."""
+    """Turns reports into broken laws. Repeated and late reports change nothing."""
 
     def __init__(self, passable: NDArray[np.bool_]) -> None:
         self._passable = passable.ravel()
@@ -71,11 +71,11 @@ class Referee:
 
     @property
     def cells(self) -> NDArray[np.int64]:
-        """Where every vehicle was last."""
+        """Last known cell of every vehicle."""
         return np.fromiter((vehicle.stay.cell for vehicle in self._vehicles.values()), dtype=np.int64)
 
     def hear(self, fleet: Fleet) -> list[Collision | LethalEntry]:
-        """Take in a report. Cells outside the grid are nobody's business here."""
+        """Returns the laws that a report proves broken. Cells outside the grid are ignored."""
         broken: list[Collision | LethalEntry] = []
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
             if cell < len(self._passable):
@@ -123,7 +123,7 @@ class Referee:
                 yield Collision(first, second, stay.cell, until_ns)
 
     def _sweep(self, now_ns: int) -> None:
-        """Forget stays that ended long ago; whoever has not moved on since still stands there."""
+        """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""
         self._swept_ns = now_ns
         for cell in list(self._stays):
             kept = [

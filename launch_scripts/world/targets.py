@@ -1,4 +1,4 @@
-"""The simulated targets: where they are, how they move, who caught them, and who broke a law on the way.
+"""The simulated targets: where they are, how they move, and which vehicle captured them.
 
 `TargetWorld` is the core, `TargetsService` puts it on the bus. They know the truth; no planner or vehicle
 does.
@@ -72,7 +72,7 @@ class _Target:
 
 
 class TargetWorld:
-    """Targets and referee. Poses, reports and ticks in; poses, captures and broken laws out.
+    """Targets and referee. Takes poses, reports and ticks; returns poses, captures and broken laws.
 
     An incarnation that starts while planners run goes on where they last saw the targets. A capture counts once:
     a target that jumps is out of reach for a cool-down, one that stays must first have been alone for another.
@@ -111,7 +111,7 @@ class TargetWorld:
         return _Target(config, walker, *self._grid.centre_m(cell))
 
     def hear_planner(self, id: str, cell: int | None) -> None:
-        """Where a planner last saw a target that we have not placed ourselves; None if it knows no more than we."""
+        """Places a target where its planner last saw it, once; None if the planner does not know."""
         target = self._targets.get(id)
         if target is None or target.placed or target.config.walk == "external":
             return
@@ -128,13 +128,13 @@ class TargetWorld:
 
     @property
     def listening(self) -> bool:
-        """Whether any planner may still know something that we want to know."""
+        """Whether a planner may still answer where an unplaced target was."""
         return any(
             not t.placed and not t.unheard_of and t.config.walk != "external" for t in self._targets.values()
         )
 
     def hear_pose(self, pose: TargetPose) -> None:
-        """Where somebody else says that an external target is."""
+        """Takes the pose of an external target."""
         target = self._targets.get(pose.target)
         if target is not None and target.config.walk == "external" and 0 <= pose.cell < self._grid.cells:
             target.walker.put(pose.cell)
@@ -149,7 +149,7 @@ class TargetWorld:
         return actions
 
     def tick(self, now_ns: int) -> list[Action]:
-        """Move everybody on and tell where they are."""
+        """Moves all targets and returns their poses."""
         if self._started_ns is None:
             self._started_ns = self._ticked_ns = now_ns
         elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * self._time_scale
@@ -194,7 +194,7 @@ class TargetWorld:
         if not len(chasing):
             return []
         chased = chased[chasing]
-        # Where nobody is: a target that is not ours, or not placed yet.
+        # inf for targets of others and those which are not placed yet: no vehicle is near.
         known = [self._targets.get(id) for id in fleet.target_ids]
         places = [(t.x_m, t.y_m) if t is not None and t.placed else (math.inf, math.inf) for t in known]
         x_m, y_m = np.array(places).T

@@ -23,14 +23,14 @@ from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 Walk = Literal["still", "random", "waypoints", "evade", "external"]
 
 WAY_HALF_CELLS = 96
-"""Waypoints lie in a window this far to every side: bounds what a way costs, whatever the size of the terrain."""
+"""Waypoints lie in a window which reaches this far to every side: bounds the time to compute a way."""
 _TURN_SHARE = 1 / 20
 _FEAR_CELLS = 40
 _STEPS_PER_TICK = 1000
 
 
 class Ground:
-    """The true pace of every cell, and which steps are possible on it."""
+    """True pace of every cell, and the steps that are possible."""
 
     def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32]) -> None:
         self.grid = grid
@@ -45,7 +45,7 @@ class Ground:
         sizes = np.bincount(regions.ravel())
         sizes[0] = 0
         self.home: NDArray[np.int64] = np.flatnonzero(regions.ravel() == int(sizes.argmax()))
-        """The cells of the largest connected passable part."""
+        """Cells of the largest connected passable part, int64, ascending."""
 
     def lethal(self, cell: int) -> bool:
         return not self.passable.flat[cell]
@@ -54,7 +54,7 @@ class Ground:
         return int(self.home[chance.randrange(len(self.home))])
 
     def step(self, cell: int, direction: int) -> int | None:
-        """The cell that a step leads to; None where there is no such step."""
+        """The cell that a step leads to; None where the step is not possible."""
         row, col = divmod(cell, self.grid.cols)
         d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
         to_row, to_col = row + d_row, col + d_col
@@ -101,7 +101,7 @@ class Ground:
 
 
 def _steps_graph(pace: NDArray[np.float32]) -> csr_array[np.float64]:
-    """Every possible step of a window of pace as an edge that costs what entering its end costs."""
+    """Graph of all possible steps of a window of pace; an edge costs what entering its end costs."""
     rows, cols = pace.shape
     padded = np.full((rows + 2, cols + 2), np.inf)
     padded[1:-1, 1:-1] = pace
@@ -129,12 +129,12 @@ def _steps_graph(pace: NDArray[np.float32]) -> csr_array[np.float64]:
 
 @dataclass(eq=False)
 class Walker:
-    """One target under way: on `cell`, or `progress_s` into the step from there `towards` the next."""
+    """A target under way: on `cell`, or `progress_s` seconds into the step from there `towards` the next."""
 
     id: str
     walk: Walk
     slowness: float
-    """Its pace over that of the terrain, 1 or more."""
+    """Factor on the pace of the terrain."""
     chance: random.Random
     cell: int
     towards: int | None = None
@@ -144,14 +144,14 @@ class Walker:
     """Cells to come, the last first."""
 
     def put(self, cell: int) -> None:
-        """Turn up somewhere else."""
+        """Places the target elsewhere."""
         self.cell = cell
         self.towards = None
         self.progress_s = 0.0
         self.way = []
 
     def advance(self, ground: Ground, elapsed_s: float, vehicles: NDArray[np.int64], budget: Budget) -> None:
-        """Move on for a time on the terrain. `vehicles` are the cells that an evader keeps away from."""
+        """Moves on for some seconds. `vehicles` are the cells that an evader keeps away from."""
         if not math.isfinite(self.slowness):
             return
         for _ in range(_STEPS_PER_TICK):
@@ -167,7 +167,7 @@ class Walker:
             self.cell, self.towards, self.progress_s = self.towards, None, 0.0
 
     def position_m(self, ground: Ground) -> tuple[float, float]:
-        """(x_m, y_m), on the line between two cells' middles while under way."""
+        """(x_m, y_m); while under way on the line between the centres of two cells."""
         x_m, y_m = ground.grid.centre_m(self.cell)
         if self.towards is None:
             return x_m, y_m
@@ -181,7 +181,7 @@ class Walker:
         return ground.length_m(self.cell, self.towards) * pace * self.slowness
 
     def choose(self, ground: Ground, vehicles: NDArray[np.int64], budget: Budget) -> int | None:
-        """The cell of its next step; None if it stays, as one does that stands still or waits for the budget."""
+        """The cell of the next step; None while the target stands still or waits for the budget."""
         match self.walk:
             case "random":
                 return self._wander(ground)
@@ -206,7 +206,7 @@ class Walker:
         return None
 
     def _flee(self, ground: Ground, vehicles: NDArray[np.int64]) -> int | None:
-        """To the neighbour that is least crowded by the vehicles near enough to be feared."""
+        """The neighbour with the fewest and farthest vehicles around it; a random one while none is near."""
         row, col = ground.grid.row_col(self.cell)
         rows, cols = np.divmod(vehicles, ground.grid.cols)
         near = np.maximum(abs(rows - row), abs(cols - col)) <= _FEAR_CELLS
@@ -224,7 +224,7 @@ class Walker:
 
 @dataclass
 class Budget:
-    """How many ways may still be computed in this tick; the other walkers wait for the next."""
+    """Number of ways that may still be computed in this tick. Other walkers wait for the next."""
 
     ways: int = 1
 

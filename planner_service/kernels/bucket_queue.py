@@ -1,34 +1,31 @@
-"""The exact tree of one root: a flood over a ring of buckets, and the parents that follow from its costs.
+"""Exact growth with a bucket queue (R. B. Dial, "Algorithm 360: Shortest-path forest with topological ordering",
+Communications of the ACM 12(11), 1969, 632-633), and a breadth-first search to compare it with.
 
-The graph is grown from the root backward. A step from u to its neighbour v costs weight[v] * length, so a settled v
-offers all its neighbours the same key: cost[v] + weight[v]. Ordered by that exit key, the first touch of a cell
-is final. Octile steps make two keys per cell, straight and diagonal.
+All neighbours of a cell are offered the same exit key per kind of step (see `layout`). Cells leave the queue in the
+order of their exit keys, so that the first offer to a cell is its least, and its cost is final at first touch: no
+key is ever decreased. Octile steps make two keys per cell, straight and diagonal. Parents follow from the costs.
+
+Arrays, beside those of `layout`:
+    touched  uint32  (size + 1,)      padded cells that got their cost from the last bucket
+    batch    uint32  (size + _AHEAD,) padded cells of the bucket that is being served
+    queue    tuple                    `_make_queue` says
 
 What the loops look like was measured, and small changes cost much: cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
-out of the chunks of their bucket into one row before they make their offers.
+out of the chunks of their bucket into one row before they make their offers. So the four and eight offers are
+written out here, and share no function with the offers of other kernels.
 
-Arrays are laid out as `rules` says. Indices are unsigned 64-bit: signed ones make numba test for negative ones,
-which blocks vectorisation. A uint64 meets only uint64 here, because with an int64 it would silently become float64.
-Scratch is allocated for the worst case; of what is not written, the system keeps no page.
+Indices are unsigned 64-bit: signed ones make numba test for negative ones, which blocks vectorisation. A uint64
+meets only uint64 here, because with an int64 it would silently become float64. Scratch is allocated for the worst
+case; of what is not written, the system keeps no page.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from planner_service.kernels.layout import (
-    HUGE,
-    INF,
-    NONE,
-    RULE_FOUR,
-    RULE_OCTILE,
-    RULE_PAPER,
-    SQRT2,
-    TOO_FINE,
-    WALL,
-)
+from planner_service.kernels.compile import njit
+from planner_service.kernels.layout import INF, RULE_OCTILE, RULE_PAPER, SQRT2, TOO_FINE, WALL, step_offsets
 from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
@@ -40,22 +37,22 @@ _AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048."""
 
 
-@njit(cache=True, nogil=True)
-def _open_costs(weight, cost):
-    """Before a flood: inf on passable cells, WALL on the others."""
-    for i in range(weight.size):
-        cost[i] = INF if weight[i] < INF else WALL
+@njit
+def _open_costs(cell_cost, cost):
+    """Before a growth: inf on passable cells, WALL on the others."""
+    for i in range(cell_cost.size):
+        cost[i] = INF if cell_cost[i] < INF else WALL
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _close_costs(cost):
-    """After a flood: inf on lethal cells too."""
+    """After a growth: inf on lethal cells too."""
     for i in range(cost.size):
         c = cost[i]
         cost[i] = c if c >= _ZERO32 else INF
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _make_queue(buckets, items):
     """A queue of cells in `buckets`, for at most `items` at once, in chunks of 2**_CHUNK_BITS cells.
 
@@ -80,17 +77,18 @@ def _make_queue(buckets, items):
     return pool, link, spare, counts, head, tail, np.uint64(shift)
 
 
-@njit(cache=True, nogil=True)
-def _choose(weight, cost, length, inverse, least, cells, count, buckets):
+@njit
+def _choose(cell_cost, cost, length, inverse, least, cells, count, buckets):
     """buckets := which one each cell's exit key falls into, `least` at least."""
     for i in range(count):
         v = np.uint64(cells[i])
-        buckets[i] = max(np.int32((cost[v] + weight[v] * length) * inverse), least)
+        buckets[i] = max(np.int32((cost[v] + cell_cost[v] * length) * inverse), least)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _put(queue, cells, count, buckets, ring, first):
-    """Put cells into the queue, each into its bucket modulo `ring`, of the ring that begins at bucket `first`."""
+    """Put cells into the queue, each into its bucket modulo `ring`, of the circular queue that begins at bucket
+    `first`."""
     pool, link, spare, counts, _, tail, shift = queue
     low = (_ONE << shift) - _ONE
     mask = ring - _ONE
@@ -111,7 +109,7 @@ def _put(queue, cells, count, buckets, ring, first):
         tail[b] = t
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _take(queue, b, batch):
     """Move all cells of a bucket to `batch`. Returns how many."""
     pool, link, spare, counts, head, tail, shift = queue
@@ -134,23 +132,23 @@ def _take(queue, b, batch):
     return n + (end - position)
 
 
-@njit(cache=True, nogil=True)
-def _ask_for(weight, cost, s, u):
-    prefetch(weight, u)
+@njit
+def _ask_for(cell_cost, cost, s, u):
+    prefetch(cell_cost, u)
     prefetch(cost, u - s)
     prefetch(cost, u)
     prefetch(cost, u + s)
 
 
-@njit(cache=True, nogil=True)
-def _offer_straight(weight, cost, s, batch, n, touched):
+@njit
+def _offer_straight(cell_cost, cost, s, batch, n, touched):
     """Offer their exit keys to four neighbours. Writes the cells that had no cost yet to `touched`; returns how
     many."""
     count = _ZERO
     for p in range(n):
-        _ask_for(weight, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
         u = np.uint64(batch[p])
-        key = cost[u] + weight[u]
+        key = cost[u] + cell_cost[u]
         north, west, east, south = cost[u - s], cost[u - _ONE], cost[u + _ONE], cost[u + s]
         for i, old in ((u - s, north), (u - _ONE, west), (u + _ONE, east), (u + s, south)):
             cost[i] = min(old, key)
@@ -159,13 +157,13 @@ def _offer_straight(weight, cost, s, batch, n, touched):
     return count
 
 
-@njit(cache=True, nogil=True)
-def _offer_diagonal(weight, cost, s, corners, batch, n, touched, count):
+@njit
+def _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
     """As `_offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
     for p in range(n):
-        _ask_for(weight, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
         u = np.uint64(batch[p])
-        key = cost[u] + weight[u] * SQRT2
+        key = cost[u] + cell_cost[u] * SQRT2
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
@@ -190,14 +188,14 @@ def _offer_diagonal(weight, cost, s, corners, batch, n, touched, count):
     return count
 
 
-@njit(cache=True, nogil=True)
-def _offer_around(weight, cost, s, corners, batch, n, touched):
+@njit
+def _offer_around(cell_cost, cost, s, corners, batch, n, touched):
     """As `_offer_straight`, to eight neighbours, all a step of length 1 away."""
     count = _ZERO
     for p in range(n):
-        _ask_for(weight, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
         u = np.uint64(batch[p])
-        key = cost[u] + weight[u]
+        key = cost[u] + cell_cost[u]
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
@@ -225,30 +223,30 @@ def _offer_around(weight, cost, s, corners, batch, n, touched):
     return count
 
 
-@njit(cache=True, nogil=True)
-def flood(weight, cost, stride, root, rule, corners, width, ring):
-    """First-touch flood. `cost` is written whole.
+@njit
+def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, ring):
+    """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
-    width  of a bucket, s: below the smallest weight, so that nothing in a bucket leads back into it
-    ring   buckets in the circular queue, a power of two; ring * width exceeds the dearest step by two widths
+    width  of a bucket, s: below the lowest cell cost, so that nothing in a bucket leads back into it
+    ring   buckets of the circular queue, a power of two; ring * width exceeds the dearest step by two widths
     Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
 
     With octile steps a cell waits twice, under its straight exit key in the first `ring` buckets and under its
     diagonal one in as many behind them.
     """
     kinds = 2 if rule == RULE_OCTILE else 1
-    queue = _make_queue(kinds * ring, kinds * weight.size)
+    queue = _make_queue(kinds * ring, kinds * cell_cost.size)
     head, tail = queue[4], queue[5]
     # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
-    touched = np.empty(weight.size + 1, np.uint32)
-    batch = np.empty(weight.size + _AHEAD, np.uint32)
+    touched = np.empty(cell_cost.size + 1, np.uint32)
+    batch = np.empty(cell_cost.size + _AHEAD, np.uint32)
     s = np.uint64(stride)
     ring = np.uint64(ring)
     mask = ring - _ONE
     second = ring if rule == RULE_OCTILE else _ZERO
     inverse = _ONE32 / width
 
-    _open_costs(weight, cost)
+    _open_costs(cell_cost, cost)
     cost[np.uint64(root)] = _ZERO32
     touched[0] = root
     count = _ONE
@@ -258,11 +256,11 @@ def flood(weight, cost, stride, root, rule, corners, width, ring):
         # Cells touched from the last bucket join the queue: their cost is final.
         waiting += count
         following = np.int32(current + 1)
-        _choose(weight, cost, _ONE32, inverse, following, touched, count, batch)
+        _choose(cell_cost, cost, _ONE32, inverse, following, touched, count, batch)
         _put(queue, touched, count, batch, ring, _ZERO)
         if rule == RULE_OCTILE:
             waiting += count
-            _choose(weight, cost, SQRT2, inverse, following, touched, count, batch)
+            _choose(cell_cost, cost, SQRT2, inverse, following, touched, count, batch)
             _put(queue, touched, count, batch, ring, ring)
         if waiting == _ZERO:
             _close_costs(cost)
@@ -277,93 +275,23 @@ def flood(weight, cost, stride, root, rule, corners, width, ring):
         n = _take(queue, b, batch)
         waiting -= n
         if rule == RULE_PAPER:
-            count = _offer_around(weight, cost, s, corners, batch, n, touched)
+            count = _offer_around(cell_cost, cost, s, corners, batch, n, touched)
         else:
-            count = _offer_straight(weight, cost, s, batch, n, touched)
+            count = _offer_straight(cell_cost, cost, s, batch, n, touched)
         if rule == RULE_OCTILE:
             n = _take(queue, b + ring, batch)
             waiting -= n
-            count = _offer_diagonal(weight, cost, s, corners, batch, n, touched, count)
+            count = _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
 
 
-@njit(cache=True, nogil=True)
-def point_to_parents(weight, cost, stride, rule, corners, root, box, parent):
-    """Parent of each cell of a window: the neighbour with the smallest exit key; of equals the first of north,
-    east, south, west, then of the diagonals clockwise. Costs grow strictly along such parents, backwards, so that
-    they cannot form a cycle. box = (row0, col0, row1, col1)."""
-    row0, col0, row1, col1 = box
-    for row in range(row0, row1):
-        first = np.uint64((row + 1) * stride + 1 + col0)
-        last = np.uint64((row + 1) * stride + 1 + col1)
-        if rule == RULE_FOUR:
-            _parents_of_four(weight, cost, np.uint64(stride), first, last, parent)
-        else:
-            step = SQRT2 if rule == RULE_OCTILE else _ONE32
-            limit = INF if corners else HUGE
-            _parents_of_eight(weight, cost, np.uint64(stride), first, last, step, limit, parent)
-    parent[root] = NONE
-
-
-@njit(cache=True, nogil=True)
-def _parents_of_four(weight, cost, s, first, last, parent):
-    for i in range(first, last):
-        best = cost[i - s] + weight[i - s]
-        code = np.uint8(0)
-        key = cost[i + _ONE] + weight[i + _ONE]
-        code = np.uint8(2) if key < best else code
-        best = min(best, key)
-        key = cost[i + s] + weight[i + s]
-        code = np.uint8(4) if key < best else code
-        best = min(best, key)
-        key = cost[i - _ONE] + weight[i - _ONE]
-        code = np.uint8(6) if key < best else code
-        best = min(best, key)
-        parent[i] = code if max(cost[i], best) < INF else NONE
-
-
-@njit(cache=True, nogil=True)
-def _parents_of_eight(weight, cost, s, first, last, step, limit, parent):
-    """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
-    vectorises."""
-    for i in range(first, last):
-        north = cost[i - s] + weight[i - s]
-        east = cost[i + _ONE] + weight[i + _ONE]
-        south = cost[i + s] + weight[i + s]
-        west = cost[i - _ONE] + weight[i - _ONE]
-        best = north
-        code = np.uint8(0)
-        code = np.uint8(2) if east < best else code
-        best = min(best, east)
-        code = np.uint8(4) if south < best else code
-        best = min(best, south)
-        code = np.uint8(6) if west < best else code
-        best = min(best, west)
-        key = cost[i - s + _ONE] + weight[i - s + _ONE] * step
-        key = key if max(north, east) <= limit else INF
-        code = np.uint8(1) if key < best else code
-        best = min(best, key)
-        key = cost[i + s + _ONE] + weight[i + s + _ONE] * step
-        key = key if max(south, east) <= limit else INF
-        code = np.uint8(3) if key < best else code
-        best = min(best, key)
-        key = cost[i + s - _ONE] + weight[i + s - _ONE] * step
-        key = key if max(south, west) <= limit else INF
-        code = np.uint8(5) if key < best else code
-        best = min(best, key)
-        key = cost[i - s - _ONE] + weight[i - s - _ONE] * step
-        key = key if max(north, west) <= limit else INF
-        code = np.uint8(7) if key < best else code
-        best = min(best, key)
-        parent[i] = code if max(cost[i], best) < INF else NONE
-
-
-@njit(cache=True, nogil=True)
-def breadth_first(weight, cost, stride, root):
-    """Steps from every cell to the root, whatever they cost: the floor under every growth of a tree."""
-    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
-    for i in range(weight.size):
-        cost[i] = INF if weight[i] < INF else WALL
-    queue = np.empty(weight.size, np.uint32)
+@njit
+def breadth_first(cell_cost, cost, stride, root):
+    """Steps from every cell to the root over 8 neighbours, whatever they cost: what no growth can be faster than.
+    Returns how many cells have a way; `cost` is written whole, and WALL stays on lethal cells."""
+    offsets = step_offsets(stride)
+    for i in range(cell_cost.size):
+        cost[i] = INF if cell_cost[i] < INF else WALL
+    queue = np.empty(cell_cost.size, np.uint32)
     cost[root] = np.float32(0.0)
     queue[0] = root
     first = 0

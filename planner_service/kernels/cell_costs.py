@@ -1,45 +1,53 @@
-"""The weights of a map: padded, changed, their range; a window cut out of them, and merged back.
+"""Cell costs of a map: padded, changed, their range; a window cut out of them, and merged back.
 
-Arrays are flat and padded as `rules` says. Positive float32 numbers sort as their bits do, read as integers: the
-least of integers is found by vectors, the least of floats one by one, in 4 times the time.
+Arrays, beside those of `layout`:
+    pace    float32  (rows, cols)  s/m; inf is lethal; NaN, zero and negative ones are errors, which are counted
+    part    float32  ((row1 - row0 + 2) * width,)  cell costs or costs of a window as a padded grid of its own,
+                     whose stride is width = col1 - col0 + 2
+
+Positive float32 numbers sort as their bits do, read as integers: the least of integers is found by vectors, the
+least of floats one by one, in 4 times the time.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-INF = np.float32(np.inf)
+from planner_service.kernels.compile import njit
+from planner_service.kernels.layout import INF
+
 _INF_BITS = np.int32(0x7F800000)
 _ONE = np.uint64(1)
 
 
-@njit(cache=True, nogil=True)
-def pad_weights(pace, resolution, extra, stride, weight):
-    """weight := pace * resolution + extra, everywhere. Returns cells whose pace is NaN, zero or negative."""
+@njit
+def pad_cell_costs(pace, resolution, extra, stride, cell_cost):
+    """cell_cost := pace * resolution + extra, everywhere; resolution in m, extra in s. Returns how many cells have
+    a pace that is NaN, zero or negative."""
     bad = 0
     for row in range(pace.shape[0]):
         base = np.uint64((row + 1) * stride + 1)
         for col in range(np.uint64(pace.shape[1])):
             p = pace[row, col]
-            w = p * resolution + extra
-            bad += not (p > 0 and w > 0)
-            weight[base + col] = w
+            c = p * resolution + extra
+            bad += not (p > 0 and c > 0)
+            cell_cost[base + col] = c
     return bad
 
 
-@njit(cache=True, nogil=True)
-def changed_cells(pace, resolution, extra, box, stride, weight, cells, before):
-    """The padded cells of a window whose weight differs from their pace, and their weight before; updates weight.
+@njit
+def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before):
+    """Update the cell costs of a window, and list what changed.
 
-    box = (row0, col0, row1, col1); cells, before have room for the whole window. Returns (count, cells whose pace
-    is NaN, zero or negative: these are not applied; smallest, largest finite new weight: inf, 0 if there is none).
+    cells, before  int64 padded cells and float32 cost before, written; both have room for the whole window
+    Returns (count of changed cells, count of cells whose pace is NaN, zero or negative: these are not applied;
+    lowest, highest finite new cell cost: inf, 0 if there is none).
     """
     row0, col0, row1, col1 = box
     count = 0
     bad = 0
-    low = INF
-    high = np.float32(0.0)
+    lowest = INF
+    highest = np.float32(0.0)
     for row in range(row0, row1):
         base = (row + 1) * stride + 1
         for col in range(col0, col1):
@@ -48,39 +56,40 @@ def changed_cells(pace, resolution, extra, box, stride, weight, cells, before):
             if not (p > 0 and new > 0):
                 bad += 1
                 continue
-            old = weight[base + col]
+            old = cell_cost[base + col]
             if new != old:
                 cells[count] = base + col
                 before[count] = old
                 count += 1
-                weight[base + col] = new
-                low = min(low, new)
-                high = max(high, new if new < INF else high)
-    return count, bad, low, high
+                cell_cost[base + col] = new
+                lowest = min(lowest, new)
+                highest = max(highest, new if new < INF else highest)
+    return count, bad, lowest, highest
 
 
-@njit(cache=True, nogil=True)
-def weight_range(weight):
-    """(smallest, largest finite) weight; (inf, 0) if all cells are lethal."""
-    bits = weight.view(np.int32)
-    low = _INF_BITS
-    high = np.int32(0)
+@njit
+def cell_cost_range(cell_cost):
+    """(lowest, highest finite) cell cost; (inf, 0) if all cells are lethal."""
+    bits = cell_cost.view(np.int32)
+    lowest = _INF_BITS
+    highest = np.int32(0)
     for i in range(bits.size):
-        w = bits[i]
-        low = min(low, w)
-        high = max(high, w if w < _INF_BITS else np.int32(0))
-    found = np.array((low, high), np.int32).view(np.float32)
+        c = bits[i]
+        lowest = min(lowest, c)
+        highest = max(highest, c if c < _INF_BITS else np.int32(0))
+    found = np.array((lowest, highest), np.int32).view(np.float32)
     return found[0], found[1]
 
 
-@njit(cache=True, nogil=True)
-def cut_window(weight, stride, box, part):
-    """The weights of a window as a padded grid of its own. Returns their range, as `weight_range` does."""
+@njit
+def cut_window(cell_cost, stride, box, part):
+    """part := the cell costs of a window, behind a lethal border. Returns their range, as `cell_cost_range`
+    does."""
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
-    low = _INF_BITS
-    high = np.int32(0)
-    bits = weight.view(np.int32)
+    lowest = _INF_BITS
+    highest = np.int32(0)
+    bits = cell_cost.view(np.int32)
     taken = part.view(np.int32)
     part[:width] = INF
     part[part.size - width :] = INF
@@ -89,18 +98,19 @@ def cut_window(weight, stride, box, part):
         b = np.uint64((row - row0 + 1) * width + 1)
         part[b - _ONE] = INF
         for col in range(np.uint64(col1 - col0)):
-            w = bits[a + col]
-            taken[b + col] = w
-            low = min(low, w)
-            high = max(high, w if w < _INF_BITS else np.int32(0))
+            c = bits[a + col]
+            taken[b + col] = c
+            lowest = min(lowest, c)
+            highest = max(highest, c if c < _INF_BITS else np.int32(0))
         part[b + np.uint64(col1 - col0)] = INF
-    found = np.array((low, high), np.int32).view(np.float32)
+    found = np.array((lowest, highest), np.int32).view(np.float32)
     return found[0], found[1]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def merge_window(part, box, offset, old_root, cost, stride):
-    """Costs of a window grown around a new root improve a tree whose costs are stored less `offset`.
+    """Lower a tree's costs, which are stored less `offset` (s), to those of a window grown around a new root
+    (`part`).
 
     Only what gets cheaper is rewritten, and the old root, so that costs stay upper bounds of what is driven and
     grow strictly along every way.
@@ -117,10 +127,14 @@ def merge_window(part, box, offset, old_root, cost, stride):
     cost[old_root] = part[(row - row0 + 1) * width + col - col0 + 1] - offset
 
 
-@njit(cache=True, nogil=True)
+@njit
 def find_rim(part, box, rows, stride, rim, rim_cost):
-    """The cells with a cost from which a step leads out of a window, padded in the whole grid of `rows` rows, and
-    their costs. rim, rim_cost have room for all of the window's border. Returns how many there are."""
+    """The cells of a window that have a way and from which a step leads out of it.
+
+    rim, rim_cost  int64 cells, padded in the whole grid of `rows` rows, and float64 costs (s); written, both with
+                   room for all of the window's border
+    Returns how many there are.
+    """
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
     count = 0

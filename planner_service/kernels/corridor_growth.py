@@ -1,29 +1,38 @@
-"""Kernels of the skeleton and the rings: which cells carry the traffic, and new costs spreading along them.
+"""Which cells carry the traffic, and new costs spreading over them only.
 
-Arrays are laid out as `rules` says.
+`mark_levels` counts how many shortest paths pass each cell of a tree. `grow_corridors` is a label-correcting search
+(Dijkstra's with a binary heap, cells being re-entered when they get cheaper; E. W. Dijkstra 1959, D. P. Bertsekas
+1993) over the cells so marked. It needs an order by cost that may fall back: a cell's cost is first recomputed
+along its parents, and may turn out to be less than what was served last, which bucket queues and radix heaps rule
+out.
+
+Arrays, beside those of `layout`:
+    level  uint8  (size,)  traffic of each cell; 0 for none, 1 from `least` paths on, one more for each four times
+                           that
+    stamp  uint8  (size,)  whether a cost has been recomputed: `now` or `now + 1` if it has, less if not; `now + 1`
+                           on cells that were offered a cost by this growth
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
+from planner_service.kernels.compile import njit
+from planner_service.kernels.layout import (
+    INF,
+    NONE,
+    RULE_FOUR,
+    RULE_OCTILE,
+    SQRT2,
+    check_cells,
+    enlarged,
+    step_offsets,
+)
 
 
-@njit(cache=True, nogil=True)
-def _longer(array, count, size):
-    """Room for `size` elements, the first `count` copied. By a loop: assigning to a slice would bring along what
-    numba needs for the text of its error, which takes longer to compile than any kernel here."""
-    longer = np.empty(size, array.dtype)
-    for i in range(count):
-        longer[i] = array[i]
-    return longer
-
-
-@njit(cache=True, nogil=True)
-def _sink(keys, items, size):
-    """Restore a binary heap after its last element, keys[size], was taken from the end to replace the top."""
+@njit
+def _heap_pop(keys, items, size):
+    """Restore a binary heap of `size` elements after its top was read: keys[size] takes its place and sinks."""
     key = keys[size]
     item = items[size]
     hole = 0
@@ -42,8 +51,8 @@ def _sink(keys, items, size):
     items[hole] = item
 
 
-@njit(cache=True, nogil=True)
-def _rise(keys, items, size, key, item):
+@njit
+def _heap_push(keys, items, size, key, item):
     hole = size
     while hole > 0:
         above = (hole - 1) >> 1
@@ -56,16 +65,10 @@ def _rise(keys, items, size, key, item):
     items[hole] = item
 
 
-@njit(cache=True, nogil=True)
-def step_offsets(stride):
-    """What each direction code 0..7 adds to a padded cell index."""
-    return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
-
-
-@njit(cache=True, nogil=True)
+@njit
 def mark_levels(parent, stride, least, level):
-    """Raise `level` (uint8) to 1 where the ways of `least` cells pass in a tree given by its parents, to 2 where
-    those of 4 * least do, and so on. What drains an area four times as large is twice as far from its like."""
+    """Raise `level` to 1 where the paths of `least` cells pass in a tree given by its parents, to 2 where those of
+    4 * least do, and so on. What drains an area four times as large is twice as far from its like."""
     offsets = step_offsets(stride)
     children = np.zeros(parent.size, np.uint8)
     traffic = np.ones(parent.size, np.uint32)
@@ -90,13 +93,15 @@ def mark_levels(parent, stride, least, level):
             v = u
 
 
-@njit(cache=True, nogil=True)
-def _tighten(weight, cost, parent, stamp, now, offsets, rule, v, trail):
-    """As `tighten`, for one cell. Returns (cells visited, the trail, which may have grown)."""
+@njit
+def _tighten(grid, labels, stamp, now, offsets, v, trail):
+    """As `tighten`, for one padded cell. Returns (cells visited, the trail, which may have been enlarged)."""
+    cost, parent = labels.cost, labels.parent
+    cell_cost = grid.cell_cost
     many = 0
     while stamp[v] < now and parent[v] != NONE:
         if many == trail.size:
-            trail = _longer(trail, many, 2 * many)
+            trail = enlarged(trail, many, 2 * many)
         trail[many] = v
         many += 1
         v += offsets[parent[v]]
@@ -106,42 +111,91 @@ def _tighten(weight, cost, parent, stamp, now, offsets, rule, v, trail):
         v = trail[j]
         k = parent[v]
         u = v + offsets[k]
-        driven = cost[u] + (weight[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else weight[u])
+        driven = cost[u] + (cell_cost[u] * SQRT2 if grid.rule == RULE_OCTILE and k & 1 else cell_cost[u])
         cost[v] = min(cost[v], driven)
         stamp[v] = now
     return many, trail
 
 
-@njit(cache=True, nogil=True)
-def tighten(weight, cost, parent, stamp, now, stride, rule, root, cells):
-    """cost := what is driven along the parents, less the tree's offset, on the ways from `cells` to the root.
+@njit
+def tighten(grid, labels, stamp, now, cells):
+    """Lower costs, which are upper bounds, to what is driven along the parents, less the tree's offset: of `cells`
+    (int64, padded) and of all on their ways to the root.
 
-    stamp  uint8  `now` or one more on cells that are known to be right, and on those that become so; less elsewhere
-    Costs only fall, and stay at least what the parent offers. Returns cells visited.
+    They stay at least what the parent offers. Cells whose stamp is `now` or more are taken to be right, and those
+    that become so are stamped `now`. Returns cells visited. Raises ValueError where one is no padded cell.
     """
-    offsets = step_offsets(stride)
+    check_cells(cells, stamp.size)
+    offsets = step_offsets(grid.stride)
     trail = np.empty(1024, np.int64)
     visited = 0
-    stamp[root] = now
+    stamp[labels.root] = now
     for i in range(cells.size):
-        many, trail = _tighten(weight, cost, parent, stamp, now, offsets, rule, cells[i], trail)
+        many, trail = _tighten(grid, labels, stamp, now, offsets, cells[i], trail)
         visited += many
     return visited
 
 
-@njit(cache=True, nogil=True)
-def spread(weight, cost, parent, stamp, now, level, stride, rule, corners, root, box, inner):
+@njit
+def grow_corridors(grid, labels, level, stamp, now, box, inner):
     """Let the costs on the rim of a window around the root spread outward over the cells that carry the traffic.
 
-    level  uint8  which cells take part: of level 1 or more up to `inner` cells from the root, of 2 or more up to
-                  twice as far, of 3 up to four times, ...
-    box    (row0, col0, row1, col1) of the window, whose costs are new
-    stamp, now  as in `tighten`, which a cell is before it is offered anything: an old way from far off is often
-                better than its cost says, and than the way over the skeleton. One more than `now` where it was
-    Only what gets cheaper is rewritten, with its parent, so that costs stay upper bounds and grow strictly along
-    every way. Returns cells visited.
+    box    the window, whose costs are new
+    inner  cells: level 1 or more takes part up to so far from the root, level 2 or more up to twice as far, level 3
+           up to four times, ...
+    A cell is tightened before it is offered anything: an old way from far off is often better than its cost says,
+    and than the way through the corridors. Only what gets cheaper is rewritten, with its parent, so that costs stay
+    upper bounds and grow strictly along every way. Returns cells visited.
     """
+    cell_cost, stride, rule, corners = grid
+    cost, parent, root = labels
     offsets = step_offsets(stride)
+    keys, items, size = _rim_heap(cost, stride, box)
+    root_row = root // stride
+    root_col = root % stride
+    trail = np.empty(1024, np.int64)
+    stamp[root] = now
+    visited = 0
+    while size > 0:
+        key = keys[0]
+        u = items[0]
+        size -= 1
+        _heap_pop(keys, items, size)
+        if key > cost[u]:
+            continue
+        visited += 1
+        if size + 16 > keys.size:
+            keys, items = enlarged(keys, size, 2 * keys.size), enlarged(items, size, 2 * keys.size)
+        away = max(abs(u // stride - root_row), abs(u % stride - root_col))
+        least = 1
+        while away > inner:
+            away >>= 1
+            least += 1
+        straight = key + cell_cost[u]
+        diagonal = key + (cell_cost[u] * SQRT2 if rule == RULE_OCTILE else cell_cost[u])
+        for k in range(0, 8, 2 if rule == RULE_FOUR else 1):
+            v = u + offsets[k]
+            offer = diagonal if k & 1 else straight
+            if level[v] < least or not cell_cost[v] < INF or not (stamp[v] <= now or offer < cost[v]):
+                continue
+            shut = max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) == INF
+            if k & 1 and not corners and shut:
+                continue
+            if stamp[v] < now:
+                many, trail = _tighten(grid, labels, stamp, now, offsets, v, trail)
+                visited += many
+            stamp[v] = now + 1
+            if offer < cost[v]:
+                cost[v] = offer
+                parent[v] = (k + 4) & 7
+            _heap_push(keys, items, size, cost[v], v)
+            size += 1
+    return visited
+
+
+@njit
+def _rim_heap(cost, stride, box):
+    """A heap of the cells on the border of a window that have a way: keys (float32), items (int64), how many."""
     row0, col0, row1, col1 = box
     capacity = 4096 + 4 * (row1 - row0 + col1 - col0)
     keys = np.empty(capacity, np.float32)
@@ -152,47 +206,6 @@ def spread(weight, cost, parent, stamp, now, level, stride, rule, corners, root,
         for col in range(col0, col1, across):
             v = (row + 1) * stride + col + 1
             if cost[v] < INF:
-                _rise(keys, items, size, cost[v], v)
+                _heap_push(keys, items, size, cost[v], v)
                 size += 1
-    root_row = root // stride
-    root_col = root % stride
-    trail = np.empty(1024, np.int64)
-    stamp[root] = now
-    visited = 0
-    while size > 0:
-        key = keys[0]
-        u = items[0]
-        size -= 1
-        _sink(keys, items, size)
-        if key > cost[u]:
-            continue
-        visited += 1
-        if size + 16 > capacity:
-            capacity *= 2
-            keys = _longer(keys, size, capacity)
-            items = _longer(items, size, capacity)
-        away = max(abs(u // stride - root_row), abs(u % stride - root_col))
-        ring = 1
-        while away > inner:
-            away >>= 1
-            ring += 1
-        straight = key + weight[u]
-        diagonal = key + (weight[u] * SQRT2 if rule == RULE_OCTILE else weight[u])
-        for k in range(0, 8, 2 if rule == RULE_FOUR else 1):
-            v = u + offsets[k]
-            offer = diagonal if k & 1 else straight
-            if level[v] < ring or not weight[v] < INF or not (stamp[v] <= now or offer < cost[v]):
-                continue
-            shut = max(weight[u + offsets[k - 1]], weight[u + offsets[(k + 1) & 7]]) == INF
-            if k & 1 and not corners and shut:
-                continue
-            if stamp[v] < now:
-                many, trail = _tighten(weight, cost, parent, stamp, now, offsets, rule, v, trail)
-                visited += many
-            stamp[v] = now + 1
-            if offer < cost[v]:
-                cost[v] = offer
-                parent[v] = (k + 4) & 7
-            _rise(keys, items, size, cost[v], v)
-            size += 1
-    return visited
+    return keys, items, size

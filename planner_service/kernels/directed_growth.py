@@ -1,47 +1,67 @@
-"""Growth where a step also costs by what it climbs. Arrays are laid out as `rules` says; and
+"""Exact growth where a step also costs by what it climbs: a label-correcting search with approximate buckets and
+decrease-key (Dial 1969 with buckets wider than a step: B. V. Cherkassky, A. V. Goldberg, T. Radzik, "Shortest paths
+algorithms", Mathematical Programming 73, 1996, 129-174).
 
-    height   float32  m; NaN is a void, and a step from or to it is level
-    factors  float32  (2 * n + 1) what a step of each rise costs, relative to the cheapest; its least value is 1
-    scale    (straight, diagonal) float32; entries of `factors` per metre of difference in height, from the middle
-    weight   here what the cheapest straight step into a cell costs, s
+Where a step's cost depends on both its ends, a cell's first offer is not its least, and the growths of
+`bucket_queue` and `radix_heap` do not hold. Here a cell waits in one bucket, by its cost, and moves to an earlier
+one when it gets cheaper.
 
-Where a step's cost depends on both its ends, a cell's first touch is not its last, and the floods of `flood` do not
-hold. Here a cell waits in one bucket, by its cost, and moves to an earlier one when it gets cheaper.
+Arrays, beside those of `layout`:
+    cell_cost  here what the cheapest straight step into a cell costs, s
+    links      int32  (size, 2)  of each waiting cell, which waits before and which after it in its bucket; _NOBODY
+                                 at the ends; links[v, 0] is _OUT where v waits in none
+    first      int32  (count,)   first cell of each bucket; _NOBODY if empty
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from typing import NamedTuple
 
-from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels.compile import njit
+from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, step_offsets
 
 _NOBODY = np.int32(-1)
 _OUT = np.int32(-2)
-"""Of a cell that waits in no bucket."""
 
 
-@njit(cache=True, nogil=True)
-def flood_directed(weight, height, factors, scale, cost, parent, stride, root, rule, corners, width, ring):
-    """The tree of cheapest ways to the root. `cost` and `parent` are written whole; returns the largest cost.
+class Climbs(NamedTuple):
+    """What steps cost by their difference in height."""
 
-    width  of a bucket, s. The tree is exact whatever it is; up to the smallest weight no cell is taken twice
-    ring   buckets in the circular queue, a power of two; ring * width exceeds the dearest step by two widths
+    height: NDArray[np.float32]
+    """(size,) m, padded; NaN is a void, and a step from or to it is level."""
+    factors: NDArray[np.float32]
+    """(2 * n + 1,) what a step of each rise costs, relative to the cheapest; its least value is 1."""
+    scale: NDArray[np.float32]
+    """(2,) of straight and diagonal steps, entries of `factors` per metre of rise, counted from the middle."""
+
+
+@njit
+def grow_directed(grid, labels, climbs, buckets):
+    """The tree of cheapest ways to a padded, passable root. Costs and parents are written whole; returns the
+    largest cost.
+
+    buckets  width: the tree is exact whatever it is; up to the lowest cell cost no cell is taken twice. count: a
+             power of two, the circular queue; count * width exceeds the dearest step by two widths
 
     Costs end as a fixed point of float32 arithmetic: each is its parent's plus the step, rounded, and the least of
     what its neighbours offer. So no ring of parents can be: its cells would all have one cost, and each would have
     got it, for the last time, after its parent did.
     """
-    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
-    # Of each waiting cell, who waits before and after it: side by side, as they are read together.
-    links = np.empty((weight.size, 2), np.int32)
-    for i in range(weight.size):
+    cell_cost, stride, rule, corners = grid
+    cost, parent, root = labels
+    height, factors, scale = climbs
+    offsets = step_offsets(stride)
+    links = np.empty((cell_cost.size, 2), np.int32)
+    for i in range(cell_cost.size):
         cost[i] = INF
         parent[i] = NONE
         links[i, 0] = _OUT
-    first = np.full(ring, _NOBODY, np.int32)
-    mask = ring - 1
-    inverse = 1.0 / np.float64(width)
+    first = np.full(buckets.count, _NOBODY, np.int32)
+    mask = buckets.count - 1
+    inverse = 1.0 / np.float64(buckets.width)
     half = np.float32(factors.size // 2)
     every = 2 if rule == RULE_FOUR else 1
     cost[root] = np.float32(0.0)
@@ -66,21 +86,20 @@ def flood_directed(weight, height, factors, scale, cost, parent, stride, root, r
         reach = max(reach, base)
         for k in range(0, 8, every):
             v = u + offsets[k]
-            w = weight[v]
             old = cost[v]
-            # No step costs less than the weight of the cell that it enters, which is u.
-            if not w < INF or old <= base + weight[u]:
+            # No step costs less than the cell cost of the cell that it enters, which is u.
+            if not cell_cost[v] < INF or old <= base + cell_cost[u]:
                 continue
             odd = k & 1
-            if odd and not corners and not max(weight[u + offsets[k - 1]], weight[u + offsets[(k + 1) & 7]]) < INF:
+            if (
+                odd
+                and not corners
+                and max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) == INF
+            ):
                 continue
             at = (height[u] - height[v]) * scale[odd]
-            factor = (
-                factors[np.int64(min(max(at, -half), half) + half + np.float32(0.5))]
-                if at == at
-                else (factors[np.int64(half)])
-            )
-            step = weight[u] * factor
+            at = at if at == at else np.float32(0.0)
+            step = cell_cost[u] * factors[np.int64(min(max(at, -half), half) + half + np.float32(0.5))]
             new = base + (step * SQRT2 if odd and rule == RULE_OCTILE else step)
             if not new < old:
                 continue
@@ -99,6 +118,7 @@ def flood_directed(weight, height, factors, scale, cost, parent, stride, root, r
                 if behind != _NOBODY:
                     links[behind, 0] = ahead
                 waiting -= 1
+            # In place: as a call, for whose array arguments references are counted, this took a third more time.
             head = first[c]
             links[v, 1] = head
             links[v, 0] = _NOBODY

@@ -1,65 +1,91 @@
-"""Lower bounds on the optimum, for many cells at once: docs/certificates.md says why they hold.
+"""Lower bounds on the optimum, for many cells at once; docs/certificates.md proves them.
 
-Arrays are laid out as `rules` says; `bound` is float64, s, one a start.
+`bound_by_heuristic` is the landmark bound of ALT (A. V. Goldberg, C. Harrelson, "Computing the shortest path: A*
+search meets graph theory", SODA 2005) with one landmark, an earlier root: its exact costs are a consistent
+heuristic, so that no way from v to the root costs less than it falls between the two. A window around the root adds
+that a way either stays inside, or comes in over the window's rim for the last time.
+
+Arrays, beside those of `layout`:
+    starts     int64    (n,)     padded cells
+    bound      float64  (n,)     s; proven lower bound on the cost from each start
+    heuristic  float32  (size,)  s; as `cost`; no step costs less than it falls by. Size 0 if there is none
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from typing import NamedTuple
 
-from planner_service.kernels.layout import INF
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels.compile import njit
+from planner_service.kernels.layout import INF, check_cells
 
 _ROUNDING = 2.0**-23
 """Relative error of one float32 step, doubled for the sum over a route's steps."""
 
 
-@njit(cache=True, nogil=True)
-def _rounding(cost, low, most):
+class WindowBound(NamedTuple):
+    """What a window around the root costs on its own: a lower bound on every way that stays inside."""
+
+    cost: NDArray[np.float32]
+    """(cells,) s, of the window as a padded grid of its own; exact inside it."""
+    box: tuple[int, int, int, int]
+    """(row0, col0, row1, col1) of the window."""
+    rim: NDArray[np.int64]
+    """Padded cells of the window, in the whole grid, from which a step leads out of it. Empty if there is no
+    window."""
+    rim_cost: NDArray[np.float64]
+    """s; the window's own cost of each cell of the rim."""
+
+
+@njit
+def _rounding(cost, lowest, most):
     """How far float32 may have put this cost off, relatively: no optimal route has more steps than its cost has
-    smallest weights, or than there are cells (`most`)."""
-    return min((min(cost / low, most) + 4.0) * _ROUNDING, 1.0)
+    lowest cell costs, or than there are cells (`most`)."""
+    return min((min(cost / lowest, most) + 4.0) * _ROUNDING, 1.0)
 
 
-@njit(cache=True, nogil=True)
-def by_exact(cost, starts, low, most, bound):
-    """bound := what an exact tree says."""
+@njit
+def bound_by_exact_cost(cost, starts, lowest, most, bound):
+    """bound := what an exact tree says. lowest: cell cost, s; most: cells of the grid."""
+    check_cells(starts, cost.size)
     for i in range(starts.size):
         own = np.float64(cost[starts[i]])
-        bound[i] = own * (1.0 - _rounding(own, low, most))
+        bound[i] = own * (1.0 - _rounding(own, lowest, most))
 
 
-@njit(cache=True, nogil=True)
-def by_potential(potential, root, part, box, stride, rim, rim_cost, starts, low, most, bound):
-    """bound := the larger of itself and what a potential and the window around the root prove.
+@njit
+def bound_by_heuristic(heuristic, root, stride, window, starts, lowest, most, bound):
+    """bound := the larger of itself and what a heuristic and the window around the padded root prove.
 
-    potential  as `cost`; no step costs less than it falls by. Empty if there is none
-    part, box  the window's own costs, padded, and where it lies; rim: int64, its cells from which a step leads out
-               of it; rim_cost: float64, their own costs. Empty if there is no window
-    No way to the root is cheaper than the potential falls along it; and it either stays in the window, or comes in
-    over its rim for the last time and costs from there what the window says.
+    window  a `WindowBound`
+    lowest, most  lowest cell cost, s, and cells of the grid: they bound the steps of a route, and so its rounding
     """
+    part, box, rim, rim_cost = window
+    if heuristic.size > 0:
+        check_cells(starts, heuristic.size)
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
-    known = potential.size > 0
+    known = heuristic.size > 0
     at_root = np.inf
     if known:
-        at_root = np.float64(potential[root])
-        at_root *= 1.0 + _rounding(at_root, low, most)
+        at_root = np.float64(heuristic[root])
+        at_root *= 1.0 + _rounding(at_root, lowest, most)
     nearest = np.inf
     highest = -np.inf
     for j in range(rim.size):
-        inner = rim_cost[j] * (1.0 - _rounding(rim_cost[j], low, most))
+        inner = rim_cost[j] * (1.0 - _rounding(rim_cost[j], lowest, most))
         nearest = min(nearest, inner)
         if known:
-            at_rim = np.float64(potential[rim[j]])
-            highest = max(highest, at_rim * (1.0 + _rounding(at_rim, low, most)) - inner)
+            at_rim = np.float64(heuristic[rim[j]])
+            highest = max(highest, at_rim * (1.0 + _rounding(at_rim, lowest, most)) - inner)
     for i in range(starts.size):
         v = starts[i]
         own = 0.0
-        if known and potential[v] < INF:
-            own = np.float64(potential[v])
-            own *= 1.0 - _rounding(own, low, most)
+        if known and heuristic[v] < INF:
+            own = np.float64(heuristic[v])
+            own *= 1.0 - _rounding(own, lowest, most)
         way = nearest
         if known and rim.size:
             way = max(way, own - highest)
@@ -68,7 +94,7 @@ def by_potential(potential, root, part, box, stride, rim, rim_cost, starts, low,
         if row0 <= row < row1 and col0 <= col < col1:
             inner = np.float64(part[(row - row0 + 1) * width + col - col0 + 1])
             if inner < np.inf:
-                way = min(way, inner * (1.0 - _rounding(inner, low, most)))
+                way = min(way, inner * (1.0 - _rounding(inner, lowest, most)))
         # A route was found, so that no bound is infinite; a rim that leads nowhere would be.
         if way == np.inf:
             way = 0.0

@@ -1,18 +1,27 @@
-"""The exact tree of one root over weights of any ratio: a flood over a radix heap. Arrays are as `rules` says.
+"""Exact growth over cell costs of any ratio with a radix heap (R. K. Ahuja, K. Mehlhorn, J. B. Orlin, R. E. Tarjan,
+"Faster algorithms for the shortest path problem", Journal of the ACM 37(2), 1990, 213-223), on the digits of
+float32.
 
-Where one weight is thousands of times another, buckets as narrow as the smallest weight are too many to turn over
-one by one. Here a key's bits are read as digits, which sort positive floats, and a cell waits in the list of the
-first digit in which its key differs from the keys that are served now. When these reach a list, it is spread over
-the lists of the digits below; or served whole where it is no wider than the smallest weight. So a cell moves a few
+Where one cell cost is thousands of times another, buckets as narrow as the lowest are too many to turn over one by
+one. Here a key's bits are read as digits, which sort positive floats, and a cell waits in the list of the first
+digit in which its key differs from the keys that are served now. When these reach a list, it is spread over the
+lists of the digits below; or served whole where it is no wider than the lowest cell cost. So a cell moves a few
 times, whatever the ratio, and no width is too fine: float32 keys are served in the order that they have.
+
+Arrays, beside those of `layout`; an *item* is a padded cell and a kind of step: with octile steps item 2 * v waits
+under the straight exit key of v and 2 * v + 1 under its diagonal one, else item v under its only one:
+    heads    uint32  (levels * slots,)  first item of each list; 0 if empty (cell 0 is border)
+    links    uint32  (kinds * size,)    the item behind each in its list; 0 at the end
+    waiting  uint64  (levels,)          how many items wait at each level of digits
+    touched  uint32  (size,)            padded cells that got their first cost from what was served last
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, WALL
+from planner_service.kernels.compile import njit
+from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, WALL, step_offsets
 
 _ONE = np.uint64(1)
 _DIGIT = np.uint64(6)
@@ -22,7 +31,7 @@ _LEVELS = np.uint64(6)
 """Digits of 6 bits that 32 bits take."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _enter(heads, links, waiting, item, key, served):
     """Put an item into the list of the first digit in which its key differs from `served`; of equal ones, the last.
 
@@ -38,26 +47,26 @@ def _enter(heads, links, waiting, item, key, served):
     waiting[level] += _ONE
 
 
-@njit(cache=True, nogil=True)
-def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
-    """First-touch flood for weights of any ratio. `cost` and `parent` are written whole: where one weight drowns in
-    the rounding of another, costs do not tell the parents.
+@njit
+def grow_by_radix_heap(grid, labels, width):
+    """Costs and parents of a tree to a padded, passable root, both written whole: where one cell cost drowns in the
+    rounding of another, costs do not tell the parents.
 
-    width  s; the smallest weight, or less
-
+    width  s; the lowest cell cost, or less
     Returns the largest exit key, which no cost exceeds.
     """
-    offsets = np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
+    cell_cost, stride, rule, corners = grid
+    cost, parent, root = labels
+    offsets = step_offsets(stride)
     every = 2 if rule == RULE_FOUR else 1
     kinds = 2 if rule == RULE_OCTILE else 1
-    for i in range(weight.size):
+    for i in range(cell_cost.size):
         parent[i] = NONE
-        cost[i] = INF if weight[i] < INF else WALL
-    # With octile steps item 2 * v waits under the straight key of v, 2 * v + 1 under its diagonal one. None is 0.
+        cost[i] = INF if cell_cost[i] < INF else WALL
     heads = np.zeros(_LEVELS * _SLOTS, np.uint32)
-    links = np.empty(kinds * weight.size, np.uint32)
+    links = np.empty(kinds * cell_cost.size, np.uint32)
     waiting = np.zeros(_LEVELS, np.uint64)
-    touched = np.empty(weight.size, np.uint32)
+    touched = np.empty(cell_cost.size, np.uint32)
     bits = np.empty(1, np.float32)
     as_bits = bits.view(np.uint32)
     cost[root] = np.float32(0.0)
@@ -69,7 +78,7 @@ def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
         for i in range(count):
             v = np.uint64(touched[i])
             for kind in range(kinds):
-                bits[0] = cost[v] + (weight[v] * SQRT2 if kind else weight[v])
+                bits[0] = cost[v] + (cell_cost[v] * SQRT2 if kind else cell_cost[v])
                 _enter(heads, links, waiting, v * np.uint64(kinds) + np.uint64(kind), np.uint64(as_bits[0]), served)
         count = 0
         level = np.uint64(0)
@@ -94,7 +103,7 @@ def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
             waiting[level] -= _ONE
             u = np.int64(item) // kinds
             kind = np.int64(item) % kinds
-            key = cost[u] + (weight[u] * SQRT2 if kind else weight[u])
+            key = cost[u] + (cell_cost[u] * SQRT2 if kind else cell_cost[u])
             if not whole:
                 bits[0] = key
                 _enter(heads, links, waiting, np.uint64(item), np.uint64(as_bits[0]), served)
@@ -109,7 +118,7 @@ def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
                 if (
                     k & 1
                     and not corners
-                    and not max(weight[u + offsets[k - 1]], weight[u + offsets[(k + 1) & 7]]) < INF
+                    and not max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) < INF
                 ):
                     continue
                 if cost[v] == INF:
@@ -117,6 +126,6 @@ def flood_wide(weight, cost, stride, root, rule, corners, width, parent):
                     count += 1
                 cost[v] = key
                 parent[v] = (k + 4) & 7
-    for i in range(weight.size):
+    for i in range(cell_cost.size):
         cost[i] = cost[i] if cost[i] >= np.float32(0.0) else INF
     return reach

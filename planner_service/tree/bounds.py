@@ -6,76 +6,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import lower_bounds as kernels
-from planner_service.kernels.repair import lower
-from planner_service.tree.cost_grid import Changes, Ground
-from planner_service.tree.cost_to_go import NOWHERE, CostToGoTree
+from planner_service.kernels.repair import lower_costs
+from planner_service.tree.cost_grid import Changes, CostGrid
+from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from shared_map.arrays import Floats
 
 LOWER_SHARE = 16
-"""A potential is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""
+"""A heuristic is lowered by visiting at most one cell in so many; beyond, the bound waits for a full growth."""
 
 
 class LowerBounds:
-    """What is known of the optimum while the tree itself is not exact.
+    """What is known of the optimum while the tree itself is not exact."""
 
-    The potential is the exact cost of an earlier root, lowered where the map became cheaper: no step costs less
-    than it falls by.
-    """
-
-    def __init__(self, ground: Ground) -> None:
-        self._ground = ground
-        self._potential: Floats | None = None
+    def __init__(self, cost_grid: CostGrid) -> None:
+        self._grid = cost_grid
+        self._heuristic: Floats | None = None
+        """float32, padded, s: the exact cost of an earlier root, lowered where the map became cheaper. A consistent
+        heuristic: no step costs less than it falls by. `take` sets it, `learn` lowers it, or drops it (None) where
+        that would visit too many cells."""
 
     def take(self, exact_cost: Floats) -> None:
         """Go by this exact padded cost from now on; nobody may write to it any more."""
-        self._potential = exact_cost
+        self._heuristic = exact_cost
 
     def learn(self, changes: Changes) -> None:
-        """The ground changed: lower the potential where ways became cheaper."""
-        if self._potential is None or not changes.any_lower:
+        """The map changed: lower the heuristic where ways became cheaper. Dearer cells leave it consistent."""
+        if self._heuristic is None or not changes.any_lower:
             return
-        ground = self._ground
-        limit = ground.grid.cells // LOWER_SHARE + 1024
-        done = lower(
-            ground.weight,
-            self._potential,
-            ground.stride,
-            ground.rule,
-            ground.corners,
-            changes.cells,
-            changes.before,
-            *ground.buckets,
-            limit,
-        )
-        if done < 0:
-            self._potential = None
+        grid = self._grid
+        limit = grid.grid.cells // LOWER_SHARE + 1024
+        if lower_costs(grid.padded, self._heuristic, changes.cells, changes.before, grid.buckets, limit) < 0:
+            self._heuristic = None
 
     def at(self, tree: CostToGoTree, starts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Proven lower bounds on the time from padded cells to the target now."""
-        ground = self._ground
-        low, most = ground.low, ground.grid.cells
+        """Proven lower bounds, s, on the time from padded cells to the target now.
+
+        Raises ValueError where a start is no padded cell.
+        """
+        grid = self._grid
+        lowest, most = grid.lowest_cell_cost, grid.grid.cells
         bound = np.zeros(starts.size)
         if tree.exact:
-            kernels.by_exact(tree.cost, starts, low, most, bound)
+            kernels.bound_by_exact_cost(tree.cost, starts, lowest, most, bound)
         else:
-            near = NOWHERE if tree.near is None else tree.near
-            potential = _NONE if self._potential is None else self._potential
-            kernels.by_potential(
-                potential,
-                ground.pad(tree.root),
-                near.cost,
-                near.box,
-                ground.stride,
-                near.rim,
-                near.rim_cost,
-                starts,
-                low,
-                most,
-                bound,
-            )
-        if ground.length_weight_s:
-            # Of the key's optimum only the share that is travel time counts, at least 1 - lambda / smallest weight.
-            bound *= 1.0 - ground.length_weight_s / ground.low
+            window = NO_WINDOW if tree.window_bound is None else tree.window_bound
+            heuristic = _NONE if self._heuristic is None else self._heuristic
+            root = grid.pad(tree.root)
+            kernels.bound_by_heuristic(heuristic, root, grid.stride, window, starts, lowest, most, bound)
+        if grid.length_weight_s:
+            # Of the optimum only the share that is travel time counts: at least 1 - lambda / lowest cell cost.
+            bound *= 1.0 - grid.length_weight_s / lowest
         return bound
 
 

@@ -1,4 +1,4 @@
-"""The weights of a map as the kernels want them, and what changed in them."""
+"""The cell costs of a map as the kernels want them, and what changed in them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import cell_costs as kernels
-from planner_service.kernels.layout import RULE_FOUR, RULE_OCTILE, RULE_PAPER, SQRT2_EXACT
+from planner_service.kernels.layout import (
+    RULE_FOUR,
+    RULE_OCTILE,
+    RULE_PAPER,
+    SQRT2_EXACT,
+    Buckets,
+    PaddedGrid,
+)
 from planner_service.kernels.route_walk import walk_routes
-from planner_service.tree.growth import flood
+from planner_service.tree.growth import grow_tree
 from shared_map.arrays import Floats
 from swarm.config.scenario import PlannerConfig
+from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
 
 Cells = NDArray[np.int64]
@@ -24,15 +32,15 @@ Cells = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """Cells whose weight changed (padded, no repetition) and what it was before."""
+    """Cells whose cost changed (padded, no repetition), and the cell costs before and after, s."""
 
     cells: Cells
     before: Floats
-    weight_now: Floats
+    after: Floats
 
     @cached_property
     def any_lower(self) -> bool:
-        return self.cells.size > 0 and bool((self.weight_now < self.before).any())
+        return self.cells.size > 0 and bool((self.after < self.before).any())
 
 
 NO_CHANGES = Changes(np.empty(0, np.int64), np.empty(0, np.float32), np.empty(0, np.float32))
@@ -59,7 +67,7 @@ _FEWEST, _MOST = 1 << 9, 1 << 14
 
 
 class Walks(NamedTuple):
-    """Routes read off a tree, as `kernels.walk.walk_routes` returns them."""
+    """Routes read off a tree, as `kernels.route_walk` describes them."""
 
     directions: NDArray[np.uint8]
     ends: Cells
@@ -68,36 +76,54 @@ class Walks(NamedTuple):
     last: Cells
 
 
-class Ground:
-    """The weights of a map: what entering each cell costs, s, padded with a lethal border.
-
-    low, high  bounds of the finite weights, not necessarily reached; (inf, 0) if all is lethal
-    directed   whether a step costs by where it comes from too; then only whole trees are grown
-    """
+class CostGrid:
+    """What entering each cell of a map costs, padded with a lethal border."""
 
     directed = False
+    """Whether a step's cost depends on where it comes from, too; then only whole trees are grown."""
 
     def __init__(self, grid: GridSpec, config: PlannerConfig) -> None:
         self.grid = grid
         self.config = config
         self.rule = rule_of(config)
+        """Which steps there are: RULE_FOUR, RULE_PAPER or RULE_OCTILE."""
         self.corners = config.corner_cutting
+        """Whether a diagonal step may pass a lethal cell."""
         self.stride = grid.cols + 2
+        """Cells of a padded row."""
         self.size = (grid.rows + 2) * self.stride
+        """Cells of a padded array."""
         self.diagonal = SQRT2_EXACT if self.rule == RULE_OCTILE else 1.0
+        """Length of a diagonal step in straight ones."""
         self._metres = np.float32(grid.resolution_m)
         self.length_weight_s = config.length_weight * grid.resolution_m
-        self.weight: Floats = np.full(self.size, np.inf, np.float32)
-        self.low = math.inf
-        self.high = 0.0
+        """s; what a cell's length costs beside the time. It is part of every cell cost."""
+        self.cell_cost: Floats = np.full(self.size, np.inf, np.float32)
+        """float32 (size,), s: price of a straight step into each cell; inf is lethal, as is the border. Lethal
+        everywhere before `load`; `load` and `apply` write it, in place."""
+        self.lowest_cell_cost = math.inf
+        """s; no finite cell cost is less. `load` sets it, `apply` only lowers it, so that it need not be reached;
+        inf if all is lethal."""
+        self.highest_cell_cost = 0.0
+        """s; no finite cell cost is more. `load` sets it, `apply` only raises it; 0 if all is lethal."""
+        self.padded = PaddedGrid(self.cell_cost, self.stride, self.rule, self.corners)
+        """The same for kernels."""
 
     @property
-    def buckets(self) -> tuple[np.float32, int]:
-        """Width of a bucket, s, and how many of them hold all that costs at most a step more: for repairs."""
-        longest = self.high * self.diagonal
-        return np.float32(self.low), min(max(math.ceil(longest / self.low) + 2, _FEWEST), _MOST)
+    def buckets(self) -> Buckets:
+        """Of a repair: as wide as the lowest cell cost, and enough to hold all that costs at most a step more."""
+        longest = self.highest_cell_cost * self.diagonal
+        count = math.ceil(longest / self.lowest_cell_cost) + 2
+        return Buckets(np.float32(self.lowest_cell_cost), min(max(count, _FEWEST), _MOST))
+
+    def check_root(self, cell: int) -> None:
+        """Raises OutsideGridError unless the cell is one of the grid, ValueError where it is lethal: no tree leads
+        there, and kernels check no index."""
+        if not self.passable(cell):
+            raise ValueError(f"cell {cell} is lethal: no tree can lead there")
 
     def pad(self, cell: int) -> int:
+        """The padded cell of a cell of the grid."""
         row, col = divmod(cell, self.grid.cols)
         return (row + 1) * self.stride + col + 1
 
@@ -114,11 +140,12 @@ class Ground:
     def load(self, pace: Floats) -> None:
         """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative."""
         check_pace(self.grid, pace)
-        bad = kernels.pad_weights(pace, self._metres, np.float32(self.length_weight_s), self.stride, self.weight)
+        extra = np.float32(self.length_weight_s)
+        bad = kernels.pad_cell_costs(pace, self._metres, extra, self.stride, self.cell_cost)
         if bad:
             raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
-        low, high = kernels.weight_range(self.weight)
-        self.low, self.high = float(low), float(high)
+        lowest, highest = kernels.cell_cost_range(self.cell_cost)
+        self.lowest_cell_cost, self.highest_cell_cost = float(lowest), float(highest)
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
         """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative."""
@@ -126,25 +153,25 @@ class Ground:
         found: list[Changes] = []
         for box in self._boxes(dirty):
             row0, col0, row1, col1 = box
-            room = (row1 - row0) * (col1 - col0)
-            cells = np.empty(room, np.int64)
-            before = np.empty(room, np.float32)
-            count, bad, low, high = kernels.changed_cells(
+            most = (row1 - row0) * (col1 - col0)
+            cells = np.empty(most, np.int64)
+            before = np.empty(most, np.float32)
+            count, bad, lowest, highest = kernels.changed_cells(
                 pace,
                 self._metres,
                 np.float32(self.length_weight_s),
                 box,
                 self.stride,
-                self.weight,
+                self.cell_cost,
                 cells,
                 before,
             )
             if bad:
                 raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
             if count:
-                self.low = min(self.low, float(low))
-                self.high = max(self.high, float(high))
-                found.append(Changes(cells[:count], before[:count], self.weight[cells[:count]]))
+                self.lowest_cell_cost = min(self.lowest_cell_cost, float(lowest))
+                self.highest_cell_cost = max(self.highest_cell_cost, float(highest))
+                found.append(Changes(cells[:count], before[:count], self.cell_cost[cells[:count]]))
         if not found:
             return NO_CHANGES
         changes = found[0]
@@ -153,22 +180,22 @@ class Ground:
             changes = Changes(
                 np.concatenate([part.cells for part in found]),
                 np.concatenate([part.before for part in found]),
-                np.concatenate([part.weight_now for part in found]),
+                np.concatenate([part.after for part in found]),
             )
         return changes
 
     def difference(self, older: Floats, dirty: Sequence[Window]) -> Changes:
-        """What changed inside the dirty windows since `older` weights."""
+        """What changed inside the dirty windows since the `older` cell costs (padded)."""
         parts: list[Cells] = []
         shape = (self.grid.rows + 2, self.stride)
         for row0, col0, row1, col1 in self._boxes(dirty):
             part = np.s_[row0 + 1 : row1 + 1, col0 + 1 : col1 + 1]
-            rows, cols = np.nonzero(self.weight.reshape(shape)[part] != older.reshape(shape)[part])
+            rows, cols = np.nonzero(self.cell_cost.reshape(shape)[part] != older.reshape(shape)[part])
             parts.append((rows + row0 + 1) * self.stride + cols + col0 + 1)
         if not parts:
             return NO_CHANGES
         cells = np.unique(np.concatenate(parts))
-        return Changes(cells, older[cells], self.weight[cells])
+        return Changes(cells, older[cells], self.cell_cost[cells])
 
     def _boxes(self, windows: Sequence[Window]) -> Iterator[tuple[int, int, int, int]]:
         """(row0, col0, row1, col1) of what of each window lies on the grid, where anything does."""
@@ -179,15 +206,34 @@ class Ground:
                 yield row0, col0, row1, col1
 
     def grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
-        """The exact tree of a padded, passable root. Arrays are written whole; no cost exceeds what is returned."""
-        return flood(self.weight, self.low, self.high, self.stride, root, self.rule, self.corners, cost, parent)
+        """The exact tree of a padded root. Arrays are written whole; no cost exceeds what is returned, s.
 
-    def walk(self, parent: NDArray[np.uint8], root: int, starts: Cells, most: int, weight: Floats) -> Walks:
-        """Routes from padded cells that have a way to a padded root, over the weights of this or an earlier map.
+        Raises OutsideGridError unless the root is a padded cell, ValueError where it is lethal or an array has
+        another size than the map.
+        """
+        if not 0 <= root < self.size:
+            raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
+        if not self.cell_cost[root] < np.inf:
+            raise ValueError(f"padded root {root} is lethal: no tree can lead there")
+        if cost.size != self.size or parent.size != self.size:
+            raise ValueError(f"a tree of this map has {self.size} cells")
+        return self._grow(root, cost, parent)
+
+    def _grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
+        return grow_tree(self.padded, self.lowest_cell_cost, self.highest_cell_cost, root, cost, parent)
+
+    def walk(self, parent: NDArray[np.uint8], root: int, starts: Cells, most: int, cell_cost: Floats) -> Walks:
+        """Routes from padded cells that have a way to a padded root, over the cell costs of this or an earlier map.
 
         most  steps of a route; 0 for all of it
+        Raises ValueError where a start or the root is no padded cell.
         """
-        return Walks(*walk_routes(weight, parent, self.stride, self.rule, root, starts, most, self.grid.cells))
+        if not 0 <= root < self.size:
+            raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
+        padded = self.padded if cell_cost is self.cell_cost else self.padded._replace(cell_cost=cell_cost)
+        return Walks(*walk_routes(padded, parent, root, starts, most, self.grid.cells))
 
     def passable(self, cell: int) -> bool:
-        return bool(self.weight[self.pad(cell)] < np.inf)
+        """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""
+        self.grid.row_col(cell)
+        return bool(self.cell_cost[self.pad(cell)] < np.inf)

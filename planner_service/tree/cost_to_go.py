@@ -1,6 +1,6 @@
 """The cost-to-go tree of one target over one map: grown, moved by windows, repaired after changes.
 
-`Ground` holds the padded weights of the map, `CostToGoTree` the labels of one root on it. Costs are seconds.
+`CostGrid` holds the padded cell costs of the map, `CostToGoTree` the labels of one root on it. Costs are seconds.
 float32 labels: a full growth over a route of n steps is within n * 2**-24 of the exact cost, relatively.
 
 The one invariant that everything rests on: a cell's stored cost is at least what its parent offers. Costs then grow
@@ -11,219 +11,211 @@ tree's offset is an upper bound of what is driven along the parents.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import corridor_growth, route_walk
-from planner_service.kernels.bucket_queue import point_to_parents
 from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
-from planner_service.kernels.layout import NONE
+from planner_service.kernels.layout import NONE, Labels, PaddedGrid
+from planner_service.kernels.lower_bounds import WindowBound
+from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
-from planner_service.tree.corridors import INNER, Skeleton
-from planner_service.tree.cost_grid import Cells, Changes, Ground
-from planner_service.tree.growth import FINE, flood
+from planner_service.tree.corridors import INNER, CorridorGraph
+from planner_service.tree.cost_grid import Cells, Changes, CostGrid
+from planner_service.tree.growth import FINE, grow_tree
 from shared_map.arrays import Floats
+from swarm.errors import OutsideGridError
 from swarm.grid import Window
 
-
-@dataclass(frozen=True, eq=False)
-class Surrounding:
-    """What a window around the root cost on its own: a lower bound on every way that stays inside.
-
-    cost      float32  s, of the window as a padded grid of its own; exact inside it
-    box       (row0, col0, row1, col1) of the window
-    rim       int64    padded cells of the window from which a step leads out of it; rim_cost: float64, s
-    """
-
-    cost: Floats
-    box: tuple[int, int, int, int]
-    rim: Cells
-    rim_cost: NDArray[np.float64]
-
-
-NOWHERE = Surrounding(np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
+NO_WINDOW = WindowBound(np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
 
 
 class CostToGoTree:
-    """The tree of one root on a `Ground`.
+    """The tree of one root on a `CostGrid`."""
 
-    root    the target's cell
-    offset  s; a cell's cost-to-go is at most its stored cost plus this
-    near    of the last window, as long as it is where the root is; None otherwise
-    exact   whether cost-to-go is exact on the ground as it is now (then offset is 0)
-    reach   s; no stored cost exceeds it
-    """
-
-    def __init__(self, ground: Ground) -> None:
-        self.ground = ground
-        self.cost: Floats = np.full(ground.size, np.inf, np.float32)
-        self.parent: NDArray[np.uint8] = np.full(ground.size, NONE, np.uint8)
+    def __init__(self, cost_grid: CostGrid) -> None:
+        self.cost_grid = cost_grid
+        """The map that the tree lies on. Whoever changes it calls `repair`, or grows the tree anew."""
+        self.cost: Floats = np.full(cost_grid.size, np.inf, np.float32)
+        """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no way. `grow`
+        and `take` set it, `move`, `grow_corridors`, `tighten`, `relabel` and `repair` change it."""
+        self.parent: NDArray[np.uint8] = np.full(cost_grid.size, NONE, np.uint8)
+        """uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way."""
         self.root = -1
+        """The target's cell, of the grid; -1 before the first growth. `grow`, `take` and `move` set it."""
         self.offset = 0.0
+        """s; how much the stored costs lack at most. `move` adds the cost from the old root to the new one; `grow`,
+        `take` and `relabel` reset it."""
         self.exact = False
+        """Whether cost-to-go is exact on the map as it is now (then the offset is 0). `grow` and `take` set it,
+        `move` to another root and `grow_corridors` reset it, `repair` keeps it."""
         self.reach = 0.0
-        self.near: Surrounding | None = None
+        """s; no stored cost exceeds it. A growth sets it, a repair may raise it."""
+        self.window_bound: WindowBound | None = None
+        """What the last window proves, as long as its root is the tree's. `move` sets it, a growth resets it, and
+        so does the owner (to None) when a cell gets cheaper: it bounds from below."""
         self._stamps: NDArray[np.uint8] | None = None
+        """uint8, padded: `_now` or `_now + 1` where a cost was recomputed since ways changed last. None until
+        needed."""
         self._now = 2
+        """Raised by 2 whenever ways change, so that all stamps are old; begins anew with new stamps at 254."""
 
     def grow(self, root: int) -> None:
-        """Grow the whole tree of a passable cell, exactly."""
-        self.reach = self.ground.grow(self.ground.pad(root), self.cost, self.parent)
-        self.root = root
-        self.offset = 0.0
-        self.near = None
-        self.exact = True
+        """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
+        it is lethal."""
+        self.cost_grid.check_root(root)
+        self.reach = self.cost_grid.grow(self.cost_grid.pad(root), self.cost, self.parent)
+        self._become_exact(root)
 
     def take(self, root: int, cost: Floats, parent: NDArray[np.uint8], reach: float) -> None:
-        """Become a tree that somebody else grew, exactly, on the ground as it is now."""
+        """Become a tree that somebody else grew, exactly, on the map as it was or is now. Raises as `grow`, except
+        that the root may have become lethal since, and ValueError unless the arrays are as `cost` and `parent`
+        here."""
+        self.cost_grid.grid.row_col(root)
+        size = self.cost_grid.size
+        if cost.shape != (size,) or parent.shape != (size,) or cost.dtype != np.float32 or parent.dtype != np.uint8:
+            raise ValueError(f"a tree of this map is float32 and uint8, {size} cells each")
         self.cost = cost
         self.parent = parent
+        self.reach = reach
+        self._become_exact(root)
+
+    def _become_exact(self, root: int) -> None:
         self.root = root
         self.offset = 0.0
-        self.near = None
+        self.window_bound = None
         self.exact = True
-        self.reach = reach
 
-    def grow_rings(self, window: Window, skeleton: Skeleton) -> int:
-        """After a window around the root was grown: renew what lies beyond, on the cells of a skeleton only, ring
-        by ring of doubling width and four times the traffic. All others keep their parents. Returns cells visited.
-        """
-        ground = self.ground
+    @property
+    def _labels(self) -> Labels:
+        """For kernels. Raises ValueError where there is no tree yet."""
+        if self.root < 0:
+            raise ValueError("the tree has no root: grow it first")
+        return Labels(self.cost, self.parent, self.cost_grid.pad(self.root))
+
+    def grow_corridors(self, window: Window, corridors: CorridorGraph) -> int:
+        """After a window around the root was grown: renew what lies beyond, on the cells of corridors only, from
+        distance to twice that distance for four times the traffic. All others keep their parents. Returns cells
+        visited. Raises OutsideGridError on a window that is not inside the grid."""
+        labels = self._labels
+        box = self._box(window)
         self.exact = False
-        found = int(
-            corridor_growth.spread(
-                ground.weight,
-                self.cost,
-                self.parent,
-                self._stamps_now(),
-                self._now,
-                skeleton.level,
-                ground.stride,
-                ground.rule,
-                ground.corners,
-                ground.pad(self.root),
-                (window.row0, window.col0, window.row1, window.col1),
-                min(max(window.row1 - window.row0, window.col1 - window.col0), INNER),
-            )
+        inner = min(max(window.row1 - window.row0, window.col1 - window.col0), INNER)
+        found = corridor_growth.grow_corridors(
+            self.cost_grid.padded, labels, corridors.level, self._stamps_now(), self._now, box, inner
         )
-        self._stamp()
-        return found
+        self._ways_changed()
+        return int(found)
 
     def move(self, root: int, window: Window) -> int:
         """Lead to a new root, by growing only a window that holds it and the old root.
 
-        Returns cells grown, or 0 if nothing was done because the old root has no way to the new one inside the
-        window.
+        Costs outside become upper bounds: the old ones plus the cost from the old root to the new. Returns cells
+        grown, or 0 if nothing was done because the old root has no way to the new one inside the window. Raises as
+        `grow`, and OutsideGridError on a window that is not inside the grid or does not hold both roots.
         """
-        ground = self.ground
-        row0, col0, row1, col1 = box = (window.row0, window.col0, window.row1, window.col1)
+        grid = self.cost_grid
+        if self.root < 0:
+            raise ValueError("the tree has no root: grow it first")
+        grid.check_root(root)
+        row0, col0, row1, col1 = box = self._box(window)
         width = col1 - col0 + 2
+        start, old = self._in_window(root, window), self._in_window(self.root, window)
         part = np.empty((row1 - row0 + 2) * width, np.float32)
-        low, high = cut_window(ground.weight, ground.stride, box, part)
+        lowest, highest = cut_window(grid.cell_cost, grid.stride, box, part)
         cost = np.empty_like(part)
-        row, col = ground.grid.row_col(root)
-        start = (row - row0 + 1) * width + col - col0 + 1
-        flood(part, float(low), float(high), width, start, ground.rule, ground.corners, cost, None)
-        row, col = ground.grid.row_col(self.root)
-        way = float(cost[(row - row0 + 1) * width + col - col0 + 1])
+        padded = PaddedGrid(part, width, grid.rule, grid.corners)
+        grow_tree(padded, float(lowest), float(highest), start, cost, None)
+        way = float(cost[old])
         if not way < math.inf:
             return 0
         self.offset += way
-        merge_window(cost, box, np.float32(self.offset), ground.pad(self.root), self.cost, ground.stride)
-        rows, cols = ground.grid.rows, ground.grid.cols
+        merge_window(cost, box, np.float32(self.offset), grid.pad(self.root), self.cost, grid.stride)
+        rows, cols = grid.grid.rows, grid.grid.cols
         # A neighbour of a cell that got cheaper may lead there now.
-        grown = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
-        new_root = ground.pad(root)
+        around = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
+        new_root = grid.pad(root)
         point_to_parents(
-            ground.weight, self.cost, ground.stride, ground.rule, ground.corners, new_root, grown, self.parent
+            grid.cell_cost, self.cost, grid.stride, grid.rule, grid.corners, new_root, around, self.parent
         )
         self.exact = self.exact and root == self.root
         self.root = root
-        self._stamp()
+        self._ways_changed()
         rim = np.empty(2 * (row1 - row0 + col1 - col0), np.int64)
         rim_cost = np.empty(rim.size, np.float64)
-        many = find_rim(cost, box, rows, ground.stride, rim, rim_cost)
-        self.near = Surrounding(cost, box, rim[:many], rim_cost[:many])
+        many = find_rim(cost, box, rows, grid.stride, rim, rim_cost)
+        self.window_bound = WindowBound(cost, box, rim[:many], rim_cost[:many])
         return window.cells
 
+    def _box(self, window: Window) -> tuple[int, int, int, int]:
+        """For kernels. Raises OutsideGridError on a window that is not inside the grid."""
+        row0, col0, row1, col1 = window.row0, window.col0, window.row1, window.col1
+        if not (0 <= row0 < row1 <= self.cost_grid.grid.rows and 0 <= col0 < col1 <= self.cost_grid.grid.cols):
+            raise OutsideGridError(f"{window} is not inside the grid")
+        return row0, col0, row1, col1
+
+    def _in_window(self, cell: int, window: Window) -> int:
+        """A cell's index in the window as a padded grid of its own. Raises OutsideGridError if it lies outside."""
+        row, col = self.cost_grid.grid.row_col(cell)
+        if not window.contains(row, col):
+            raise OutsideGridError(f"cell {cell} is not in {window}")
+        return (row - window.row0 + 1) * (window.col1 - window.col0 + 2) + col - window.col0 + 1
+
     def repair(self, changes: Changes) -> int:
-        """Bring the tree up to date after the ground changed. Returns cells visited, or -1 if so many are concerned
+        """Bring the tree up to date after the map changed. Returns cells visited, or -1 if so many are concerned
         that a growth costs less: then it must be grown before anything else."""
         if changes.cells.size == 0:
             return 0
-        if self.ground.directed:
+        grid = self.cost_grid
+        if grid.directed:
             return -1
-        ground = self.ground
-        visited, highest = repair(
-            ground.weight,
-            self.cost,
-            self.parent,
-            ground.stride,
-            ground.rule,
-            ground.corners,
-            ground.pad(self.root),
-            changes.cells,
-            changes.before,
-            *ground.buckets,
-            _most_repaired(ground.grid.cells),
-        )
+        most = _most_repaired(grid.grid.cells)
+        visited, highest = repair(grid.padded, self._labels, changes.cells, changes.before, grid.buckets, most)
         self.reach = max(self.reach, float(highest))
-        self._stamp()
+        self._ways_changed()
         return int(visited)
 
     def tighten(self, cells: Cells) -> None:
-        """Make the costs of padded cells, and of all on their ways, what is really driven. A window raises the
-        costs beyond it by the most that may be, move after move, until a growth comes by or somebody asks."""
-        if self.exact:
-            return
-        ground = self.ground
-        corridor_growth.tighten(
-            ground.weight,
-            self.cost,
-            self.parent,
-            self._stamps_now(),
-            self._now,
-            ground.stride,
-            ground.rule,
-            ground.pad(self.root),
-            cells,
-        )
+        """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.
+
+        A window raises the costs beyond it by the most that may be, move after move, until a growth comes by or
+        this is asked. Raises ValueError where one is no padded cell.
+        """
+        if not self.exact:
+            corridor_growth.tighten(self.cost_grid.padded, self._labels, self._stamps_now(), self._now, cells)
 
     def _stamps_now(self) -> NDArray[np.uint8]:
-        """`_now` or one more where a cost was tightened since ways changed last."""
         if self._stamps is None:
-            self._stamps = np.zeros(self.ground.size, np.uint8)
+            self._stamps = np.zeros(self.cost_grid.size, np.uint8)
         return self._stamps
 
-    def _stamp(self) -> None:
-        """Ways have changed: what was tightened before need not be right any more."""
+    def _ways_changed(self) -> None:
+        """What was tightened before need not be right any more."""
         self._now += 2
         if self._now > 254:
             self._now = 2
             self._stamps = None
 
     def relabel(self) -> None:
-        """Make every cost what is really driven along the parents."""
-        ground = self.ground
-        route_walk.relabel(ground.weight, self.parent, ground.stride, ground.rule, ground.pad(self.root), self.cost)
+        """Make every cost what is really driven along the parents, and the offset 0."""
+        route_walk.relabel(self.cost_grid.padded, self._labels)
         self.offset = 0.0
 
     @property
     def fine(self) -> bool:
         """Whether float32 tells every cost from its parent's. If not, only whole growths keep the tree right."""
-        return self.reach <= FINE * self.ground.low
+        return self.reach <= FINE * self.cost_grid.lowest_cell_cost
 
     @property
     def precise(self) -> bool:
         """Whether one more window can be merged without losing a cell's cost in the rounding of the offset."""
-        return self.fine and self.offset <= FINE / 8 * self.ground.low
+        return self.fine and self.offset <= FINE / 8 * self.cost_grid.lowest_cell_cost
 
     def inner(self, padded: NDArray[np.generic]) -> NDArray[np.generic]:
         """The (rows, cols) view of a padded array."""
-        grid = self.ground.grid
-        view: NDArray[np.generic] = padded.reshape(grid.rows + 2, self.ground.stride)[1:-1, 1:-1]
+        grid = self.cost_grid.grid
+        view: NDArray[np.generic] = padded.reshape(grid.rows + 2, self.cost_grid.stride)[1:-1, 1:-1]
         return view
 
 

@@ -1,4 +1,4 @@
-"""A full growth: which flood suits the weights."""
+"""A full growth: which queue suits the cell costs."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import bucket_queue as kernels
-from planner_service.kernels.layout import RULE_OCTILE, SQRT2_EXACT, TOO_FINE
-from planner_service.kernels.radix_heap import flood_wide
+from planner_service.kernels.bucket_queue import grow_by_buckets
+from planner_service.kernels.layout import RULE_OCTILE, SQRT2_EXACT, TOO_FINE, Labels, PaddedGrid
+from planner_service.kernels.parents import point_to_parents
+from planner_service.kernels.radix_heap import grow_by_radix_heap
 from shared_map.arrays import Floats
 
 MAX_RATIO = 1 << 12
@@ -19,36 +20,31 @@ CELLS_PER_BUCKET = 16
 SMALL_RATIO = 64
 """No grid is so small that a ring of this many buckets does not pay."""
 FINE = float(1 << 20)
-"""While no cost exceeds so many smallest weights, float32 tells any cell's cost from its parent's."""
+"""While no cost exceeds so many lowest cell costs, float32 tells any cell's cost from its parent's."""
 
 
-def flood(
-    weight: Floats,
-    low: float,
-    high: float,
-    stride: int,
-    root: int,
-    rule: int,
-    corners: bool,
-    cost: Floats,
-    parent: NDArray[np.uint8] | None,
+def grow_tree(
+    padded: PaddedGrid, lowest: float, highest: float, root: int, cost: Floats, parent: NDArray[np.uint8] | None
 ) -> float:
-    """Grow the exact tree of a padded root. Returns a bound that no cost exceeds.
+    """Grow the exact tree of a padded, passable root. Returns a bound, s, that no cost exceeds.
 
-    low, high  bounds of the finite weights, s
+    lowest, highest  bounds of the finite cell costs, s
+    cost, parent     padded, written whole; None where parents are not wanted
     """
-    box = (0, 0, weight.size // stride - 2, stride - 2)
-    longest = high * (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
-    if longest <= min(MAX_RATIO, max(SMALL_RATIO, weight.size // CELLS_PER_BUCKET)) * low:
-        width = np.float32(low * 0.98)
-        ring = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
-        last = kernels.flood(weight, cost, stride, root, rule, corners, width, ring)
+    cell_cost, stride, rule, corners = padded
+    size = cell_cost.size
+    box = (0, 0, size // stride - 2, stride - 2)
+    longest = highest * (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
+    if longest <= min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)) * lowest:
+        width = np.float32(lowest * 0.98)
+        count = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
+        last = grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, count)
         if last != TOO_FINE:
             if parent is not None:
-                kernels.point_to_parents(weight, cost, stride, rule, corners, root, box, parent)
+                point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent)
             return float((last + 1) * width)
-    parents = np.empty(weight.size, np.uint8) if parent is None else parent
-    reach = float(flood_wide(weight, cost, stride, root, rule, corners, np.float32(low), parents))
-    if parent is not None and reach <= FINE * low:
-        kernels.point_to_parents(weight, cost, stride, rule, corners, root, box, parent)
+    parents = np.empty(size, np.uint8) if parent is None else parent
+    reach = float(grow_by_radix_heap(padded, Labels(cost, parents, root), np.float32(lowest)))
+    if parent is not None and reach <= FINE * lowest:
+        point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent)
     return reach

@@ -13,27 +13,18 @@ from swarm.wire.routes import RouteBatch
 
 def read_routes(tree: CostToGoTree, bounds: LowerBounds, asked: NDArray[np.int64], max_cells: int) -> RouteBatch:
     """A route from each cell, in order; statuses, no exceptions. 0 for `max_cells` is the whole route."""
-    ground = tree.ground
-    root = ground.pad(tree.root)
+    grid = tree.cost_grid
+    root = grid.pad(tree.root)
     starts = np.empty(asked.size, np.int64)
     statuses = np.empty(asked.size, np.uint8)
-    find_starts(ground.weight, tree.cost, ground.stride, root, asked, starts, statuses)
-    walks = ground.walk(tree.parent, root, starts, max_cells, ground.weight)
+    find_starts(grid.cell_cost, tree.cost, grid.stride, root, asked, starts, statuses)
+    walks = grid.walk(tree.parent, root, starts, max_cells, grid.cell_cost)
     if max_cells:
         tree.tighten(walks.last)
     prices = np.empty((4, asked.size), np.float64)
     prices[1] = bounds.at(tree, starts)
-    whole = price_routes(
-        tree.cost,
-        tree.offset,
-        root,
-        ground.grid.resolution_m,
-        ground.diagonal,
-        ground.config.length_weight,
-        walks[1:],
-        statuses,
-        prices,
-    )
+    metres = (grid.grid.resolution_m, grid.diagonal, grid.config.length_weight)
+    whole = price_routes(tree.cost, tree.offset, root, metres, walks[1:], statuses, prices)
     if not whole:
         raise AssertionError("a route does not end at the target: the tree is broken")
     return RouteBatch(statuses, asked, walks.directions, walks.ends, *prices)

@@ -1,4 +1,4 @@
-"""How wide a window a move asks for: rungs of doubling width; the paper's variable range, mended."""
+"""How wide a window a move asks for: a schedule of doubling widths; the paper's variable range, mended."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ AHEAD = 16
 """A window reaches so many times as far as the target has come since one so wide was grown last."""
 
 
-class Rungs:
-    """Windows of doubling width, each grown anew once the target has come a share of that width.
+class WindowSchedule:
+    """Windows of doubling width, each of which is due once the target has come a share of that width.
 
     Routes are as old as the widest window that they begin in. What the target has moved since matters in proportion
     to how far away it is: a window that reaches `AHEAD` times as far keeps that small at every distance, and costs
@@ -21,15 +21,16 @@ class Rungs:
     def __init__(self, grid: GridSpec, half: int) -> None:
         self._grid = grid
         self._half = half
+        # Where the target stood when the whole tree was last grown, and when each width was: narrowest first.
         self._whole = 0
         self._centres = [0] * max((max(grid.rows, grid.cols) // half).bit_length(), 1)
 
     def half(self, cell: int, widest: int) -> int:
-        """How far the window around a target that came to `cell` should reach, at most `widest` unless one rung is
-        wider. No window is ever narrower than the way since one so wide, so that windows overlap."""
+        """How far the window around a target that came to `cell` should reach, at most `widest` unless the
+        narrowest is wider. No window is ever narrower than the way since one so wide, so that windows overlap."""
         found = self._half
-        for rung, centre in enumerate(self._centres):
-            half = self._half << rung
+        for doublings, centre in enumerate(self._centres):
+            half = self._half << doublings
             if half > max(widest, self._half):
                 break
             if AHEAD * self._grid.distance_cells(centre, cell) >= half:
@@ -37,16 +38,17 @@ class Rungs:
         return found
 
     def beyond(self, cell: int, widest: int) -> bool:
-        """Whether what lies beyond a window of `widest` cells is due to be renewed: when the next rung would be."""
+        """Whether what lies beyond a window of `widest` cells is due to be renewed: when a window twice as wide
+        would be."""
         return AHEAD * self._grid.distance_cells(self._whole, cell) >= 2 * widest
 
-    def grown(self, cell: int, half: int) -> None:
-        """The tree was grown around `cell`, so far to every side."""
+    def note_grown(self, cell: int, half: int) -> None:
+        """A window of `half` cells to every side of `cell` was grown: all widths up to it begin anew."""
         if half >= max(self._grid.rows, self._grid.cols):
             self._whole = cell
-        for rung in range(len(self._centres)):
-            if self._half << rung <= half:
-                self._centres[rung] = cell
+        for doublings in range(len(self._centres)):
+            if self._half << doublings <= half:
+                self._centres[doublings] = cell
 
 
 def block_half(grid: GridSpec, old: int, new: int, k_min: int) -> int:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.marks import Statements, fault, grid_cells, mark_set, statements, tile_cells
+from shared_map.replication.marks import Statements, fault, mark_set, statements
 from shared_map.replication.replica import MapReplica
+from shared_map.replication.tiles import grid_cells, tile_cells, tile_corners
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.wire.messages.marks import MarkSet
@@ -39,7 +40,7 @@ def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
 
 def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
     said = statements(each)
-    rows, cols = np.divmod(grid_cells(grid, each.tile, said.cells), grid.cols)
+    rows, cols = np.divmod(grid_cells(grid, tile_corners(grid, each.tile), said.cells), grid.cols)
     untils = [FOREVER] * len(said.cells) if said.untils_ns is None else said.untils_ns.tolist()
     marks: list[list[Any]] = []
     for row, col, kind, pace, stamp_ns, until_ns in zip(
@@ -106,14 +107,13 @@ def to_bands(
     """(pace, kind) of the winning marks. The pace is in s/m: inf is lethal, nan is as the prior map says. The kind
     is a MarkKind, NOTHING_SAID_BAND where nobody says anything."""
     replica = MapReplica(grid)
-    for each in sets:
-        replica.merge(each, measured=False)
+    replica.merge(list(sets))
     replica.tick(now_ns)
     pace = np.full(grid.cells, np.nan, np.float32)
     kind = np.full(grid.cells, NOTHING_SAID_BAND, np.uint8)
-    for tile in replica.tiles:
+    for tile in replica.held.tiles:
         won = replica.winners(tile)
-        cells = grid_cells(grid, tile, won.cells)
+        cells = grid_cells(grid, tile_corners(grid, tile), won.cells)
         kind[cells] = won.kinds
         pace[cells] = np.choose(won.kinds, [won.paces, np.float32(np.inf), np.float32(np.nan)])
     return pace.reshape(grid.rows, grid.cols), kind.reshape(grid.rows, grid.cols)

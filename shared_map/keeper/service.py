@@ -6,10 +6,10 @@ import logging
 from contextlib import suppress
 
 from shared_map.keeper.base_map_transfer import BaseMapServer
-from shared_map.keeper.compaction import FoldPlan, fold
+from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.store import Keeper, KeeperStore
 from shared_map.replication.replica import MapReplica, PublishSet
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Bus, Event, Heard, Post
@@ -24,19 +24,23 @@ from swarm.wire.topics import SIGHTED
 log = logging.getLogger(__name__)
 
 THROTTLED = "throttled."
-"""Begins the gauge, there only while it is so, of an author that marks more than its share."""
+"""Prefix of the gauge of an author that exceeds its quota; the gauge is there only while it does."""
 
 _RETRY_NS = NS_PER_S
 _NOTE_AGAIN_NS = 60 * NS_PER_S
 _NAME_AT_MOST = 16
-_FOLD_EVERY_NS = NS_PER_S
-_FOLD_TILES = 16
+_COMPACT_EVERY_NS = NS_PER_S
+_COMPACT_TILES = 16
 _SWEEP_EVERY_NS = 600 * NS_PER_S
 
 
 class KeeperService:
-    """A replica that writes every set to its store, tells by its digest what is safe there, and answers for all
-    authors, above all for those that are gone."""
+    """A replica which writes every set to its store, tells by its digest what is safe there, and answers for all
+    authors, above all for dead ones.
+
+    replica   the marks
+    counters  what the process publishes of itself
+    """
 
     def __init__(self, setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post, store: KeeperStore) -> None:
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
@@ -47,7 +51,7 @@ class KeeperService:
         self._store = store
         self._keeper = Keeper()
         self.replica = MapReplica(terrain.grid)
-        self._feed = MapFeed(
+        self._sync = MapSync(
             self.replica,
             bus,
             post,
@@ -55,54 +59,53 @@ class KeeperService:
             setup.role,
             name=setup.author,
             serves_all=True,
-            held=self._keeper.committed.held,
+            committed=self._keeper.committed.held,
             on_accepted=self._accepted,
         )
         config = setup.scenario.map
-        self._fold_after_ns = int(config.fold_after_s * NS_PER_S)
-        self._fold_keep_ns = int(config.fold_keep_s * NS_PER_S)
-        self._fold_plan = FoldPlan(self._fold_after_ns, 0)
-        self._fold_due_ns = 0
+        self._compact_after_ns = int(config.compact_after_s * NS_PER_S)
+        self._compact_keep_ns = int(config.compact_keep_s * NS_PER_S)
+        self._plan = CompactionPlan(self._compact_after_ns, 0)
+        self._compact_due_ns = 0
         self._sweep_due_ns = 0
         for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged"):
             self.counters.count(name, 0)
         self._save_due_ns = 0
-        self._sightings = Sightings(self.replica.reading)
+        self._sightings = Sightings(self.replica.filter)
         self._seen: dict[str, Sighted] = {}
         self._sightings_due_ns = 0
         self._noted_ns: int | None = None
         self._named: list[str] = []
         store.bind(terrain.digest, terrain.grid)
-        for mark_set in store.load():
-            if self.replica.merge(mark_set, measured=False) is not None:
-                self._keeper.restored(mark_set)
+        for each in self.replica.merge(list(store.load()), measured=False).sets:
+            self._keeper.restored(each)
 
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._base_map.start(self._bus)
-        self._fold_plan = FoldPlan(self._fold_after_ns, now_ns)
-        self._feed.start(now_ns)
+        self._plan = CompactionPlan(self._compact_after_ns, now_ns)
+        self._sync.start(now_ns)
         self._bus.subscribe(SIGHTED, self._post)
-        log.info("keeper started: %d tiles in store %s", len(self.replica.tiles), self._store.path)
+        log.info("keeper started: %d tiles in store %s", len(self.replica.held.tiles), self._store.path)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, Heard) and isinstance(event.message, Sighted):
             self._sightings.hear(event.message)
             return
         if isinstance(event, Heard) and isinstance(event.message, Digest):
-            self._fold_plan.heard(event.message.author, now_ns)
+            self._plan.heard(event.message.author, now_ns)
         if not self._member.handle(event):
-            self._feed.handle(event, now_ns)
+            self._sync.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
         if now_ns >= self._save_due_ns:
             self._save(now_ns)
-        if now_ns >= self._fold_due_ns and not self._keeper.waiting:
-            self._fold_due_ns = now_ns + _FOLD_EVERY_NS
-            self._fold(now_ns)
+        if now_ns >= self._compact_due_ns and not self._keeper.waiting:
+            self._compact_due_ns = now_ns + _COMPACT_EVERY_NS
+            self._compact(now_ns)
         if now_ns >= self._sightings_due_ns:
             self._save_sightings(now_ns)
-        self._feed.tick(now_ns)
+        self._sync.tick(now_ns)
         self._name_throttled(now_ns)
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]
@@ -115,7 +118,7 @@ class KeeperService:
         self._member.publish_stats(now_ns)
 
     def _save_sightings(self, now_ns: int) -> None:
-        """Where targets were seen is for people to look at: what a full disk does not take is not missed."""
+        """Save the newest sightings. They are for people to look at, so a full disk is no reason to try again."""
         self._sightings_due_ns = now_ns + NS_PER_S
         new = {id: each for id, each in self._sightings.best(now_ns).items() if self._seen.get(id) != each}
         self._sightings.expire(now_ns)
@@ -125,8 +128,8 @@ class KeeperService:
                 self._store.save_sightings(new.values())
 
     def _name_throttled(self, now_ns: int) -> None:
-        """Tell people once who marks more than its share."""
-        throttled = self._feed.throttled
+        """Note each author that begins to exceed its quota."""
+        throttled = self._sync.throttled
         self.counters.gauge("authors_throttled", float(len(throttled)))
         for author in self._named:
             self.counters.gauges.pop(THROTTLED + author, None)
@@ -141,42 +144,42 @@ class KeeperService:
 
     def _accepted(self, mark_set: MarkSet) -> None:
         self._keeper.accept(mark_set)
-        self._fold_plan.accepted(mark_set)
+        self._plan.accepted(mark_set)
 
-    def _fold(self, now_ns: int) -> None:
-        """Fold what the dead have left, a few tiles at a time. On the disk first: what is put is never less than
-        what the store could put back."""
-        plan = self._fold_plan
-        plan.update(self.replica.ledger, now_ns)
-        tiles = plan.take_due(_FOLD_TILES, now_ns)
-        folded: list[MarkSet] = []
+    def _compact(self, now_ns: int) -> None:
+        """Compact what dead authors left, a few tiles at a time. The store is written before anything is published,
+        so that it can always put back what was dropped."""
+        plan = self._plan
+        plan.update(self.replica.held.ledger, now_ns)
+        tiles = plan.take_due(_COMPACT_TILES, now_ns)
+        compacted: list[MarkSet] = []
         try:
             for tile, dropped_too in tiles.items():
-                sets = self.replica.sets(tile)
-                dropped = self._store.folded(tile) if dropped_too else {}
+                sets = self.replica.held.of_tile(tile)
+                dropped = self._store.set_aside(tile) if dropped_too else {}
                 names = {*dropped, *(each.author for each in sets)}
                 gone = {name for name in names if plan.is_gone(name, now_ns)}
-                new = fold(sets, dropped, gone, now_ns - self._fold_after_ns)
+                new = compact(sets, dropped, gone, now_ns - self._compact_after_ns)
                 left = {each.author: each for each in sets if each.author in gone}
-                plan.folded(tile, (left | {each.author: each for each in new}).values(), now_ns)
-                folded.extend(new)
-            if folded:
-                self._store.save(folded, now_ns)
+                plan.compacted(tile, (left | {each.author: each for each in new}).values(), now_ns)
+                compacted.extend(new)
+            if compacted:
+                self._store.save(compacted, now_ns)
             if now_ns >= self._sweep_due_ns:
                 self._sweep_due_ns = now_ns + _SWEEP_EVERY_NS
-                self._store.forget_folded(now_ns - self._fold_keep_ns)
+                self._store.forget_set_aside(now_ns - self._compact_keep_ns)
         except StoreError as error:
             plan.put_off(tiles)
-            self._fold_due_ns = now_ns + 10 * _FOLD_EVERY_NS
-            log.warning("cannot fold: %s", error)
+            self._compact_due_ns = now_ns + 10 * _COMPACT_EVERY_NS
+            log.warning("cannot compact: %s", error)
             return
-        self.replica.merge_many(folded, measured=False)
-        self._keeper.saved(folded)
-        self._feed.publish(PublishSet(each) for each in folded)
-        self.counters.count("sets_folded", len(folded))
+        self.replica.merge(compacted, measured=False)
+        self._keeper.saved(compacted)
+        self._sync.publish(PublishSet(each) for each in compacted)
+        self.counters.count("sets_folded", len(compacted))
 
     def _save(self, now_ns: int) -> None:
-        """Commit what waits. A disk that refuses is told of, tried again, and no reason to stop serving."""
+        """Commit what waits. If the disk refuses, say so once, go on serving and try again."""
         waiting = self._keeper.waiting
         if not waiting:
             return

@@ -1,4 +1,4 @@
-"""What the keeper must not lose: sets on their way to the disk (core), and the disk (SQLite)."""
+"""The keeper's store: one SQLite file (`KeeperStore`), and which sets still wait for it (`Keeper`, core)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from urllib.parse import quote
 
 from shared_map.keeper.compaction import united, without
 from shared_map.replication.digest import Ledger
-from shared_map.replication.marks import base_seq, is_burial
+from shared_map.replication.marks import base_seq, is_tombstone
 from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.marks import FOLDS, MarkSet
+from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.messages.targets import Sighted
 
 log = logging.getLogger(__name__)
@@ -44,6 +44,7 @@ CREATE TABLE IF NOT EXISTS sightings (
     target TEXT PRIMARY KEY, stamp_ns INTEGER NOT NULL, sighted BLOB NOT NULL
 ) WITHOUT ROWID;
 """
+# `folded` holds what compaction dropped; the name stays, as stores of this version have it.
 _SEEN = """
 INSERT INTO sightings (target, stamp_ns, sighted) VALUES (?, ?, ?)
 ON CONFLICT (target) DO UPDATE SET stamp_ns = excluded.stamp_ns, sighted = excluded.sighted
@@ -59,20 +60,21 @@ ON CONFLICT (tile, author) DO UPDATE SET grp = excluded.grp, epoch = excluded.ep
     untils_ns = excluded.untils_ns
 WHERE (excluded.epoch, excluded.seq) >= (sets.epoch, sets.seq)
 """
-_BURY = "DELETE FROM sets WHERE tile = ? AND author = ? AND (epoch, seq) <= (?, ?)"
+_DELETE = "DELETE FROM sets WHERE tile = ? AND author = ? AND (epoch, seq) <= (?, ?)"
 _OUTDATE = "DELETE FROM folded WHERE tile = ? AND author = ? AND (epoch, seq) < (?, ?)"
-"""What was dropped from a set counts only as long as its author says nothing newer."""
+"""What was dropped from a set counts only until its author states something newer."""
 _DROP = f"REPLACE INTO folded ({', '.join(_COLUMNS)}, since_ns) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 
 
 class KeeperStore:
-    """Every set in one SQLite file, or in memory under the name ":memory:". One process at a time.
+    """Every set in one SQLite file, or in memory under the name ":memory:". One writing process at a time.
 
     A commit is on the disk when it returns (WAL with synchronous=FULL): it survives kill -9 of this process at any
-    instant, and a power cut as far as the disk keeps what it was told to flush.
+    instant, and a power cut if the disk keeps what it was told to flush. All methods raise StoreError where the
+    file is damaged or cannot be written.
 
-    rebuild    move a damaged file aside and begin an empty one, to be filled from the swarm
-    read_only  look at a store, also while a keeper writes it
+    rebuild    move a damaged file aside, and begin an empty one, which the swarm fills
+    read_only  look at a store, even while a keeper writes it
     """
 
     def __init__(self, path: Path | str, *, rebuild: bool = False, read_only: bool = False) -> None:
@@ -94,7 +96,7 @@ class KeeperStore:
             self._db = _open(str(path))
 
     def bind(self, terrain: str, grid: GridSpec) -> None:
-        """Belong to this terrain from now on. Raises StoreError if the store holds the marks of another."""
+        """Tie the store to this terrain. Raises StoreError if it holds the marks of another."""
         bound = self.terrain
         if bound is None:
             try:
@@ -131,15 +133,15 @@ class KeeperStore:
         return None if row is None else str(row[0])
 
     def load(self) -> Iterator[MarkSet]:
-        """Everything in the store. Raises StoreError where a row is no set."""
+        """Every set in the store. Raises StoreError at a row which is no valid set."""
         return self._sets("FROM sets")
 
-    def folded(self, tile: int) -> dict[str, MarkSet]:
-        """Author -> what was dropped from its set of this tile, under the number of the last folding."""
+    def set_aside(self, tile: int) -> dict[str, MarkSet]:
+        """Author -> what was dropped from its set of this tile, under the number of its last compacted set."""
         return {each.author: each for each in self._sets("FROM folded WHERE tile = ?", tile)}
 
-    def forget_folded(self, before_ns: int) -> None:
-        """Drop for good what was folded before. Raises StoreError."""
+    def forget_set_aside(self, before_ns: int) -> None:
+        """Delete what compaction set aside before this time."""
         try:
             with self._db:
                 self._db.execute("DELETE FROM folded WHERE since_ns < ?", (before_ns,))
@@ -161,44 +163,44 @@ class KeeperStore:
         return found[0] if found else None
 
     def save(self, sets: Iterable[MarkSet], now_ns: int = 0) -> None:
-        """Commit all or none; on the disk when this returns. What a folding drops from the set that it replaces is
-        set aside. Raises StoreError, which leaves the store usable."""
+        """Commit all or none. What a compacted set lacks of the set that it replaces is set aside. A StoreError
+        leaves the store usable."""
         given = list(sets)
-        own = [each for each in given if each.seq % FOLDS == 0]
+        own = [each for each in given if each.seq % SEQ_STEP == 0]
         try:
             with self._db:
                 self._db.executemany(_UPSERT, [_row(each) for each in own])
                 self._db.executemany(_OUTDATE, [(each.tile, each.author, each.epoch, each.seq) for each in own])
                 for each in given:
-                    if each.seq % FOLDS:
-                        self._save_folding(each, now_ns)
+                    if each.seq % SEQ_STEP:
+                        self._save_compacted(each, now_ns)
         except sqlite3.ProgrammingError:
             raise  # a bug of ours, and no disk will get better
         except sqlite3.Error as error:
             raise StoreError(f"cannot write the store {self.path}: {error}") from error
 
-    def _save_folding(self, folding: MarkSet, now_ns: int) -> None:
-        at = (folding.tile, folding.author)
+    def _save_compacted(self, compacted: MarkSet, now_ns: int) -> None:
+        at = (compacted.tile, compacted.author)
         stored = self._set_at("sets", *at)
-        if stored is not None and (stored.epoch, stored.seq) > (folding.epoch, folding.seq):
+        if stored is not None and (stored.epoch, stored.seq) > (compacted.epoch, compacted.seq):
             return
-        base = (folding.epoch, base_seq(folding.seq))
+        base = (compacted.epoch, base_seq(compacted.seq))
         before = [
             each
             for each in (stored, self._set_at("folded", *at))
             if each is not None and (each.epoch, base_seq(each.seq)) == base
         ]
         if before:
-            self._db.execute(_DROP, (*_row(without(united(*before), folding)), now_ns))
-        elif is_burial(folding):
-            self._db.execute(_DROP, (*_row(folding), now_ns))
-        if is_burial(folding):
-            self._db.execute(_BURY, (*at, folding.epoch, folding.seq))
+            self._db.execute(_DROP, (*_row(without(united(*before), compacted)), now_ns))
+        elif is_tombstone(compacted):
+            self._db.execute(_DROP, (*_row(compacted), now_ns))
+        if is_tombstone(compacted):
+            self._db.execute(_DELETE, (*at, compacted.epoch, compacted.seq))
         else:
-            self._db.execute(_UPSERT, _row(folding))
+            self._db.execute(_UPSERT, _row(compacted))
 
     def save_sightings(self, seen: Iterable[Sighted]) -> None:
-        """Keep where each target was seen last. Raises StoreError, which leaves the store usable."""
+        """Keep where each target was seen last. A StoreError leaves the store usable."""
         try:
             with self._db:
                 self._db.executemany(_SEEN, [(each.target, each.stamp_ns, encode(each)) for each in seen])
@@ -206,7 +208,7 @@ class KeeperStore:
             raise StoreError(f"cannot write the store {self.path}: {error}") from error
 
     def sightings(self) -> list[Sighted]:
-        """Where each target was seen last, in order of target; of a store from before there were any, nothing."""
+        """The last sighting of each target, in order of target; none in a store without a table of them."""
         try:
             rows = self._db.execute("SELECT sighted FROM sightings ORDER BY target").fetchall()
             return [decode(row[0], Sighted) for row in rows]
@@ -216,6 +218,7 @@ class KeeperStore:
             raise StoreError(_damaged(self.path, str(error))) from error
 
     def close(self) -> None:
+        """Release the file, and its lock."""
         self._db.close()
         self._unlock()
 
@@ -282,7 +285,7 @@ def _damaged(path: Path | str, reason: str) -> str:
 
 
 def _lock(path: Path) -> IO[bytes]:
-    """One writer: a second keeper on the same file is refused. The lock falls with its process."""
+    """Refuse a second writer on the same file. The lock ends with its process."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = open(f"{path}.lock", "wb")  # noqa: SIM115 - held until close
@@ -307,28 +310,32 @@ def _move_aside(path: Path) -> Path:
 
 
 class Keeper:
-    """Which sets wait for the disk and which are on it. Only the latter are in `committed`, which is what the
-    keeper's digest, and so the acknowledgement, is made of."""
+    """Which sets wait for the disk, and which are on it.
+
+    committed  the sets on the disk: the keeper's digest names these only, and so acknowledges them
+    """
 
     def __init__(self) -> None:
         self.committed = Ledger()
-        self._waiting: dict[tuple[int, str], MarkSet] = {}
+        self._waiting: dict[tuple[int, str], MarkSet] = {}  # (tile, author) -> newest set not on the disk
 
     def restored(self, mark_set: MarkSet) -> None:
+        """A set was read from the store."""
         self.committed.record(mark_set.author, mark_set.tile, mark_set.epoch, mark_set.seq)
 
     def accept(self, mark_set: MarkSet) -> None:
-        """A set that the replica took in: the newest of its tile and author."""
+        """The replica took in a set: it replaces an older one of its tile and author which still waits."""
         self._waiting[mark_set.tile, mark_set.author] = mark_set
 
     @property
     def waiting(self) -> list[MarkSet]:
+        """Sets to save."""
         return list(self._waiting.values())
 
     def saved(self, sets: Iterable[MarkSet]) -> None:
-        """These are on the disk, or buried there."""
+        """These sets are on the disk, or their tombstones deleted what was there."""
         for each in sets:
-            if is_burial(each):
+            if is_tombstone(each):
                 self.committed.drop(each.author, each.tile)
             else:
                 self.committed.record(each.author, each.tile, each.epoch, each.seq)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from swarm.wire.messages.marks import DIGEST_ROW, MarkSet
 
@@ -15,7 +15,7 @@ Held = Mapping[str, bytes]
 
 
 class Ledger:
-    """What is held, by author and tile. A digest is copied out of it, not computed."""
+    """The number of each set held, by author and tile, as the rows that digests are made of."""
 
     def __init__(self) -> None:
         self._authors: dict[str, _Rows] = {}
@@ -24,33 +24,18 @@ class Ledger:
         rows = self._authors.get(author)
         if rows is None:
             rows = self._authors[author] = _Rows()
-        rows.record(tile, epoch, seq)
+        rows.recorded[tile] = (epoch, seq)
 
-    def record_many(self, sets: Sequence[MarkSet]) -> None:
-        """As `record` of each; no two of one author and tile."""
-        of_author: dict[str, list[MarkSet]] = {}
-        for each in sets:
-            of_author.setdefault(each.author, []).append(each)
-        for author, theirs in of_author.items():
-            self.record_rows(
-                author,
-                [each.tile for each in theirs],
-                [each.epoch for each in theirs],
-                [each.seq for each in theirs],
-            )
-
-    def record_rows(self, author: str, tiles: list[int], epochs: ArrayLike, seqs: ArrayLike) -> None:
-        """As `record` of each of an author's sets, given as columns; no tile occurs twice."""
-        self._authors.setdefault(author, _Rows()).record_many(tiles, epochs, seqs)
+    def record_all(self, author: str, sets: Iterable[MarkSet]) -> None:
+        """As `record` of each of an author's sets."""
+        numbers = {each.tile: (each.epoch, each.seq) for each in sets}
+        self._authors.setdefault(author, _Rows()).recorded.update(numbers)
 
     def drop(self, author: str, tile: int) -> None:
-        """Nothing is held any more of this tile of an author."""
+        """An author's set of this tile is held no more."""
         rows = self._authors.get(author)
         if rows is not None and rows.drop(tile) == 0:
             del self._authors[author]
-
-    def forget(self, author: str) -> None:
-        self._authors.pop(author, None)
 
     @property
     def authors(self) -> list[str]:
@@ -62,7 +47,7 @@ class Ledger:
         return {name: self._authors[name].sorted().tobytes() for name in names}
 
     def rows_of(self, author: str, tiles: Iterable[int]) -> bytes:
-        """Rows of these tiles of an author, as far as it has them."""
+        """Rows of an author's sets of these tiles, in order of tile; of tiles without a set none."""
         rows = self._authors.get(author)
         return b"" if rows is None else rows.of(tiles).tobytes()
 
@@ -92,57 +77,51 @@ class Ledger:
 
 
 class _Rows:
-    """One author's rows, updated in place."""
+    """One author's rows. What is recorded becomes rows, many at a time, when they are read.
+
+    recorded  tile -> (epoch, seq) that is newer than its row
+    """
 
     def __init__(self) -> None:
-        self._place: dict[int, int] = {}
-        self._rows: NDArray[np.void] = np.zeros(8, DIGEST_ROW)
-        self._ordered = True
-
-    def record(self, tile: int, epoch: int, seq: int) -> None:
-        place = self._place.get(tile)
-        if place is None:
-            place = len(self._place)
-            if place == len(self._rows):
-                self._rows = np.concatenate([self._rows, np.zeros(place, DIGEST_ROW)])
-            self._place[tile] = place
-            self._ordered = self._ordered and (place == 0 or int(self._rows["tile"][place - 1]) < tile)
-        self._rows[place] = (tile, epoch, seq)
-
-    def record_many(self, tiles: list[int], epochs: ArrayLike, seqs: ArrayLike) -> None:
-        """Tiles are all different."""
-        new = [tile for tile in tiles if tile not in self._place]
-        if new:
-            count = len(self._place)
-            self._place.update(zip(new, range(count, count + len(new)), strict=True))
-            if count + len(new) > len(self._rows):
-                self._rows = np.concatenate([self._rows, np.zeros(max(count, len(new)), DIGEST_ROW)])
-            self._ordered = False
-        place = self._place
-        at = [place[tile] for tile in tiles]
-        self._rows["tile"][at], self._rows["epoch"][at], self._rows["seq"][at] = tiles, epochs, seqs
+        self._rows: NDArray[np.void] = np.zeros(0, DIGEST_ROW)  # in order of tile
+        self._places: dict[int, int] = {}  # tile -> its place in `_rows`
+        self.recorded: dict[int, tuple[int, int]] = {}
 
     def drop(self, tile: int) -> int:
         """Returns how many are left."""
-        if tile in self._place:
-            self._rows = np.delete(self.sorted(), self._place[tile])
-            self._place = {tile: place for place, tile in enumerate(self._rows["tile"].tolist())}
-        return len(self._place)
+        rows = self.sorted()
+        if tile in self._places:
+            self._set(np.delete(rows, self._places[tile]))
+        return len(self._rows)
 
     def of(self, tiles: Iterable[int]) -> NDArray[np.void]:
-        return self._rows[[place for tile in sorted(tiles) if (place := self._place.get(tile)) is not None]]
+        rows = self.sorted()
+        return rows[[place for tile in sorted(tiles) if (place := self._places.get(tile)) is not None]]
 
     def sorted(self) -> NDArray[np.void]:
-        if not self._ordered:
-            count = len(self._place)
-            self._rows[:count] = self._rows[np.argsort(self._rows["tile"][:count])]
-            self._place = {tile: place for place, tile in enumerate(self._rows["tile"][:count].tolist())}
-            self._ordered = True
-        return self._rows[: len(self._place)]
+        if self.recorded:
+            tiles = list(self.recorded)
+            new = np.zeros(len(tiles), DIGEST_ROW)
+            new["tile"] = tiles
+            new["epoch"], new["seq"] = zip(*self.recorded.values(), strict=True)
+            self.recorded = {}
+            known = np.array([tile in self._places for tile in tiles])
+            self._rows[[self._places[tile] for tile in new["tile"][known].tolist()]] = new[known]
+            if not known.all():
+                rows = np.concatenate([self._rows, new[~known]])
+                self._set(rows[np.argsort(rows["tile"])])
+        return self._rows
+
+    def _set(self, rows: NDArray[np.void]) -> None:
+        self._rows = rows
+        self._places = {tile: place for place, tile in enumerate(rows["tile"].tolist())}
 
 
 def _newer(rows: NDArray[np.void], base: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Which of `rows` are newer than the row of the same tile in `base`, which is in order of tile."""
+    """Which of `rows` are newer than the row of the same tile in `base`, or have none there: bool (rows,).
+
+    base  in order of tile
+    """
     if not len(base):
         return np.ones(len(rows), bool)
     # Of a garbled digest with a tile twice, the last and thus the newest row of `base` counts.

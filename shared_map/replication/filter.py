@@ -1,27 +1,29 @@
-"""What of others' marks a replica takes in: whose, by the policy of groups, and where, by its interest.
+"""Which marks of others a replica takes in: by author (the policy of groups) and by tile (its interest).
 
-The group of an author stands in the author's id (`blue.a3.17f2`), and so in the key of everything that it writes:
-access control can enforce the policy, and a digest, which names authors only, is read without asking for sets that
-would be refused.
+An author's id begins with its group (`blue.a3.17f2`), and so do the keys of all that it writes. So access control
+can enforce the policy, and of a digest, which names only authors, nothing is asked for that would be refused.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from shared_map.replication.marks import region_tiles
+from shared_map.replication.tiles import region_tiles
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 
 
 def author_of(group: str, name: str) -> str:
-    """The id under which a process of a group writes: `name` is that of its incarnation."""
+    """The author id of a process of a group.
+
+    name  of the process and its incarnation
+    """
     return f"{group}.{name}"
 
 
 def readable_groups(scenario: Scenario, group: str) -> frozenset[str] | None:
-    """The groups whose marks and positions a group takes in: itself, and those that it reads and that write to it.
-    None where that is everybody."""
+    """The groups whose marks and positions a group takes in: its own, and those that it reads and that write to it.
+    None if that is all groups."""
     groups = {each.name: each for each in scenario.groups}
     mine = groups[group]
     heard = {
@@ -33,10 +35,11 @@ def readable_groups(scenario: Scenario, group: str) -> frozenset[str] | None:
 
 
 def readable_for_target(scenario: Scenario, target: str) -> frozenset[str] | None:
-    """The groups whose marks the planner of a target takes in: all that any group reads that chases the target.
+    """The groups whose marks the planner of a target takes in: all that any group reads which chases the target.
+    None if that is all groups.
 
-    So the routes of the least informed group are as good as those of the best: what goes over to it are routes, not
-    marks. Groups that must not learn even that chase targets of their own.
+    So the least informed of these groups gets routes as good as the best informed one, but not the marks behind
+    them. Groups which must not learn even that much have to chase targets of their own.
     """
     heard: set[str] = set()
     for group in scenario.groups:
@@ -52,10 +55,11 @@ def _names(listed: Sequence[str], group: str) -> bool:
     return "*" in listed or group in listed
 
 
-class Reading:
-    """What a replica takes in. Two limits, each of which may be absent.
+class MarkFilter:
+    """Which sets a replica takes in, by author and by tile. Either limit may be absent.
 
-    groups  whose statements count, by the id of their author and what the set says itself; None is everybody's
+    groups   whose statements count, by the id of their author and by what the set says; None: everybody's
+    regions  about which regions; None: all
     """
 
     def __init__(self, grid: GridSpec, groups: frozenset[str] | None = None) -> None:
@@ -63,30 +67,30 @@ class Reading:
         self.regions: frozenset[int] | None = None
         self._grid = grid
         self._prefixes = None if groups is None else tuple(f"{group}." for group in sorted(groups))
-        self._tiles: frozenset[int] | None = None
+        self._tiles: frozenset[int] | None = None  # those of `regions`
 
-    def limit(self, regions: frozenset[int]) -> None:
-        """From now on only what is said about these regions is of interest."""
+    def limit_to(self, regions: frozenset[int]) -> None:
+        """From now on accept only sets about these regions."""
         self.regions = regions
         self._tiles = frozenset(tile for region in regions for tile in region_tiles(self._grid, region))
 
-    def hears(self, author: str, group: str) -> bool:
-        """Whether the policy lets this author, who says to be of this group, speak to us."""
-        if self._prefixes is None or self.groups is None:
+    def accepts_author(self, author: str, group: str) -> bool:
+        """Whether the policy of groups lets us read this author, which states to be of this group."""
+        if self.groups is None:
             return True
         return group in self.groups and author.startswith(f"{group}.")
 
-    def concerns(self, tile: int) -> bool:
-        """Whether what is said about a tile is of interest."""
+    def accepts_tile(self, tile: int) -> bool:
+        """Whether a tile lies in the regions of interest."""
         return self._tiles is None or tile in self._tiles
 
-    def wanted(self, missing: Sequence[tuple[str, list[int]]]) -> list[tuple[str, list[int]]]:
-        """Of (author, tiles) that others have and we lack, what we would take in."""
-        heard = missing
+    def accepted(self, sets: Sequence[tuple[str, list[int]]]) -> list[tuple[str, list[int]]]:
+        """Of (author, tiles), those which would be taken in."""
+        of_authors = sets
         if self._prefixes is not None:
-            heard = [(author, tiles) for author, tiles in missing if author.startswith(self._prefixes)]
+            of_authors = [(author, tiles) for author, tiles in sets if author.startswith(self._prefixes)]
         if self._tiles is None:
-            return list(heard)
+            return list(of_authors)
         near = self._tiles
-        inside = ((author, [tile for tile in tiles if tile in near]) for author, tiles in heard)
+        inside = ((author, [tile for tile in tiles if tile in near]) for author, tiles in of_authors)
         return [(author, tiles) for author, tiles in inside if tiles]

@@ -1,6 +1,6 @@
-"""Which squares of the grid concern those who stand at some cells: those around them, entered early and left late.
+"""Interest: which squares of the grid are near some cells. Pure.
 
-The squares are regions, by which values travel, or anything else of one size. Pure.
+The squares are regions, the unit of subscription, or others of one size.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
 
 
 class Interest:
-    """The squares within `enter_cells` of anybody, and those of before that are still within `leave_cells`.
+    """The squares within `enter_cells` of any cell, and of the squares before those still within `leave_cells`.
 
-    Whoever drives to and fro across a border so does not come and go with every crossing. Squares are counted row
-    by row, as regions are.
+    The hysteresis keeps a vehicle at a border from subscribing anew with every crossing. Squares are numbered row
+    by row, as regions are. Raises ValueError if squares are left nearer than they are entered.
 
-    square_cells  side of a square: that of a region, unless told otherwise
+    leave_cells   default: twice `enter_cells`
+    square_cells  side of a square; default: that of a region
+    squares       the result of the last `update`
     """
 
     def __init__(
@@ -39,7 +41,7 @@ class Interest:
         self.squares: frozenset[int] = frozenset()
 
     def update(self, cells: Iterable[int]) -> frozenset[int]:
-        """The squares that concern whoever stands at these cells (flat indices in the grid)."""
+        """The squares of interest around these cells (flat indices in the grid)."""
         rows, cols = np.divmod(np.fromiter(cells, np.int64), self._grid.cols)
         near = self._within(rows, cols, self._enter)
         if not self.squares <= near:
@@ -48,7 +50,7 @@ class Interest:
         return self.squares
 
     def _within(self, rows: NDArray[np.int64], cols: NDArray[np.int64], reach: int) -> set[int]:
-        """The squares that the surroundings of `reach` cells to every side touch."""
+        """The squares that are at most `reach` cells away from any of these cells, by row or column."""
         grid, side = self._grid, self._side
         north = np.maximum(rows - reach, 0) // side
         south = np.minimum(rows + reach, grid.rows - 1) // side

@@ -1,67 +1,73 @@
-"""How much a replica may hold: a hostile author could fill everybody's memory, one tile or name at a time."""
+"""What one author may cost a replica: memory (`Capacity`) and work (`Quota`)."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import TILE_AREA
 
 MAX_SETS = 1 << 18
-"""Sets in all, tombstones included: every tile of a 16,384 x 16,384 map once. About half a kilobyte each."""
+"""Sets in all, empty ones included: every tile of a 16,384 x 16,384 map once. About half a kilobyte each."""
 MAX_MARKS = 1 << 23
-"""Statements in all; 15 bytes each, 23 where they end by themselves."""
-_SHARE = 4
-"""No author may fill more than this part of either."""
+"""Statements in all; 15 bytes each, 23 where some of the set expire."""
+_PART = 4
+"""No author may fill more than one part in this many of either."""
+
+_BURST_S = 10
+_FORGET_NS = 60 * NS_PER_S
+_SPEAKS_NS = _BURST_S * NS_PER_S
 
 
-class Room:
-    """Counts what is held, in all and by author. Beyond the bounds a set that would add to it has no room.
+class Capacity:
+    """Counts the sets and statements held, in all and by author; refuses a set which would exceed a bound.
 
-    What is refused depends on what came first: only within the bounds do replicas hold the same. They are there
-    so that a hostile author costs memory that one can state (some 330 MB) and not more.
+    Which sets are refused depends on what came first, so replicas are equal only within the bounds. The bounds
+    limit what a hostile author can cost to some 330 MB.
+
+    sets, marks  what is held now
     """
 
     def __init__(self, max_sets: int = MAX_SETS, max_marks: int = MAX_MARKS) -> None:
         self.sets = 0
         self.marks = 0
         self._max_sets, self._max_marks = max_sets, max_marks
-        self._authors: dict[str, list[int]] = {}  # -> [sets, marks]
+        self._authors: dict[str, list[int]] = {}  # author -> [sets, marks], of those that hold any
 
     def take(self, new: MarkSet, old: MarkSet | None, *, own: bool = False) -> bool:
-        """Make room for `new` in the place of `old`; False if there is none. There always is for what takes no more
-        than before, and for one's own."""
-        marks = len(new.kinds)
-        sets = 1
+        """Count `new` instead of `old`; False, and nothing changes, if that exceeds a bound. A set which takes no
+        more than before is never refused.
+
+        own  no bound applies
+        """
+        held = self._authors.get(new.author) or [0, 0]
+        sets, marks = 1, len(new.kinds)
         if old is not None:
-            marks -= len(old.kinds)
-            sets = 0
-        held = self._authors.get(new.author)
-        if held is None:
-            held = [0, 0]
-        if (
-            not own
-            and (sets or marks > 0)
-            and (
-                (sets and (self.sets >= self._max_sets or held[0] >= self._max_sets // _SHARE))
-                or self.marks + marks > self._max_marks
-                or held[1] + marks > self._max_marks // _SHARE
-            )
-        ):
-            return False
-        self._authors[new.author] = held
+            sets, marks = 0, marks - len(old.kinds)
+        if not own:
+            if sets and (self.sets >= self._max_sets or held[0] >= self._max_sets // _PART):
+                return False
+            if (sets or marks > 0) and (
+                self.marks + marks > self._max_marks or held[1] + marks > self._max_marks // _PART
+            ):
+                return False
         held[0] += sets
         held[1] += marks
+        self._authors[new.author] = held
         self.sets += sets
         self.marks += marks
         return True
 
-    def take_new(self, author: str, sets: int, marks: int) -> bool:
-        """As `take` of so many sets that replace none; False, and nothing taken, unless there is room for all."""
-        held = self._authors.get(author, (0, 0))
+    def take_all(self, author: str, sets: int, marks: int) -> bool:
+        """As `take` of so many sets which replace none; False, and nothing changes, if all exceed a bound."""
+        held = self._authors.get(author) or [0, 0]
         if (
             self.sets + sets > self._max_sets
-            or held[0] + sets > self._max_sets // _SHARE
+            or held[0] + sets > self._max_sets // _PART
             or self.marks + marks > self._max_marks
-            or held[1] + marks > self._max_marks // _SHARE
+            or held[1] + marks > self._max_marks // _PART
         ):
             return False
         self._authors[author] = [held[0] + sets, held[1] + marks]
@@ -80,11 +86,123 @@ class Room:
             del self._authors[old.author]
 
     def full_for(self, author: str) -> bool:
-        """Whether an author's next set of a new tile, a full one at worst, would have no room."""
+        """Whether an author's set of one more tile could exceed a bound, were it to cover every cell."""
         sets, marks = self._authors.get(author, (0, 0))
         return (
             self.sets >= self._max_sets
             or self.marks + TILE_AREA > self._max_marks
-            or sets >= self._max_sets // _SHARE
-            or marks + TILE_AREA > self._max_marks // _SHARE
+            or sets >= self._max_sets // _PART
+            or marks + TILE_AREA > self._max_marks // _PART
         )
+
+
+class Quota:
+    """Token buckets of changed marks, for each author and for all of them together. Time is an argument.
+
+    An author whose bucket is empty waits. While the bucket of all is empty, so does an author that has used up its
+    share: of the total rate, an equal part for each author heard in the last ten seconds. An author below its share
+    is never delayed, whatever the others do. Of a waiting author the newest set of each tile is kept, and let in
+    once its buckets have filled: it is late, but not lost.
+    """
+
+    def __init__(self, author_marks_per_s: float, total_marks_per_s: float = math.inf) -> None:
+        self._author_rate = author_marks_per_s
+        self._total_rate = total_marks_per_s
+        self._total = _Bucket(total_marks_per_s * _BURST_S, 0)
+        self._authors: dict[str, _Author] = {}
+        self._waiting: dict[str, dict[int, MarkSet]] = {}  # author -> tile -> newest set, next author first
+        self._speaking = 1  # authors heard lately, counted at `_counted_ns`
+        self._counted_ns = -NS_PER_S
+
+    def admits(self, mark_set: MarkSet, now_ns: int) -> bool:
+        """Whether a set may be merged now; if not, it waits here."""
+        author = mark_set.author
+        if author not in self._waiting and self._may(author, now_ns):
+            return True
+        waiting = self._waiting.setdefault(author, {})
+        held = waiting.get(mark_set.tile)
+        if held is None or (mark_set.epoch, mark_set.seq) >= (held.epoch, held.seq):
+            waiting[mark_set.tile] = mark_set
+        return False
+
+    def charge(self, author: str, marks: int, now_ns: int) -> None:
+        """Merging a set of this author changed so many cells; a set that changes none costs as much as one."""
+        cost = max(marks, 1)
+        each = self._filled(author, now_ns)
+        each.heard_ns = now_ns
+        each.own.left -= cost
+        if self._total_rate < math.inf:
+            each.share.left -= cost
+            # Authors within their shares cannot be refused: what they overdraw must not keep others out for ever.
+            self._total.left = max(self._total.left - cost, -self._total_rate * _BURST_S)
+
+    def due(self, now_ns: int) -> MarkSet | None:
+        """A set which has waited long enough; None if there is none. Waiting authors take turns."""
+        for author, waiting in self._waiting.items():
+            if self._may(author, now_ns):
+                mark_set = waiting.pop(next(iter(waiting)))
+                del self._waiting[author]
+                if waiting:
+                    self._waiting[author] = waiting  # to the end of the queue
+                return mark_set
+        return None
+
+    @property
+    def throttled(self) -> list[str]:
+        """Authors whose sets wait now."""
+        return sorted(self._waiting)
+
+    def forget(self, now_ns: int) -> None:
+        """Drop the buckets of authors that were silent for a minute: they are full again."""
+        for author, each in list(self._authors.items()):
+            if now_ns - each.heard_ns > _FORGET_NS and author not in self._waiting:
+                del self._authors[author]
+
+    def _may(self, author: str, now_ns: int) -> bool:
+        each = self._filled(author, now_ns)
+        return each.own.left > 0 and (self._total.left > 0 or each.share.left > 0)
+
+    def _filled(self, author: str, now_ns: int) -> _Author:
+        each = self._authors.get(author)
+        if each is None:
+            own, share = self._author_rate * _BURST_S, self._share(now_ns) * _BURST_S
+            each = self._authors[author] = _Author(_Bucket(own, now_ns), _Bucket(share, now_ns), now_ns)
+        each.own.fill(self._author_rate, now_ns)
+        if self._total_rate < math.inf:
+            each.share.fill(self._share(now_ns), now_ns)
+            self._total.fill(self._total_rate, now_ns)
+        return each
+
+    def _share(self, now_ns: int) -> float:
+        """Marks per second that each author is sure of. Authors are counted once a second."""
+        if now_ns - self._counted_ns >= NS_PER_S:
+            self._counted_ns = now_ns
+            speaking = sum(now_ns - each.heard_ns < _SPEAKS_NS for each in self._authors.values())
+            self._speaking = max(speaking, 1)
+        return self._total_rate / self._speaking
+
+
+@dataclass(slots=True)
+class _Bucket:
+    """Changed marks that may still be caused: fills up to ten seconds' worth, and may be overdrawn once."""
+
+    left: float
+    since_ns: int
+
+    def fill(self, marks_per_s: float, now_ns: int) -> None:
+        elapsed_s = max(now_ns - self.since_ns, 0) / NS_PER_S
+        self.left = min(marks_per_s * _BURST_S, self.left + marks_per_s * elapsed_s)
+        self.since_ns = max(now_ns, self.since_ns)
+
+
+@dataclass(slots=True)
+class _Author:
+    """
+    own       fills at the rate of an author
+    share     fills at this author's part of the total rate: no need of others takes from it
+    heard_ns  when a set of it was merged last
+    """
+
+    own: _Bucket
+    share: _Bucket
+    heard_ns: int

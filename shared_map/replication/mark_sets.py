@@ -1,4 +1,4 @@
-"""Many sets in one message and back: how a late join and a resync travel."""
+"""Many sets in one message, and back: the form of replies to a late join and a resync."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.marks import MarkSet, MarkSets
 
 MAX_BULK_BYTES = 1 << 18
-"""A reply is cut off about here: while the reader merges one, the next is packed and on its way."""
+"""A message is cut off at about this size: while the reader merges one, the next is packed and sent."""
 _BULK_SETS = 4096
 
 
 def packed(sets: Iterable[MarkSet]) -> Iterator[MarkSets]:
-    """Sets, no two of one tile and author, as few messages: one author and group in each."""
+    """Sets, no two of one tile and author, as few messages, each of one author and group."""
     together: dict[tuple[str, str], list[MarkSet]] = {}
     for each in sets:
         together.setdefault((each.author, each.group), []).append(each)
@@ -55,7 +55,7 @@ def _message(author: str, group: str, sets: list[MarkSet]) -> MarkSets:
 
 
 def unpacked(bulk: MarkSets) -> list[MarkSet]:
-    """The sets in a message, which was checked at the door. Each owns its bytes: none keeps the whole message."""
+    """The sets in a message that passed its checks. Each owns its bytes, so none keeps the whole message alive."""
     counts = column(bulk.counts, "<u2").astype(np.int64)
     ends = np.cumsum(counts)
     lasting = np.cumsum(np.where(column(bulk.ending, "<u1") == 1, counts, 0))

@@ -1,4 +1,4 @@
-"""What was buried lately, so that an old set that turns up late is not taken for news."""
+"""Tombstones heard lately, so that an old set which arrives late is not taken for news."""
 
 from __future__ import annotations
 
@@ -6,40 +6,43 @@ from swarm.clock import NS_PER_S
 from swarm.wire.messages.marks import MarkSet
 
 REMEMBERED_NS = 600 * NS_PER_S
-"""A set that is longer on its way comes back to life at who hears it, until a keeper buries it again: its digest
-does not tell of it, so it is offered to the keeper, which keeps the numbers of what it buried for much longer."""
-_MOST = 1 << 16
+"""A set which arrives later than this after its tombstone is held again. No digest of a keeper names it, so it is
+offered to the keepers, which remember tombstones for much longer and send this one again."""
+_MAX_TOMBSTONES = 1 << 16
 
 
-class Graves:
-    """(tile, author) -> the number under which it was buried, in order of burial."""
+class Tombstones:
+    """(tile, author) -> the number under which the author's set was deleted, oldest first."""
 
     def __init__(self) -> None:
-        self._graves: dict[tuple[int, str], tuple[int, int, int]] = {}  # -> (epoch, seq, when)
+        self._deleted: dict[tuple[int, str], tuple[int, int, int]] = {}  # -> (epoch, seq, when heard)
 
-    def holds(self, received: MarkSet) -> bool:
-        """Whether a set was buried already; the grave of an author that says something newer is opened."""
-        grave = self._graves.get((received.tile, received.author))
-        if grave is None:
+    def covers(self, received: MarkSet) -> bool:
+        """Whether a set was deleted already. Drops the tombstone of an author that states something newer."""
+        if not self._deleted:
+            return False
+        tombstone = self._deleted.get((received.tile, received.author))
+        if tombstone is None:
             return False
         number = (received.epoch, received.seq)
-        if number < grave[:2] or (number == grave[:2] and not received.kinds):
+        if number < tombstone[:2] or (number == tombstone[:2] and not received.kinds):
             return True
-        del self._graves[received.tile, received.author]
+        del self._deleted[received.tile, received.author]
         return False
 
-    def dig(self, burial: MarkSet, now_ns: int) -> None:
-        self._graves[burial.tile, burial.author] = (burial.epoch, burial.seq, now_ns)
-        if len(self._graves) > _MOST:
-            del self._graves[next(iter(self._graves))]
+    def add(self, tombstone: MarkSet, now_ns: int) -> None:
+        """Remember a tombstone; beyond 65,536 the oldest is forgotten."""
+        self._deleted[tombstone.tile, tombstone.author] = (tombstone.epoch, tombstone.seq, now_ns)
+        if len(self._deleted) > _MAX_TOMBSTONES:
+            del self._deleted[next(iter(self._deleted))]
 
-    def forget(self, now_ns: int) -> None:
-        """Drop what was buried long ago."""
-        while self._graves:
-            key, (_, _, since_ns) = next(iter(self._graves.items()))
+    def expire(self, now_ns: int) -> None:
+        """Forget tombstones which are older than REMEMBERED_NS."""
+        while self._deleted:
+            key, (_, _, since_ns) = next(iter(self._deleted.items()))
             if now_ns - since_ns <= REMEMBERED_NS:
                 return
-            del self._graves[key]
+            del self._deleted[key]
 
     def __len__(self) -> int:
-        return len(self._graves)
+        return len(self._deleted)

@@ -1,7 +1,8 @@
-"""Where direction counts, a step also costs by what it climbs: uphill is not downhill.
+"""Climb: the factor on the cost of a step by its rise, where cost depends on direction.
 
-A cell's pace is then that of level ground, and a step costs its length x the pace of the cell that it enters x the
-factor of its rise. Vehicles and planners read that factor from one table: what is promised is what is driven.
+A cell's pace is then that of level ground, and a step costs its length x the pace of the cell which it enters x the
+factor of its rise. Vehicles and planners read the factor from one table, so a vehicle drives what its route
+promises.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from swarm.config.scenario import CostConfig
 from swarm.grid import GridSpec
 
 ENTRIES = 512
-"""Of the table to either side of level: a rise is told to a five-hundredth of the steepest."""
+"""Entries of the table on each side of level: the rise is resolved to this part of the steepest."""
 _STEEPEST = 4.0
-"""76 degrees; there is no more to tell beyond."""
+"""As a grade: 76 degrees. Steeper steps cost as this one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Climb:
-    """What a step's rise does to its pace.
+    """The factor that a step's rise puts on its pace.
 
     elevation_m  float32  (rows, cols); a step from or to a void (NaN) is level
     factors      float32  (2 * ENTRIES + 1) for rises from -steepest to steepest; 1 in the middle
@@ -39,12 +40,12 @@ class Climb:
 
     @property
     def lowest(self) -> float:
-        """Of all factors: no step is cheaper than the pace of level ground times this."""
+        """The lowest factor: no step costs less than level ground times this."""
         return float(self.factors.min())
 
     @property
     def note(self) -> str:
-        """For people who look at the paces."""
+        """A sentence for people who look at the paces."""
         return (
             "paces are those of level ground; each step costs by what it climbs too,"
             f" times {self.lowest:.3g} to {self.factors.max():.3g}"
@@ -52,12 +53,15 @@ class Climb:
 
     @property
     def per_metre(self) -> tuple[np.float32, np.float32]:
-        """Entries of the table per metre that a straight and a diagonal step climb."""
+        """Entries of the table per metre of rise, of a straight step and of a diagonal one."""
         straight = ENTRIES / (self.steepest * self.grid.resolution_m)
         return np.float32(straight), np.float32(straight / math.sqrt(2))
 
     def along(self, tails: NDArray[np.integer], heads: NDArray[np.integer]) -> Floats:
-        """float32; the factor of each step from a cell to a neighbour of it (flat indices, int64)."""
+        """The factor of each step, float32 (steps,).
+
+        tails, heads  int64 (steps,)  flat indices of a cell and of a neighbour of it
+        """
         heights = self.elevation_m.reshape(-1)
         diagonal = (tails // self.grid.cols != heads // self.grid.cols) & (
             tails % self.grid.cols != heads % self.grid.cols
@@ -70,7 +74,8 @@ class Climb:
         return factors
 
     def of_step(self, tail: int, head: int) -> float:
-        """The factor of one step, without the cost of arrays: vehicles ask for it many times a second."""
+        """The factor of one step between neighbours (flat indices). Without arrays: vehicles ask many times a
+        second."""
         cols = self.grid.cols
         row0, col0 = divmod(tail, cols)
         row1, col1 = divmod(head, cols)
@@ -82,7 +87,7 @@ class Climb:
 
 
 def climb_of(grid: GridSpec, elevation_m: Floats, cost: CostConfig) -> Climb | None:
-    """The climb of a terrain; None where direction does not count."""
+    """The climb of a terrain; None if cost does not depend on direction."""
     if not cost.directional:
         return None
     steepest = _STEEPEST

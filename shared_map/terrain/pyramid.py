@@ -1,6 +1,6 @@
-"""A terrain at half its resolution, and half of that again: to be looked at from afar.
+"""Levels of detail of a terrain, each at half the resolution of the one before, for pictures.
 
-Thin things survive: a wall or a road one cell wide is in every level, however small its share of the cell there.
+A wall or a road one cell wide is in every level, however small its share of the cell there.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from swarm.grid import GridSpec
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A terrain at 1 / `side` of its resolution; a block cut off at the border counts what is there.
+    """A terrain at 1 / `side` of its resolution. A block which the border cuts off counts the cells that exist.
 
     side          cells of the terrain along one cell of this level, a power of two
     elevation_m   float32  mean of the heights that are known; NaN where none is
@@ -56,7 +56,7 @@ def level_of(terrain: Terrain, most_cells: int) -> Level:
 
 
 def any_in_blocks(cells: Bools, side: int) -> Bools:
-    """Which blocks of `side` x `side` cells hold any: what marks on single cells look like from afar."""
+    """Which blocks of `side` x `side` cells contain any of these cells: bool, at the resolution of the level."""
     if side == 1:
         return cells
     rows, cols = cells.shape
@@ -93,7 +93,7 @@ def _corners(values: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def _mean(corners: list[Floats], without: np.float32, weights: list[Floats] | None = None) -> Floats:
-    """Of the finite ones, weighted; `without` where there is none."""
+    """Weighted mean of the finite corners; `without` where none is finite."""
     total, weight = (np.zeros(corners[0].shape, np.float32) for _ in range(2))
     for number, corner in enumerate(corners):
         share = np.isfinite(corner).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Work on a large grid in bands of rows, a few at a time, so that what is needed between stays small."""
+"""Work on a large grid in bands of rows, a few at a time, so that intermediate arrays stay small."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from shared_map.arrays import Floats
 
 BAND_ROWS = 128
 Progress = Callable[[str, float], None]
-"""Told what is being done and the share of it that is done, 0 to 1."""
+"""Called with what is being done, and the share of it that is done, 0 to 1."""
 
 
 def no_progress(what: str, share: float) -> None:
-    """Tells nobody."""
+    """Ignores progress."""
 
 
 def bands(rows: int, band_rows: int = BAND_ROWS) -> list[tuple[int, int]]:
-    """(first, end) of each band."""
+    """(first row, end) of each band."""
     return [(row, min(row + band_rows, rows)) for row in range(0, rows, band_rows)]
 
 
@@ -41,7 +41,8 @@ def in_bands(rows: int, work: Callable[[int, int], None], what: str = "", progre
 
 
 def padded_rows(elevation_m: Floats, row0: int, row1: int) -> Floats:
-    """Rows row0 - 1 .. row1 with a border of one cell; beyond the terrain the ground goes on as steep as it is."""
+    """Rows row0 - 1 .. row1 with one more column on each side, float32 (row1 - row0 + 2, cols + 2). Beyond the
+    terrain the slope at its border goes on."""
     rows = elevation_m.shape[0]
     above, below = max(row0 - 1, 0), min(row1 + 1, rows)
     pads = ((above - (row0 - 1), row1 + 1 - below), (1, 1))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats
 from shared_map.terrain.climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.hidden import true_ground
 from shared_map.terrain.layers import (
     TerrainClass,
     class_factors,
@@ -30,7 +31,6 @@ from shared_map.terrain.layers import (
     terrain_pace,
 )
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
-from shared_map.terrain.truth import hide
 from swarm.config.scenario import CostConfig, Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -215,7 +215,7 @@ def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
     """The true pace of the ground: the prior ground changed by what `terrain.hidden` asks for.
 
     Without inflation: it is what a sensor sees of each cell. Never shown to planners."""
-    return hide(
+    return true_ground(
         scenario.terrain.hidden,
         scenario.cost,
         terrain.grid,

@@ -1,5 +1,21 @@
-"""What processes may do with the network, and what the network tells them. Two implementations: `ZenohBus`,
-`MemoryBus`. Nothing here blocks: all that comes back is posted as one of the events below."""
+"""What processes may do with the network, and what the network tells them.
+
+`ZenohBus` and `MemoryBus` implement `Bus`; `tests/support/bus_behaviour.py` holds both to the rules below.
+
+Threads     No method but `close` waits for the network: what comes back is posted as an event. A `Post` is called
+            on the bus's threads, on several at once, and blocks what its thread reads: a service posts to an
+            `Inbox` and handles events on its own thread.
+Order       Samples of one publisher on one topic come in the order of their publishing, as do replies to one query
+            from one process. Nothing else has an order: not two publishers, not two topics, not samples and
+            replies.
+Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is congested or down, without
+            a subscriber, and where a reader falls behind by more than `Topic.buffer` samples (the oldest go).
+            Queries and replies are lost with their link. On the memory bus a sample may come twice or late.
+Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
+            logged once per key and minute, and never posted.
+Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the
+            caller.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +30,7 @@ from swarm.wire.topics import Topic
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A sample on a topic that we subscribed to. `fields` are the chunks of its key, by name."""
+    """A sample on a subscribed topic. `fields` are the chunks of its key, by name."""
 
     topic: Topic
     fields: Mapping[str, str]
@@ -23,8 +39,10 @@ class Heard:
 
 @dataclass(frozen=True, slots=True)
 class HeardMany:
-    """Samples that waited together on a topic subscribed to with `together`, in the order of their coming: (key
-    below the namespace, message)."""
+    """Samples that waited together on a topic subscribed to with `together`, in the order of their arrival.
+
+    samples  (key below the namespace, message); the key is not yet compared with the message
+    """
 
     topic: Topic
     samples: Sequence[tuple[str, Message]]
@@ -32,7 +50,10 @@ class HeardMany:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Asked:
-    """A query on a topic that we serve. Answer with any number of messages, or refuse; then call `end`."""
+    """A query on a topic that we serve. Send any number of answers, or refuse; then call `end`, at any later time.
+
+    fields  the chunks of the key that was asked, `*` where any will do
+    """
 
     topic: Topic
     fields: Mapping[str, str]
@@ -41,19 +62,21 @@ class Asked:
 
     def answer(self, message: Message, **fields: str | int) -> None:
         """Send one reply. `fields` complete the key where `serve` left wildcards; a reply whose key is not
-        among those asked for is not sent."""
+        among those asked for is not sent. Raises RuntimeError after `end`."""
         self.answerer.answer(message, fields)
 
     def refuse(self, reason: str) -> None:
+        """Say in a sentence why there is no answer. It becomes `AskEnded.failure`."""
         self.answerer.refuse(reason)
 
     def end(self) -> None:
+        """There are no more answers. A query that is never ended ends by the timeout of `ask`."""
         self.answerer.end()
 
 
 @dataclass(frozen=True, slots=True)
 class Replied:
-    """One reply to what we asked under `tag`."""
+    """One reply to what we asked under `tag`. `fields` are the chunks of its key."""
 
     tag: str
     topic: Topic
@@ -63,9 +86,10 @@ class Replied:
 
 @dataclass(frozen=True, slots=True)
 class AskEnded:
-    """No more replies to `tag`. None at all is normal (nobody there, link lost): ask again.
+    """No more replies to `tag`. No reply at all is normal (not served, link lost): ask again.
 
-    failure  what the last error reply said, "timeout" included
+    replies  how many were posted
+    failure  the last refusal, "timeout" if the time ran out; None if neither happened
     """
 
     tag: str
@@ -76,19 +100,23 @@ class AskEnded:
 
 @dataclass(frozen=True, slots=True)
 class Appeared:
+    """A liveliness token is up."""
+
     peer: Peer
 
 
 @dataclass(frozen=True, slots=True)
 class Disappeared:
+    """A liveliness token has fallen, or the link to it is lost."""
+
     peer: Peer
 
 
 @dataclass(frozen=True, slots=True)
 class LinkChanged:
-    """A transport came up or went down: whoever replicates compares what it has with the others.
+    """A transport came up or went down: replicas compare what they hold with the others.
 
-    beyond  it is one between routers, of which only they are told; our own link is as it was
+    beyond  the transport is one between routers; our own link is as it was
     """
 
     up: bool
@@ -97,7 +125,7 @@ class LinkChanged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorkDone:
-    """What a worker thread was asked to do is done."""
+    """A job given to a `Worker` is done, after `took_ns`."""
 
     tag: str
     result: object
@@ -109,6 +137,8 @@ Post = Callable[[Event], None]
 
 
 class Answerer(Protocol):
+    """The bus's side of `Asked`."""
+
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None: ...
     def refuse(self, reason: str) -> None: ...
     def end(self) -> None: ...
@@ -118,32 +148,35 @@ class Bus(Protocol):
     """The network of one process. Keyword `fields` fill the topic's key; those not given are wildcards."""
 
     @property
-    def namespace(self) -> str: ...
+    def namespace(self) -> str:
+        """The first chunk of all keys."""
+        ...
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """`messages_out, messages_in, payloads_dropped`."""
+        """`messages_out, messages_in, payloads_dropped`, since the bus was opened."""
         ...
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        """Put a message. Dropped, never waited for, where a link is congested."""
+        """Put a message under a key of which all fields are given. It is dropped where a link is congested. A
+        process hears its own samples. Nothing is sent after `close`."""
         ...
 
     def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
-        """Post `Heard` for every sample; what does not parse, or says that it is another's than its key says, is
-        counted, logged and dropped.
+        """Post `Heard` for every sample from now on.
 
-        together  post `HeardMany` of all samples that wait, for a topic of many small messages: whether each is
-                  under its own key is then for the reader to see
+        together  post `HeardMany` of all samples that wait, for a topic of many small messages; the reader
+                  compares each key with its message
         """
         ...
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        """End every subscription that was made with these very fields. What is on its way may still be posted."""
+        """End every subscription that was made with exactly these fields. Samples under way may be posted after
+        it."""
         ...
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
-        """Post `Asked` for every query."""
+        """Post `Asked` for every query on the key. Raises TypeError on a topic without requests."""
         ...
 
     def ask(
@@ -156,27 +189,30 @@ class Bus(Protocol):
         timeout_s: float = 2.0,
         **fields: str | int,
     ) -> None:
-        """Query everybody who serves the key; post `Replied` for each reply, then `AskEnded`, always."""
+        """Query all who serve the key, ourselves included. Posts `Replied` for each reply and then always one
+        `AskEnded`, after `timeout_s` at the latest."""
         ...
 
     def declare_alive(self, peer: Peer) -> None:
-        """Raise our liveliness token; it falls when the process ends, however it ends."""
+        """Raise our liveliness token. It falls when the process ends, however it ends."""
         ...
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
         """Post `Appeared` for the tokens of others that are up now and later, `Disappeared` when they fall or
-        the link to them is lost."""
+        the link to them is lost. Our own is never posted."""
         ...
 
     def watch_links(self, post: Post) -> None:
-        """Post `LinkChanged`."""
+        """Post `LinkChanged` from now on."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Leave the network: our token falls, nothing is sent any more. Returns within seconds. May be repeated."""
+        ...
 
 
 class Worker(Protocol):
-    """Runs long work beside the process's own thread."""
+    """Runs long jobs beside the process's own thread, one after the other."""
 
     def submit(self, tag: str, job: Callable[[], object], post: Post, model_ns: int = 0) -> None:
         """Run `job`, then post `WorkDone`. A job that raises ends the process.
@@ -185,4 +221,6 @@ class Worker(Protocol):
         """
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Wait for the job in hand, forget the others."""
+        ...

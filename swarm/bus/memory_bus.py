@@ -1,8 +1,8 @@
 """A network inside one process, on a manual clock: the same services run on it in tests and simulations.
 
-Everything is encoded and decoded as on the wire, once per message: those who hear it share the frozen result. What
-a link does to a message (delay, loss, repetition, partition) is decided by a `LinkModel`, so that a seed
-replays a run exactly.
+Everything is encoded and decoded as on the wire, once per message; all subscribers share the frozen result. A
+`LinkModel` decides what a link does to a message (delay, loss, repetition, partition), so that a seed replays a
+run. Nothing is buffered: a handler takes no simulated time, so no reader falls behind.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from swarm.bus.bus import Appeared, Asked, Disappeared, Event, Heard, HeardMany, LinkChanged, Post
+from swarm.bus.bus import Appeared, Asked, Disappeared, Event, Heard, LinkChanged, Post
+from swarm.bus.memory_declarations import Declaration, Subscriptions, as_batches, checking_key, declare, narrowed
 from swarm.bus.memory_query import Asking, MemoryAnswerer
-from swarm.bus.scheduler import InlineWorker as InlineWorker
-from swarm.bus.scheduler import Scheduler as Scheduler
+from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
@@ -23,7 +23,7 @@ from swarm.wire.messages.base import Message
 from swarm.wire.topics import Topic
 
 TOKEN_NS = 1_000_000
-"""How long word of a token takes; zenoh needs 3 to 8 ms to notice a killed process."""
+"""Until a token that rises or falls is noticed. Zenoh takes 3 to 8 ms to notice a killed process."""
 
 
 class LinkModel(Protocol):
@@ -34,7 +34,8 @@ class LinkModel(Protocol):
         ...
 
     def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        """Whether the network takes the two for connected: it notices a cut only after a while."""
+        """Whether the network holds the two for connected, in the direction of the message. Tokens and queries
+        depend on it. It may lag behind `delays_ns`: a cut is noticed when the lease runs out."""
         ...
 
 
@@ -52,31 +53,39 @@ class PerfectLinks:
 
 
 Trace = Callable[[int, str, str, str, bytes], None]
-"""Told of each delivery: time, source node, destination node, topic, payload."""
+"""Called at each delivery with time in ns, source node, destination node, topic and payload."""
 
 
 class MemoryNetwork:
-    """What Zenoh is for real processes."""
+    """What a Zenoh router is for real processes: connects the buses of all nodes.
+
+    links  may be replaced at any time; messages under way arrive as the earlier model decided
+    """
 
     def __init__(self, scheduler: Scheduler, links: LinkModel, trace: Trace | None = None) -> None:
         self.scheduler = scheduler
         self.links = links
-        self.buses: list[MemoryBus] = []
         self.trace = trace
-        self.subscriptions: dict[tuple[str, str], _Index] = {}
+        self.buses: list[MemoryBus] = []
+        """Open buses in the order of their opening, which is the order of queries and tokens."""
+        self.subscriptions: dict[tuple[str, str], Subscriptions] = {}
+        """(namespace, topic) -> subscriptions of open buses."""
         self._down: set[str] = set()
+        """Nodes cut off by `link_changed`."""
 
     def bus(self, node: str, namespace: str = "swarm") -> MemoryBus:
+        """Open a bus. A node that was started again opens a new one."""
         bus = MemoryBus(self, node, namespace)
         self.buses.append(bus)
         return bus
 
-    def subscribers(self, namespace: str, topic: str, fields: Mapping[str, str]) -> list[Interest]:
-        """The subscriptions that a value with these fields reaches, in an order that depends on nothing else."""
-        index = self.subscriptions.get((namespace, topic))
-        return [] if index is None else index.find(fields)
+    def subscribers(self, namespace: str, topic: str, fields: Mapping[str, str]) -> list[Declaration]:
+        """The subscriptions that a value with these fields reaches, in the order in which it is delivered."""
+        subscriptions = self.subscriptions.get((namespace, topic))
+        return [] if subscriptions is None else subscriptions.find(fields)
 
     def connected(self, source: MemoryBus, to: MemoryBus) -> bool:
+        """Whether queries and tokens of `source` reach `to` now."""
         if source is to:
             return True
         if source.node in self._down or to.node in self._down:
@@ -92,7 +101,7 @@ class MemoryNetwork:
         self.relink([node], up)
 
     def relink(self, nodes: Sequence[str], up: bool) -> None:
-        """Nodes notice that their link came up or went down; everybody's view of the tokens follows."""
+        """Let nodes notice that their link came up or went down, and all nodes which tokens they see now."""
         for bus in list(self.buses):
             if bus.node in nodes:
                 for post in bus.link_watchers:
@@ -100,12 +109,13 @@ class MemoryNetwork:
         self.compare_tokens()
 
     def compare_tokens(self) -> None:
+        """Let every watcher notice tokens that it sees since the last time, or no longer."""
         for bus in self.buses:
             for watcher in bus.watchers:
                 watcher.compare()
 
     def arrivals_ns(self, source: MemoryBus, to: MemoryBus, what: str) -> Sequence[int]:
-        """When each copy of a message sent now arrives."""
+        """When each copy of a message sent now arrives; a node hears itself at once."""
         now_ns = self.scheduler.clock.now_ns()
         if source is to:
             return (now_ns,)
@@ -114,131 +124,53 @@ class MemoryNetwork:
         return [now_ns + delay for delay in self.links.delays_ns(source.node, to.node, what, now_ns)]
 
 
-@dataclass(eq=False, slots=True)
-class Interest:
-    """A subscription or a queryable. `narrow` holds the fields that are no wildcard."""
-
-    bus: MemoryBus
-    narrow: dict[str, str]
-    post: Post
-
-    def meets(self, fields: Mapping[str, str]) -> bool:
-        """Whether this and another key of the topic, either with wildcards, can name the same value."""
-        return not self.narrow or _meet(self.narrow, fields)
-
-
-class _Index:
-    """The subscriptions of one topic: a hundred vehicles each listen to a key of their own."""
-
-    def __init__(self) -> None:
-        self._wide: list[Interest] = []
-        self._exact: dict[tuple[str, ...], list[Interest]] = {}
-
-    def add(self, interest: Interest, topic: Topic) -> None:
-        if len(interest.narrow) == len(topic.fields):
-            self._exact.setdefault(tuple(interest.narrow.values()), []).append(interest)
-        else:
-            self._wide.append(interest)
-
-    def remove(self, bus: MemoryBus, narrow: Mapping[str, str] | None = None) -> None:
-        """Forget a node's subscriptions: all, or those with these fields."""
-
-        def goes(interest: Interest) -> bool:
-            return interest.bus is bus and (narrow is None or interest.narrow == narrow)
-
-        self._wide = [interest for interest in self._wide if not goes(interest)]
-        for key, interests in list(self._exact.items()):
-            self._exact[key] = [interest for interest in interests if not goes(interest)]
-
-    def find(self, fields: Mapping[str, str]) -> list[Interest]:
-        found = [interest for interest in self._wide if interest.meets(fields)]
-        return found + self._exact.get(tuple(fields.values()), [])
-
-
-def _interest(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post) -> Interest:
-    every = topic.every(fields)
-    return Interest(bus, {name: chunk for name, chunk in every.items() if chunk != "*"}, post)
-
-
-def _as_many(post: Post) -> Post:
-    """What arrives at one instant here arrives one by one: each sample by itself makes a `HeardMany`."""
-
-    def together(event: Event) -> None:
-        if isinstance(event, Heard):
-            event = HeardMany(event.topic, [(event.topic.key.format(**event.fields), event.message)])
-        post(event)
-
-    return together
-
-
-def _as_keyed(post: Post, counts: dict[str, int]) -> Post:
-    """Drop what says that it is another's than its key says."""
-
-    def alone(event: Event) -> None:
-        if isinstance(event, Heard):
-            try:
-                event.topic.check_key(event.fields, event.message)
-            except ProtocolError:
-                counts["payloads_dropped"] += 1
-                return
-        post(event)
-
-    return alone
-
-
-def _meet(narrow: Mapping[str, str], fields: Mapping[str, str]) -> bool:
-    for name, chunk in narrow.items():
-        other = fields[name]
-        if other not in (chunk, "*"):
-            return False
-    return True
-
-
 class MemoryBus:
-    """A `Bus` of one node of a `MemoryNetwork`."""
+    """A `Bus` of one node of a `MemoryNetwork`. Every post is called by the network's scheduler."""
 
     def __init__(self, network: MemoryNetwork, node: str, namespace: str) -> None:
         self.network = network
         self.node = node
         self.namespace = namespace
         self.closed = False
+        """Once true, nothing is sent or posted any more."""
         self.counts: dict[str, int] = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
-        self.queryables: dict[str, list[Interest]] = {}
+        self.queryables: dict[str, list[Declaration]] = {}
+        """Topic -> what is served, in order; subscriptions are the network's."""
         self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
         self.tokens: list[Peer] = []
+        """Raised with `declare_alive`; visible to others while the bus is open and connected."""
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         self.publish_bytes(topic, encode(message), fields)
 
     def publish_bytes(self, topic: Topic, payload: bytes, fields: Mapping[str, str | int]) -> None:
-        """Put any payload at all: tests send garbage through this."""
+        """Put any payload at all: tests send garbage with it."""
         if self.closed:
             return
         self.counts["messages_out"] += 1
         named = topic.one(fields)
         sample = _Sample(topic, named, payload)
         network = self.network
-        for interest in network.subscribers(self.namespace, topic.name, named):
-            for when_ns in network.arrivals_ns(self, interest.bus, topic.name):
-                network.scheduler.at(when_ns, _Arrival(self, interest, sample))
+        for subscription in network.subscribers(self.namespace, topic.name, named):
+            for when_ns in network.arrivals_ns(self, subscription.bus, topic.name):
+                network.scheduler.at(when_ns, _Arrival(self, subscription, sample))
 
     def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
-        interest = _interest(self, topic, fields, _as_many(post) if together else _as_keyed(post, self.counts))
-        index = self.network.subscriptions.setdefault((self.namespace, topic.name), _Index())
-        index.add(interest, topic)
+        post = as_batches(post) if together else checking_key(post, self.counts)
+        subscriptions = self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions())
+        subscriptions.add(declare(self, topic, fields, post), topic)
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        narrow = {name: chunk for name, chunk in topic.every(fields).items() if chunk != "*"}
-        index = self.network.subscriptions.get((self.namespace, topic.name))
-        if index is not None:
-            index.remove(self, narrow)
+        narrow = narrowed(topic, fields)
+        subscriptions = self.network.subscriptions.get((self.namespace, topic.name))
+        if subscriptions is not None:
+            subscriptions.remove(self, narrow)
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
-        interest = _interest(self, topic, fields, post)
-        self.queryables.setdefault(topic.name, []).append(interest)
+        self.queryables.setdefault(topic.name, []).append(declare(self, topic, fields, post))
 
     def ask(
         self,
@@ -259,24 +191,24 @@ class MemoryBus:
             scheduler.after(0, asking.finish)
             return
         self.counts["messages_out"] += 1
-        interests = [
-            interest
+        queryables = [
+            queryable
             for bus in self.network.buses
             if bus.namespace == self.namespace and self.network.connected(self, bus)
-            for interest in bus.queryables.get(topic.name, ())
-            if interest.meets(wanted)
+            for queryable in bus.queryables.get(topic.name, ())
+            if queryable.meets(wanted)
         ]
-        asking.waiting = set(range(len(interests)))
-        if not interests:
+        asking.waiting = set(range(len(queryables)))
+        if not queryables:
             scheduler.after(0, asking.finish)
             return
         payload = encode(request)
         parsed = decode(payload, topic.request)
-        for index, interest in enumerate(interests):
-            for when_ns in self.network.arrivals_ns(self, interest.bus, topic.name):
-                answerer = MemoryAnswerer(asking, interest, index)
+        for index, queryable in enumerate(queryables):
+            for when_ns in self.network.arrivals_ns(self, queryable.bus, topic.name):
+                answerer = MemoryAnswerer(asking, queryable, index)
                 event = Asked(topic, wanted, parsed, answerer)
-                scheduler.at(when_ns, _Delivery(self, interest.bus, topic.name, payload, interest.post, event))
+                scheduler.at(when_ns, _Delivery(self, queryable.bus, topic.name, payload, queryable.post, event))
         scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)
 
     def declare_alive(self, peer: Peer) -> None:
@@ -292,21 +224,21 @@ class MemoryBus:
         self.link_watchers.append(post)
 
     def close(self) -> None:
-        """Leave the network. Also how a crash looks to the others."""
+        """Leave the network. To the others a crash looks the same."""
         if self.closed:
             return
         self.closed = True
         self.network.buses.remove(self)
-        for index in self.network.subscriptions.values():
-            index.remove(self)
+        for subscriptions in self.network.subscriptions.values():
+            subscriptions.remove(self)
         self.network.compare_tokens()
 
     def later(self, delay_ns: int, post: Post, event: Event) -> None:
-        """Post an event unless we are closed by then."""
+        """Post an event after a delay, unless the bus is closed by then."""
         self.network.scheduler.after(delay_ns, lambda: None if self.closed else post(event))
 
     def traced(self, source: MemoryBus, what: str, payload: bytes) -> bool:
-        """Note a delivery; False if we are gone."""
+        """Trace a delivery to this bus; False if it is closed, and nothing is delivered."""
         if self.closed:
             return False
         trace = self.network.trace
@@ -317,7 +249,7 @@ class MemoryBus:
 
 @dataclass(eq=False)
 class _Watcher:
-    """Somebody who wants to know which tokens are up, the own process's aside."""
+    """One call of `watch_alive`. `visible` are the tokens that were posted as up and not yet as down."""
 
     bus: MemoryBus
     role: str
@@ -343,7 +275,7 @@ class _Watcher:
 
 
 class _Sample:
-    """One put, parsed when the first subscription is reached."""
+    """One put, parsed once: when the first subscription is reached."""
 
     __slots__ = ("_heard", "_parsed", "fields", "payload", "topic")
 
@@ -367,14 +299,14 @@ class _Sample:
 
 @dataclass(eq=False, slots=True)
 class _Arrival:
-    """A sample reaching a subscription: parsed at the door, as on the real bus."""
+    """The arrival of a sample at a subscription. A payload that does not parse is counted and dropped."""
 
     source: MemoryBus
-    interest: Interest
+    subscription: Declaration
     sample: _Sample
 
     def __call__(self) -> None:
-        bus = self.interest.bus
+        bus = self.subscription.bus
         if not bus.traced(self.source, self.sample.topic.name, self.sample.payload):
             return
         bus.counts["messages_in"] += 1
@@ -382,12 +314,12 @@ class _Arrival:
         if heard is None:
             bus.counts["payloads_dropped"] += 1
         else:
-            self.interest.post(heard)
+            self.subscription.post(heard)
 
 
 @dataclass(eq=False, slots=True)
 class _Delivery:
-    """A query reaching a queryable."""
+    """The arrival of a query at a queryable."""
 
     source: MemoryBus
     to: MemoryBus

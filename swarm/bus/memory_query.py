@@ -1,4 +1,4 @@
-"""One query on the simulated network: who asked, who still has to answer, and how the answers travel."""
+"""One query on the simulated network: which queryables have not ended yet, and how their answers travel."""
 
 from __future__ import annotations
 
@@ -12,12 +12,19 @@ from swarm.wire.messages.base import Message
 from swarm.wire.topics import Topic
 
 if TYPE_CHECKING:
-    from swarm.bus.memory_bus import Interest, MemoryBus
+    from swarm.bus.memory_bus import MemoryBus
+    from swarm.bus.memory_declarations import Declaration
 
 
 @dataclass(eq=False)
 class Asking:
-    """One query under way. `waiting` are the queryables that have not ended yet."""
+    """One query under way.
+
+    waiting   queryables that have not ended yet, by number; the query ends with the last
+    replies   how many were posted
+    failure   the last refusal, or "timeout"
+    over      whether `AskEnded` was posted: what comes later is dropped
+    """
 
     bus: MemoryBus
     topic: Topic
@@ -42,8 +49,15 @@ class Asking:
 
 @dataclass(eq=False)
 class MemoryAnswerer:
+    """The answers of one queryable to one query.
+
+    index            the queryable's number in `Asking.waiting`
+    ended            whether `end` was called
+    last_arrival_ns  when its latest answer arrives: no later answer overtakes it
+    """
+
     asking: Asking
-    interest: Interest
+    queryable: Declaration
     index: int
     ended: bool = False
     last_arrival_ns: int = 0
@@ -51,8 +65,8 @@ class MemoryAnswerer:
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
         if self.ended:
             raise RuntimeError("answered after the end")
-        asking, bus = self.asking, self.interest.bus
-        named = asking.topic.one({**self.interest.narrow, **fields})
+        asking, bus = self.asking, self.queryable.bus
+        named = asking.topic.one({**self.queryable.narrow, **fields})
         if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
             return
         bus.counts["messages_out"] += 1
@@ -89,7 +103,7 @@ class MemoryAnswerer:
 
     def _send(self, payload: bytes, arrive: Callable[[], None]) -> None:
         """What answers one query stays in order; it may be lost or repeated."""
-        source, to, what = self.interest.bus, self.asking.bus, self.asking.topic.name
+        source, to, what = self.queryable.bus, self.asking.bus, self.asking.topic.name
         if source.closed:
             return
 

@@ -1,4 +1,4 @@
-"""What happens when, on a manual clock: the thread and the worker of every simulated process."""
+"""Simulated time: what happens when, on a manual clock, in the place of threads and of workers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,22 @@ from swarm.clock import ManualClock
 
 
 class Scheduler:
-    """What happens when, on a manual clock. Of two things due at once the one scheduled first happens first."""
+    """Runs actions at their times, in order. Of two that are due at once the one scheduled first runs first.
+
+    All nodes of a simulation share one. An action runs to its end before the next: it may schedule others, and time
+    stands still meanwhile. An error in an action ends the simulation.
+    """
 
     def __init__(self, clock: ManualClock) -> None:
         self.clock = clock
+        """Moved by `run_until` only."""
         self._due: list[tuple[int, int, Callable[[], None]]] = []
+        """Heap of (time in ns, number, action)."""
         self._count = 0
+        """How many actions were scheduled so far: their numbers, which decide between equal times."""
 
     def at(self, when_ns: int, action: Callable[[], None]) -> None:
+        """Run an action at a time; at once, after what is due already, if that has passed."""
         self._count += 1
         heapq.heappush(self._due, (max(when_ns, self.clock.now_ns()), self._count, action))
 
@@ -25,7 +33,7 @@ class Scheduler:
         self.at(self.clock.now_ns() + delay_ns, action)
 
     def run_until(self, end_ns: int) -> int:
-        """Let everything due up to `end_ns` happen; returns how many things did."""
+        """Run all actions due up to `end_ns`, then move the clock there. Returns how many ran."""
         happened = 0
         while self._due and self._due[0][0] <= end_ns:
             when_ns, _, action = heapq.heappop(self._due)
@@ -37,7 +45,7 @@ class Scheduler:
 
 
 class InlineWorker:
-    """A `Worker` whose jobs run at once and are done after the time that they are taken to cost."""
+    """A `Worker` that runs a job at once and posts its result after the time which the job is taken to cost."""
 
     def __init__(self, scheduler: Scheduler) -> None:
         self._scheduler = scheduler

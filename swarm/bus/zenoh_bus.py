@@ -1,13 +1,12 @@
-"""The only door to zenoh. Bytes become messages here; what does not parse is counted, logged once per key and
-minute, and dropped.
+"""The bus of real processes, on one Zenoh session.
 
-What the choices rest on is measured: rings that drop the oldest keep a stalled reader from holding up queries
-on the same link; replies come straight on zenoh's own thread, because a thread per query is ten times slower.
+Each subscription and queryable has a channel and a thread that reads it. Two choices rest on measurements: channels
+of subscriptions drop their oldest sample when full, because with a FIFO a stalled reader holds up queries on the
+same link; replies are posted on Zenoh's own thread, because a thread per query is ten times slower.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
@@ -17,19 +16,13 @@ from typing import Any
 import zenoh
 
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Post, Replied
-from swarm.config.scenario import NetworkConfig, TlsConfig
+from swarm.bus.zenoh_config import session_config
+from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.codec import (
-    MAX_PAYLOAD_BYTES,
-    decode,
-    decode_either,
-    decode_many,
-    decode_parameters,
-    encode,
-    encode_readable,
-)
+from swarm.wire.codec import decode, decode_either, decode_many, encode
 from swarm.wire.messages.base import Message
+from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic
 
 log = logging.getLogger(__name__)
@@ -40,21 +33,27 @@ _PRIORITIES = {
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
 _LOG_AGAIN_S = 60.0
+"""A key whose payloads are dropped is logged again after this."""
+_LOGGED_KEYS = 10_000
+"""Most keys whose last log is remembered: a hostile sender may use a new one each time."""
 _QUERY_BUFFER = 4096
+"""Queries that wait to be answered, per queryable. It takes no more until one is read."""
 _TOKEN_BUFFER = 65_536
+"""Changes of tokens that wait to be read: more than processes can start in a second."""
 _CLOSE_S = 3.0
+"""How long `close` waits for a router that does not answer."""
 _TOGETHER = 1024
-"""At most so many samples in one event, so that a tick is not kept waiting for long."""
+"""Most samples in one `HeardMany`, so that a tick does not wait for long."""
 
 
 def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
-    """Open a session. Raises BusError with a sentence when it cannot listen or nobody answers.
+    """Open a session. Raises BusError when it cannot listen or no router answers.
 
     mode  "client" connects to `network.connect`; "router" listens on `network.listen` and passes messages on
     """
     endpoints = network.listen if mode == "router" else network.connect
     try:
-        return ZenohBus(zenoh.open(_zenoh_config(network, mode)), network.namespace)
+        return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace)
     except zenoh.ZError as error:
         reason = str(error).split(" at /")[0]
         what = "listen on" if mode == "router" else "reach a router at"
@@ -62,67 +61,31 @@ def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
         raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason} ({hint})") from error
 
 
-def _zenoh_config(network: NetworkConfig, mode: str) -> zenoh.Config:
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/unicast/max_sessions": 8192,
-        "transport/unicast/accept_pending": 2048,
-        "transport/unicast/accept_timeout": 20_000,
-        "transport/link/tx/lease": int(network.lease_s * 1000),
-        "transport/link/tx/keep_alive": 4,
-        "transport/link/rx/max_message_size": MAX_PAYLOAD_BYTES + (1 << 16),
-        "transport/shared_memory/enabled": False,
-    }
-    if mode == "router":
-        settings["listen/endpoints"] = list(network.listen)
-        settings["listen/exit_on_failure"] = True
-        settings["connect/endpoints"] = list(network.peers)
-        settings["connect/exit_on_failure"] = False
-    else:
-        settings["listen/endpoints"] = []
-        settings["connect/endpoints"] = list(network.connect)
-        settings["connect/timeout_ms"] = int(network.connect_timeout_s * 1000)
-    settings["connect/retry"] = {
-        "period_init_ms": 100,
-        "period_max_ms": 500,
-        "period_increase_factor": 1.5,
-    }
-    if network.tls is not None:
-        settings["transport/link/tls"] = tls_settings(network.tls)
-    config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
-
-
-def tls_settings(tls: TlsConfig) -> dict[str, Any]:
-    """What zenoh calls mutual TLS, both ways with one certificate."""
-    return {
-        "root_ca_certificate": tls.ca,
-        "enable_mtls": True,
-        "listen_certificate": tls.certificate,
-        "listen_private_key": tls.key,
-        "connect_certificate": tls.certificate,
-        "connect_private_key": tls.key,
-    }
-
-
 class ZenohBus:
-    """A `Bus` on one zenoh session. `close` it, always: an unclosed session can hang the interpreter's exit."""
+    """A `Bus` on one Zenoh session. Always `close` it: an open session can hang the interpreter's exit.
+
+    Its methods are called by the thread that owns the service. The threads that read channels change the counters
+    and the log only; each ends when what it reads is undeclared.
+    """
 
     def __init__(self, session: zenoh.Session, namespace: str) -> None:
         self._session = session
         self._namespace = namespace
         self._counts = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
         self._counting = threading.Lock()
+        """Held to add to `_counts`."""
         self._own_peers: list[Peer] = []
+        """Our tokens, of which `watch_alive` does not tell."""
         self._entities: list[Any] = []
+        """All that was declared and not yet undeclared, in order; `close` undeclares it backwards."""
         self._subscribers: dict[str, list[Any]] = {}
+        """Key expression -> its subscribers, for `unsubscribe`."""
         self._threads: list[threading.Thread] = []
+        """One per channel; those that have ended are removed at the next `unsubscribe`."""
         self._logged_s: dict[str, float] = {}
+        """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
         self._closed = False
+        """Set by `close`, for good: nothing is sent from then on."""
 
     @property
     def namespace(self) -> str:
@@ -134,7 +97,7 @@ class ZenohBus:
 
     @property
     def session(self) -> zenoh.Session:
-        """The raw session, for measurements that compare with it."""
+        """The raw session, for measurements beside it."""
         return self._session
 
     def __enter__(self) -> ZenohBus:
@@ -216,7 +179,7 @@ class ZenohBus:
                 answerer.refuse(f"{topic.name}: {error}")
                 answerer.end()
                 return
-            # A tool may ask with `**`, which no template parses: then we were asked for all that we serve.
+            # A tool may ask with `**`, which no key template parses: all that we serve is meant.
             asked = topic.parse(self._namespace, key) or dict.fromkeys(topic.fields, "*") | concrete
             post(Asked(topic, asked, request, answerer))
 
@@ -285,7 +248,7 @@ class ZenohBus:
                 self._drop(str(sample.key_expr), error)
                 return
             if peer in self._own_peers:
-                return  # our own token falls with the link; that we are alive needs no telling
+                return  # our own token falls with the link, though we live
             post(Appeared(peer) if sample.kind == zenoh.SampleKind.PUT else Disappeared(peer))
 
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
@@ -304,7 +267,7 @@ class ZenohBus:
         self._read(listener, arrive, "links")
 
     def close(self) -> None:
-        """Leave the network, within seconds even if the router hangs and zenoh would wait for it."""
+        """Leave the network, within `_CLOSE_S` even if the router hangs, for which Zenoh would wait ten seconds."""
         if self._closed:
             return
         self._closed = True
@@ -312,7 +275,7 @@ class ZenohBus:
         closer.start()
         closer.join(_CLOSE_S)
         if closer.is_alive():
-            log.warning("the router does not answer: left without saying goodbye")
+            log.warning("the router does not answer: left without closing the session")
 
     def _undeclare(self) -> None:
         for entity in reversed(self._entities):
@@ -324,10 +287,10 @@ class ZenohBus:
     def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, *, together: bool = False) -> None:
         """Read an entity's channel on a thread of its own until it is undeclared.
 
-        together  hand over lists of all that waits, instead of one item at a time
+        together  call `arrive` with lists of all that waits, instead of one item at a time
         """
         self._entities.append(entity)
-        channel = entity.handler  # a thread waiting on the entity itself would keep it from being undeclared
+        channel = entity.handler  # a thread that waits on the entity itself keeps it from being undeclared
 
         def run() -> None:
             try:
@@ -356,15 +319,18 @@ class ZenohBus:
         self._count("payloads_dropped")
         now_s = time.monotonic()
         if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
-            if len(self._logged_s) > 10_000:  # a hostile sender may use a new key each time
+            if len(self._logged_s) > _LOGGED_KEYS:
                 self._logged_s.clear()
             self._logged_s[key] = now_s
             log.warning("dropped a payload on %s: %s", key, error)
 
 
 def _waiting(channel: Any) -> list[Any]:
-    """All that waits in a channel, one item at least. What is there already is taken without letting go of the
-    interpreter: a hand-over to another busy thread for each item would cost hundreds of times more."""
+    """All items that wait in a channel; blocks until there is one.
+
+    `try_recv` keeps the interpreter's lock, `recv` releases it: taking it back for each item costs hundreds of
+    times more while another thread is busy.
+    """
     items = [channel.recv()]
     while len(items) < _TOGETHER and (item := channel.try_recv()) is not None:
         items.append(item)
@@ -379,6 +345,9 @@ def _peer(key: str) -> Peer:
 
 
 class _ZenohAnswerer:
+    """The answers to one query. `concrete` are the fields that `serve` was given; `_query` is None after the
+    end."""
+
     def __init__(
         self, bus: ZenohBus, topic: Topic, query: zenoh.Query, concrete: dict[str, str], as_json: bool
     ) -> None:

@@ -1,1 +1,1 @@
-"""The scenario: its structs, how it is read, and what is wrong with one."""
+"""The scenario: its structs, what each setting means, how a file is read, and what is wrong with one."""

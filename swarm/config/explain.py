@@ -1,4 +1,4 @@
-"""What is wrong with a scenario, in TOML's words: the key, what was found, what is allowed, the nearest name."""
+"""Errors of a scenario in terms of TOML: the key, what was found, what is allowed, the nearest name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ from typing import Annotated, Any, Literal
 
 
 def explain(reason: str, raw: dict[str, Any], root: type) -> str:
-    """msgspec's message about a `root` made of `raw`, for the person who wrote the file."""
+    """One sentence from msgspec's error message.
+
+    reason  the message: "Expected `int`, got `str` - at `$.targets[0].count`"
+    raw     what was read from the file
+    root    the type that it was to become
+    """
     path = "$"
     located = re.fullmatch(r"(.*) - at `(.*)`", reason, re.DOTALL)
     if located:
@@ -40,6 +45,7 @@ def explain(reason: str, raw: dict[str, Any], root: type) -> str:
 
 
 def nearest(word: str, allowed: list[str]) -> str:
+    """ "; did you mean 'x'?" with the most similar of the allowed words, nothing if none is."""
     close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else ""
 

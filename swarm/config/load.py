@@ -26,7 +26,7 @@ def load_scenario(path: Path) -> Scenario:
 
 
 def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
-    """As `load_scenario`, of a text. Relative files in it are taken relative to `base`."""
+    """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given."""
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -40,6 +40,7 @@ def parse_scenario(text: str, source: str = "scenario", base: Path | None = None
 
 
 def _check(scenario: Scenario, source: str) -> None:
+    """Raise ConfigError where settings that are valid each do not fit together."""
     ids = scenario.target_ids
     doubled = sorted({id for id in ids if ids.count(id) > 1})
     if doubled:
@@ -94,7 +95,7 @@ def _check_directional(planner: PlannerConfig, source: str) -> None:
 
 
 def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
-    """Beyond loopback only mutual TLS will do. Raises ConfigError."""
+    """Raise ConfigError on what is no endpoint, and on one beyond loopback without mutual TLS."""
     match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
     if match is None or int(match[3]) > 65535:
         raise ConfigError(f"{where}: {endpoint!r} is not an endpoint such as tcp/127.0.0.1:7447 or tls/host:7447")
@@ -115,7 +116,7 @@ def _loopback(host: str) -> bool:
 
 
 def _anchored(scenario: Scenario, base: Path) -> Scenario:
-    """Relative paths of a scenario file, made relative to where it lies."""
+    """The scenario with its relative paths made relative to the folder of its file."""
     terrain = scenario.terrain
     source = terrain.source
     if source not in BUILT_IN_TERRAINS:

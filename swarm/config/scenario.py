@@ -1,7 +1,8 @@
 """A scenario: frozen settings, read once from a TOML file and handed down by section.
 
-Every number that a user may turn has its home here, with its unit in its name. A wrong key, type or value is
-refused with the file, the key, what was found and what is allowed.
+Every setting is declared here: its unit in its name, its range in its type, its meaning as one row of its section's
+docstring (`swarm.config.describe` reads the rows). A wrong key, type or value is rejected with the file, the key,
+what was found and what is allowed.
 """
 
 from __future__ import annotations
@@ -32,11 +33,12 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class ZoneConfig(Section, frozen=True, kw_only=True):
-    """A polygon painted on the terrain.
+    """A part of the terrain with a cost of its own. Give either `polygon_m` or `mask`.
 
     kind       forbidden is lethal; preferred halves the pace; road sets the road pace; rough doubles the pace
     polygon_m  [east, south] corners in metres from the north-west corner of the terrain
-    mask       instead of a polygon: an image as large as the terrain, painted wherever it is not 0
+    mask       an image file with as many pixels as the terrain has cells: the zone is where it is not 0
+    name       how messages call the zone; its kind if empty
     """
 
     kind: Literal["forbidden", "preferred", "road", "rough"]
@@ -46,7 +48,13 @@ class ZoneConfig(Section, frozen=True, kw_only=True):
 
 
 class HiddenConfig(Section, frozen=True, kw_only=True):
-    """What is true of the terrain and missing from the map: vehicles find it out."""
+    """What is true of the terrain and missing from the map, until vehicles find it.
+
+    closed_roads   barriers: a stretch of road and the cells beside it is lethal
+    rubble_fields  ragged patches, 4 to 10 cells in radius, of three times the pace
+    flooded_share  share of the passable cells which is one flooded, lethal valley
+    zones          zones painted on the truth only
+    """
 
     closed_roads: Annotated[int, Meta(ge=0, le=1000)] = 0
     rubble_fields: Annotated[int, Meta(ge=0, le=10_000)] = 0
@@ -65,7 +73,11 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     height_scale  metres per unit of height, where the file does not say it (.png)
     nodata        voids are lethal, or filled from their surroundings
     roads         how many roads to lay between seeded places, as there is no map of them
-    rows, cols    size of a synthetic terrain; relief_m from its lowest to its highest cell, rivers across it
+    rows          synthetic: cells from north to south
+    cols          synthetic: cells from west to east
+    relief_m      synthetic: height of the highest cell above the lowest
+    rivers        synthetic: how many rivers cross the terrain
+    hidden        what is true of the terrain and missing from the map
     """
 
     source: Annotated[str, Meta(min_length=1)] = "jacksboro"
@@ -84,16 +96,21 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
 
 
 class CostConfig(Section, frozen=True, kw_only=True):
-    """How terrain becomes pace. `flat_speed_m_per_s` is driven on level open ground, `road_speed_m_per_s` on roads.
+    """How terrain becomes pace.
 
-    slope_rule     linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
-                   Tobler's hiking function; energy is a wheeled vehicle of constant power
-    directional    uphill is not downhill: a step costs by what it climbs along its way, instead of a cell by how
-                   steep it is; the planner grows whole trees then (strategy auto or full)
-    max_slope_deg  steeper ground is lethal
-    rough_per_m    how much a metre of roughness (neighbours off the even slope) adds to the pace, as a share of it
-    classes        whether what covers the ground (water, forest, rock ...) counts
-    class_factor   pace of a class relative to open ground, or "lethal", instead of the built-in factors
+    flat_speed_m_per_s  speed on level open ground
+    road_speed_m_per_s  speed on roads
+    slope_rule          linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
+                        Tobler's hiking function; energy is a wheeled vehicle of constant power
+    directional         uphill is not downhill: a step costs by what it climbs along its way, instead of a cell by
+                        how steep it is; the planner grows whole trees then (strategy auto or full)
+    steep_factor        pace at `max_slope_deg` over the flat pace, for the linear and the quadratic rule
+    max_slope_deg       steeper ground is lethal
+    rough_per_m         share by which a metre of roughness (neighbours off the even slope) raises the pace
+    classes             whether what covers the ground (water, forest, rock ...) counts
+    class_factor        pace of a class relative to open ground, or "lethal", instead of the built-in factors
+    vehicle_radius_m    cells in whose middle a vehicle of this radius touches a lethal cell are lethal (inflation)
+    zones               parts of the terrain with a cost of their own, painted in order; forbidden ones last
     """
 
     flat_speed_m_per_s: Positive = 10.0
@@ -112,12 +129,15 @@ class CostConfig(Section, frozen=True, kw_only=True):
 class TargetConfig(Section, frozen=True, kw_only=True):
     """A target, or `count` alike. Ids are `name` for one, `name0, name1, ...` for several.
 
-    walk      still; random: a new heading now and then; waypoints: to random places by the cheapest way;
-              evade: away from the nearest vehicles; external: somebody else publishes its pose
-    tracker   always: its pose is published all the time; sighted: only vehicles that have it in sight tell where
-              it is, and planners go by what they saw last
-    caught    jump: a captured target turns up elsewhere; stay: it goes on as before
-    start     [row, col]; a random passable cell if not given
+    name           id of the target, or what the ids begin with
+    count          how many targets
+    walk           still; random: a new heading now and then; waypoints: to random places by the cheapest way;
+                   evade: away from the nearest vehicles; external: another process publishes its pose
+    speed_m_per_s  its speed on level open ground, elsewhere slower or faster as vehicles are
+    tracker        always: its pose is published all the time; sighted: only vehicles which see it tell where it is,
+                   and planners use the last sighting
+    caught         jump: a captured target goes on from another place; stay: it goes on from where it is
+    start          [row, col]; a random passable cell if not given
     """
 
     name: Name = "t"
@@ -132,11 +152,13 @@ class TargetConfig(Section, frozen=True, kw_only=True):
 class GroupConfig(Section, frozen=True, kw_only=True):
     """Vehicles that belong together.
 
-    targets  ids they may chase; all if empty
-    start    spread over the terrain, or clustered around one random place
-    cells    explicit [row, col] places for the first vehicles
-    reads    groups whose marks and positions its vehicles take in, besides their own; "*" is all
-    writes   groups that may take in its marks and positions; both must agree
+    name      id of the group; the ids of its authors begin with it
+    vehicles  how many vehicles
+    targets   ids of the targets that they may chase; all if empty
+    start     spread over the terrain, or clustered around one random place
+    cells     explicit [row, col] places for the first vehicles
+    reads     groups whose marks and positions its vehicles take in, besides their own; "*" is all
+    writes    groups that may take in its marks and positions; both must agree
     """
 
     name: Name = "all"
@@ -151,39 +173,40 @@ class GroupConfig(Section, frozen=True, kw_only=True):
 class VehicleConfig(Section, frozen=True, kw_only=True):
     """How vehicles behave.
 
+    per_agent         vehicles that one agent process hosts, at most
+    tick_hz           how often an agent moves its vehicles and publishes their positions
     sense_range_m     radius within which the simulated sensor sees the true ground
-    sighting_lasts_s  what they tell of a target that they saw ends by itself after so long
     capture_range_m   a target this near is captured
     route_cells       steps of a route asked for at a time; 0 is the whole route
-    claim_cells       cells ahead that a vehicle claims
-    patience_s        after so long without a step, it looks for a way around
-    reassign_s        how often it asks which target is the cheapest
-    hysteresis        another target must be cheaper by this share to be worth a change
+    reserve_cells     cells ahead that a vehicle reserves
+    patience_s        a vehicle that has not moved for this long looks for a way around
+    reassign_s        how often a vehicle asks which target is the cheapest
     """
 
     per_agent: Annotated[int, Meta(ge=1, le=1000)] = 25
     tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
     sense_range_m: Positive = 300.0
-    sighting_lasts_s: Positive = 30.0
     capture_range_m: Positive = 150.0
     route_cells: Annotated[int, Meta(ge=0)] = 0
-    claim_cells: Annotated[int, Meta(ge=1, le=16)] = 3
+    reserve_cells: Annotated[int, Meta(ge=1, le=16)] = 3
     patience_s: Positive = 1.0
     reassign_s: Positive = 5.0
-    hysteresis: NotNegative = 0.15
 
 
 class PlannerConfig(Section, frozen=True, kw_only=True):
     """How a planner keeps its tree.
 
-    edge           octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
-    length_weight  lambda of the paper's length-aware key, seconds per metre
-    k_min          smallest block exponent, as in the paper: the narrowest window of variable range is
-                   2**(k_min+1) + 1 cells wide; that of the other strategies 2**(k_min+3) + 1
-    full_every     rotation: a full growth every so many moves, on small maps sooner
-    cpu_budget     auto: share of one core that this planner may use
-    max_gap        rotation, auto: a served route whose certified gap exceeds this asks for a full growth
-    push_s         newer routes are pushed to a vehicle at most this often
+    strategy        what is grown again when the target has moved; auto chooses by `cpu_budget`
+    tick_hz         how often a planner follows its target and its map
+    edge            octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
+    neighbours      cells that one step reaches: 4, or 8 with the diagonal ones
+    corner_cutting  whether a diagonal step may pass the corner of a lethal cell
+    length_weight   lambda of the paper's length-aware key, seconds per metre
+    k_min           smallest block exponent, as in the paper: the narrowest window of variable range is
+                    2**(k_min+1) + 1 cells wide; that of the other strategies 2**(k_min+3) + 1
+    full_every      rotation: a full growth every so many moves, on small maps sooner
+    cpu_budget      auto: share of one core that this planner may use
+    push_s          newer routes are pushed to a vehicle at most this often
     """
 
     strategy: Strategy = "auto"
@@ -195,7 +218,6 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     k_min: Annotated[int, Meta(ge=0, le=12)] = 3
     full_every: Annotated[int, Meta(ge=1)] = 10
     cpu_budget: Annotated[float, Meta(gt=0, le=1)] = 0.1
-    max_gap: Annotated[float, Meta(ge=1)] = 1.5
     push_s: Positive = 1.0
 
 
@@ -204,27 +226,31 @@ class MapConfig(Section, frozen=True, kw_only=True):
 
     interest            all: agents hold all marks; near: those of the regions within interest_m of their vehicles
                         only. Planners, keepers and the monitor hold all
-    publish_hz          a tile's set is put at most this often by its author
-    digest_s            every replica tells this often what it holds
-    author_marks_per_s  who changes more cells than this for ten seconds is heard with delay, and named
-    total_marks_per_s   the same of all authors together; then those above an equal share of it wait
-    fold_after_s        an author of whom a keeper has heard nothing for so long is taken for dead, and what it said
-                        is folded with what other dead authors said; longer than a partition is likely to last
-    fold_keep_s         what was folded can be put back for so long
+    interest_m          near: distance up to which an agent holds marks around its vehicles
+    digest_s            every replica publishes this often which sets it holds
+    author_marks_per_s  an author which changes more cells than this for ten seconds is named, its sets delayed
+    total_marks_per_s   the same of all authors together: the sets of those above an equal share of it are delayed
+    compact_after_s     an author of which a keeper has heard nothing for so long counts as dead: its sets are
+                        compacted with those of other dead authors. Longer than a partition is likely to last
+    compact_keep_s      what compaction dropped can be put back for so long
     """
 
     interest: Literal["all", "near"] = "all"
     interest_m: Positive = 2000.0
-    publish_hz: Positive = 10.0
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0
-    fold_after_s: Positive = 60.0
-    fold_keep_s: Positive = 86_400.0
+    compact_after_s: Positive = 60.0
+    compact_keep_s: Positive = 86_400.0
 
 
 class TlsConfig(Section, frozen=True, kw_only=True):
-    """Mutual TLS: certificate files in PEM."""
+    """Mutual TLS: files in PEM, relative to the scenario.
+
+    ca           certificate of the authority that signed all others
+    certificate  certificate of this process
+    key          private key of this process
+    """
 
     ca: str
     certificate: str
@@ -234,10 +260,13 @@ class TlsConfig(Section, frozen=True, kw_only=True):
 class NetworkConfig(Section, frozen=True, kw_only=True):
     """Where processes meet.
 
-    listen   what the router listens on; beyond loopback it must be tls/ with certificates
-    connect  which routers the other processes connect to
-    peers    other routers that a router connects to
-    lease_s  a silent peer counts as gone after this
+    namespace          first chunk of all keys: runs in different ones do not hear each other
+    listen             endpoints of the router; beyond loopback they must be tls/ with certificates
+    connect            endpoints of the routers that the other processes connect to
+    peers              endpoints of other routers that a router connects to
+    lease_s            a peer that is silent for this long counts as gone
+    connect_timeout_s  a process that reaches no router for this long ends
+    tls                certificates, for endpoints beyond loopback
     """
 
     namespace: Name = "swarm"
@@ -250,20 +279,34 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
 
 
 class MonitorConfig(Section, frozen=True, kw_only=True):
-    """The live view. Ports are on loopback; 0 picks a free one."""
+    """The live view.
+
+    live       whether there is one, beside the recording
+    grpc_port  loopback port of the stream, for native viewers; 0 is any free one
+    web_port   loopback port of the page, for browsers; 0 is any free one
+    """
 
     live: bool = True
     grpc_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
     web_port: Annotated[int, Meta(ge=0, le=65535)] = 9090
-    frame_hz: Annotated[float, Meta(gt=0, le=60)] = 10.0
-    memory_mib: Annotated[int, Meta(ge=16)] = 256
 
 
 class Scenario(Section, frozen=True, kw_only=True):
     """One run, whole.
 
+    name        what reports call it
+    seed        decides roads, hidden obstacles, starts and walks; a simulated run is decided by it entirely
     seconds     how long the run lasts
     time_scale  seconds on the terrain per second of the run: motion is that much faster than real
+    terrain     where elevation and photo come from
+    cost        how terrain becomes pace
+    targets     what is chased
+    groups      which vehicles there are
+    vehicles    how vehicles behave
+    planner     how a planner keeps its tree
+    map         how the shared map is replicated
+    network     where processes meet
+    monitor     the live view
     """
 
     name: Name = "unnamed"
@@ -286,7 +329,7 @@ class Scenario(Section, frozen=True, kw_only=True):
 
     @property
     def untracked(self) -> frozenset[str]:
-        """Targets of which nobody knows more than vehicles see."""
+        """Targets whose poses are known from sightings only."""
         return frozenset(id for target in self.targets if target.tracker == "sighted" for id in ids_of(target))
 
     @property
@@ -295,13 +338,14 @@ class Scenario(Section, frozen=True, kw_only=True):
 
 
 def ids_of(target: TargetConfig) -> list[str]:
+    """Ids of a target: `name` for one, `name0, name1, ...` for several."""
     if target.count == 1:
         return [target.name]
     return [f"{target.name}{n}" for n in range(target.count)]
 
 
 class AgentPlan(msgspec.Struct, frozen=True):
-    """Which vehicles an agent process hosts: `count` of a group, from its `first` on."""
+    """The vehicles that one agent process hosts: `count` of a group, from its `first` on."""
 
     id: str
     group: GroupConfig

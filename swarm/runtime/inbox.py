@@ -9,41 +9,56 @@ from collections.abc import Hashable
 from swarm.bus.bus import Event, Heard, HeardMany
 
 _UNREAD_BATCHES = 2
+"""Unread batches beyond which `post` blocks: one to be read while the next is decoded."""
 
 
 class Inbox:
-    """Events from any thread to the one that owns the state.
+    """A queue of events from any thread to the one that owns the state.
 
-    Of topics whose samples each say everything (`Topic.newest`) only the newest per key is kept, in the place of
-    the oldest unread one; so a slow reader is late, but never behind by more than one value per key.
+    Of topics whose samples each carry the whole state of their key (`Topic.newest`) only the newest per key is
+    kept, in the place of the oldest unread one: a slow reader is behind by at most one value per key. All other
+    events are kept, in order. Batches (`HeardMany`) are bounded by blocking their poster.
     """
 
     def __init__(self) -> None:
-        # A lock that a poster lets go of wakes the owner in half the time that a Condition takes.
-        self._lock = threading.RLock()  # re-entrant, because `wake` may interrupt its holder as a signal handler
+        self._lock = threading.RLock()
+        """Guards all below. Re-entrant, because `wake` may interrupt its holder as a signal handler."""
         self._bell = threading.Lock()
+        """Held while there is nothing to wake for. `take` waits for it and a poster releases it, which wakes the
+        owner in half the time that a Condition takes."""
         self._bell.acquire()
         self._asleep = False
-        self._room = threading.Event()
+        """Whether `take` waits for the bell; whoever sets it to false releases the bell."""
+        self._batch_taken = threading.Event()
+        """Set when a batch is taken, and when the inbox closes."""
         self._unread_batches = 0
+        """`HeardMany` events posted and not yet taken."""
         self._closed = False
+        """Set by `close`, for good."""
         self._order: deque[Hashable] = deque()
+        """Keys of `_events` in the order of taking."""
         self._events: dict[Hashable, Event | BaseException] = {}
+        """Unread events: by topic and fields where only the newest counts, else by number."""
         self._next = 0
+        """Number of the event last posted without a key."""
         self.superseded = 0
+        """Samples replaced unread by a newer one, since the start."""
 
     def post(self, event: Event) -> None:
-        """Leave an event. Who brings many samples waits here until the owner has kept up, so that what comes faster
-        than it is read stays in the bus's own buffer, whose oldest go first."""
+        """Add an event, from any thread.
+
+        With a `HeardMany` it blocks the caller while more than two batches are unread. The bus then drops its
+        oldest samples instead of this inbox growing.
+        """
         if isinstance(event, HeardMany):
             with self._lock:
                 self._unread_batches += 1
                 self._put(event, None)
             while True:
-                self._room.clear()
+                self._batch_taken.clear()
                 if self._unread_batches <= _UNREAD_BATCHES or self._closed:
                     break
-                self._room.wait()
+                self._batch_taken.wait()
         else:
             self._put(event, _newest_key(event))
 
@@ -65,13 +80,14 @@ class Inbox:
             self._ring()
 
     def take(self, timeout_s: float) -> Event | None:
-        """The oldest event; None if there is none within the timeout. Raises what `fail` was given."""
+        """The oldest event; None if there is none within the timeout. Raises the error that `fail` was given, in
+        its turn. Called by the owner only."""
         with self._lock:
             self._asleep = not self._order and timeout_s > 0
             asleep = self._asleep
         if asleep and not self._bell.acquire(timeout=timeout_s):
             with self._lock:
-                if not self._asleep:  # it rang just now
+                if not self._asleep:  # a poster released the bell between the timeout and this line
                     self._bell.acquire()
                 self._asleep = False
         with self._lock:
@@ -81,20 +97,20 @@ class Inbox:
         if isinstance(event, HeardMany):
             with self._lock:
                 self._unread_batches -= 1
-            self._room.set()
+            self._batch_taken.set()
         if isinstance(event, BaseException):
             raise event
         return event
 
     def wake(self) -> None:
-        """Make the owner look up, from any thread and from a signal handler."""
+        """End a `take` that waits, from any thread and from a signal handler."""
         with self._lock:
             self._ring()
 
     def close(self) -> None:
-        """Nobody takes any more: whoever waits for that goes on."""
+        """There are no more takes: `post` does not block from now on."""
         self._closed = True
-        self._room.set()
+        self._batch_taken.set()
 
     def _ring(self) -> None:
         if self._asleep:

@@ -1,6 +1,10 @@
-"""What every process does besides its work: says that it is alive, which run it belongs to, and what it counted."""
+"""What every process does besides its work: shows that it is alive, which run it belongs to, and what it
+counted."""
 
 from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
 
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
@@ -11,31 +15,47 @@ from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS
 
+log = logging.getLogger(__name__)
+
 ROUTER = "router"
+NO_RUN = ""
+"""The run id of what belongs to no run: a router passes on everybody's messages."""
 _TAG = "run-check"
+_MOST_STRANGERS = 256
 
 
 class Member:
     """One process's membership in a run.
 
     A process asks everybody which run they belong to when it starts, whenever a link comes back and whenever a
-    router appears, as behind it there may be others; it ends with RunMismatchError if anybody's run or terrain
-    differs from its own.
+    router appears, as behind it there may be others. Two processes belong together when run id and terrain digest
+    are the same. Nobody ends because of what another says: a process ends, with RunMismatchError, only while no
+    other has confirmed that it belongs, and then when somebody answers and nobody agrees. Once it is confirmed, who
+    differs is a stranger: counted, and named once.
     """
 
     def __init__(self, info: RunInfo, bus: Bus, post: Post) -> None:
         self.info = info
         self.counters = Counters()
+        """All that this process counts; never reset."""
         self._bus = bus
         self._post = post
         self._stats_due_ns = 0
+        # Whether another process of this run has ever answered: from then on nobody's word ends this one.
+        self._confirmed = info.run_id == NO_RUN
+        # What the round of answers that is coming in has told: the first that differs, in words.
+        self._differs: RunMismatchError | None = None
+        # Who was named already, and sentences that the next tick tells.
+        self._strangers: set[Peer] = set()
+        self._to_name: list[str] = []
 
     @property
     def peer(self) -> Peer:
         return Peer(self.info.role, self.info.id, self.info.incarnation)
 
     def join(self) -> None:
-        """Serve our run, then ask for the others': of two that start at once, at least one notices."""
+        """Serve our run, then ask for those of others, in this order: of two processes that start at once at least
+        one hears the other. Called once."""
         self._bus.serve(RUN, self._post, role=self.info.role, id=self.info.id)
         self._bus.watch_links(self._post)
         self._bus.watch_alive(self._post, role=ROUTER)
@@ -43,16 +63,19 @@ class Member:
         self._ask()
 
     def handle(self, event: Event) -> bool:
-        """True if the event was about membership. Raises RunMismatchError."""
+        """Whether the event was about membership only and is done with. Raises RunMismatchError."""
         match event:
             case Asked(topic=topic) if topic is RUN:
                 event.answer(self.info)
                 event.end()
                 return True
             case Replied(tag=tag, message=RunInfo() as other) if tag == _TAG:
-                check_same_run(self.info, other)
+                self._compare(other)
                 return True
             case AskEnded(tag=tag) if tag == _TAG:
+                differs, self._differs = self._differs, None
+                if differs is not None and not self._confirmed:
+                    raise differs
                 return True
             case Appeared(peer=Peer(role=role)) if role == ROUTER:
                 self._post(LinkChanged(up=True, beyond=True))
@@ -61,16 +84,20 @@ class Member:
                 return True
             case LinkChanged(up=True):
                 self._ask()
-                return False  # replicas want to know, too
+                return False  # replicas compare what they hold when a link comes back
         return False
 
     def tick(self, now_ns: int) -> None:
-        """Publish the counters once a second."""
+        """Name new strangers; publish the counters once a second."""
+        for sentence in self._to_name:
+            self.note(now_ns, "stranger", sentence)
+        self._to_name.clear()
         if now_ns >= self._stats_due_ns:
             self._stats_due_ns = now_ns + NS_PER_S
             self.publish_stats(now_ns)
 
     def publish_stats(self, now_ns: int) -> None:
+        """Publish the counters now: the last time when the service stops."""
         counts = {**self.counters.counts, **self._bus.counts}
         stats = Stats(
             role=self.info.role,
@@ -84,17 +111,49 @@ class Member:
         self._bus.publish(STATS, stats, role=self.info.role, id=self.info.id)
 
     def note(self, now_ns: int, kind: str, text: str, cell: int | None = None) -> None:
-        """Tell whoever watches."""
+        """Publish a sentence for people who watch the run."""
         info = self.info
         note = Note(role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text, cell=cell)
         self._bus.publish(NOTE, note, role=info.role, id=info.id)
+
+    def _compare(self, other: RunInfo) -> None:
+        peer = Peer(other.role, other.id, other.incarnation)
+        if NO_RUN in (self.info.run_id, other.run_id) or peer == self.peer:
+            return
+        try:
+            check_same_run(self.info, other)
+        except RunMismatchError as error:
+            self._differs = self._differs or error
+            if peer not in self._strangers and len(self._strangers) < _MOST_STRANGERS:
+                self._strangers.add(peer)
+                self.counters.count("strangers")
+                if self._confirmed:
+                    log.warning("%s", error)
+                    self._to_name.append(str(error))
+        else:
+            self._confirmed = True
 
     def _ask(self) -> None:
         self._bus.ask(RUN, Nothing(), self._post, tag=_TAG, timeout_s=2.0)
 
 
+def check_belongs(mine: RunInfo, others: Iterable[RunInfo]) -> None:
+    """Raises RunMismatchError, in words, where somebody answers and nobody belongs to the same run."""
+    differs: RunMismatchError | None = None
+    for other in others:
+        if other.run_id == NO_RUN:
+            continue
+        try:
+            check_same_run(mine, other)
+            return
+        except RunMismatchError as error:
+            differs = differs or error
+    if differs is not None:
+        raise differs
+
+
 def check_same_run(mine: RunInfo, other: RunInfo) -> None:
-    """Raises RunMismatchError, in words, where two processes must not share a namespace."""
+    """Raise RunMismatchError, with a sentence on the difference, where two processes must not share a namespace."""
     who = f"{other.role} {other.id}"
     if other.run_id != mine.run_id:
         raise RunMismatchError(

@@ -1,4 +1,5 @@
-"""The loop of a process: an inbox, a tick, signals. One thread owns a service's state; everybody else posts."""
+"""The loop of a process: an inbox, a tick, signals. One thread owns a service's state; all others post to the
+inbox."""
 
 from __future__ import annotations
 
@@ -20,26 +21,34 @@ log = logging.getLogger(__name__)
 
 
 class Service(Protocol):
-    """A role's shell: turns events into calls of its core, and its core's actions into calls of the bus."""
+    """A role's shell: turns events into calls of its core, and its core's actions into calls of the bus.
+
+    All methods are called by one thread, one at a time. An error that one raises ends the process.
+    """
 
     @property
     def counters(self) -> Counters: ...
 
     def start(self, now_ns: int) -> None:
-        """Subscribe, serve, raise the token. Called once, on the thread that owns the service."""
+        """Subscribe, serve, raise the token. Called once, before all others."""
         ...
 
-    def handle(self, event: Event, now_ns: int) -> None: ...
+    def handle(self, event: Event, now_ns: int) -> None:
+        """React to one event."""
+        ...
 
-    def tick(self, now_ns: int) -> None: ...
+    def tick(self, now_ns: int) -> None:
+        """Do what is due by time. Called `tick_hz` times a second, less often under load."""
+        ...
 
     def stop(self, now_ns: int) -> None:
-        """Last words before the bus is closed."""
+        """Publish what must not be lost. Called once, after all others; the bus is closed after it."""
         ...
 
 
 class ThreadWorker:
-    """One thread beside the process's own. Kernels release the interpreter lock, so both make progress."""
+    """A `Worker` on one thread. Kernels release the interpreter's lock, so the process goes on meanwhile. An error
+    in a job is raised in the process's own thread, by its next `take`."""
 
     def __init__(self, name: str, inbox: Inbox, clock: Clock) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix=name)
@@ -64,7 +73,10 @@ class ThreadWorker:
 
 
 class Process:
-    """Runs one service until it is told to stop."""
+    """Runs one service until `stop`.
+
+    tick_hz  ticks a second; those that come too late are dropped and counted
+    """
 
     def __init__(self, service: Service, inbox: Inbox, clock: Clock, tick_hz: float) -> None:
         self._service = service
@@ -72,44 +84,54 @@ class Process:
         self._clock = clock
         self._tick_ns = int(NS_PER_S / tick_hz)
         self._stopping = False
+        """Set by `stop` from any thread, for good; read after each event."""
         self._signals: tuple[signal.Signals, ...] = ()
+        """Signals handled by `stop`; ignored once the loop has ended."""
 
     def stop(self) -> None:
-        """From any thread, and from a signal handler: so no lock that the interrupted thread might hold."""
+        """End the loop after the event in hand. Callable from any thread and, as its lock is re-entrant, from a
+        signal handler."""
         self._stopping = True
         self._inbox.wake()
 
     def stop_on_signals(self) -> None:
-        """SIGTERM and SIGINT end the loop after the event in hand. Call on the main thread, and run there."""
+        """Let SIGTERM and SIGINT call `stop`. Call it on the main thread, and `run` too."""
         self._signals = (signal.SIGTERM, signal.SIGINT)
         for number in self._signals:
             signal.signal(number, lambda *_: self.stop())
 
     def run(self) -> None:
-        """Start, loop, stop. A tick that comes late is taken once and the missed ones are dropped."""
+        """Start the service, loop, stop it. Of ticks that are late one is taken and the others are counted as
+        dropped. Raises what the service or a worker's job raised, after stopping the service.
+
+        Ticks and events share the thread: while events wait, they get at least as long as the last tick took before
+        the next one is taken. So a tick that takes its whole period halves its rate and starves nobody.
+        """
         counters = self._service.counters
         counters.count("ticks_dropped", 0)
         self._service.start(self._clock.now_ns())
-        gc.freeze()  # what lives as long as we do is not looked through again and again while somebody waits
-        due_ns = self._clock.now_ns()
+        gc.freeze()  # terrain and kernels live to the end: a collection in the middle of a tick need not scan them
+        due_ns = events_until_ns = self._clock.now_ns()
         try:
             while not self._stopping:
                 now_ns = self._clock.now_ns()
-                if now_ns >= due_ns:
+                if now_ns >= due_ns and (now_ns >= events_until_ns or not len(self._inbox)):
                     missed = (now_ns - due_ns) // self._tick_ns
                     if missed:
                         counters.count("ticks_dropped", missed)
                     due_ns += (missed + 1) * self._tick_ns
                     self._service.tick(now_ns)
-                    counters.observe("tick_ms", (self._clock.now_ns() - now_ns) / 1e6)
+                    took_ns = self._clock.now_ns() - now_ns
+                    events_until_ns = now_ns + 2 * took_ns
+                    counters.observe("tick_ms", took_ns / 1e6)
                     counters.gauge("inbox", float(len(self._inbox)))
-                # Bounded, because a signal handler cannot interrupt a wait that nobody notifies.
+                # Bounded, because a signal handler does not interrupt a wait for a lock.
                 wait_s = min((due_ns - self._clock.now_ns()) / NS_PER_S, 0.5)
                 event = self._inbox.take(wait_s)
                 if event is not None:
                     self._service.handle(event, self._clock.now_ns())
         finally:
-            # We are ending: another signal, as late as in the end of Python itself, must not kill us half-way.
+            # A second signal must not interrupt the end, not even that of the interpreter.
             for number in self._signals:
                 signal.signal(number, signal.SIG_IGN)
             self._inbox.close()
@@ -117,7 +139,7 @@ class Process:
 
 
 def end_with(parent_gone: Callable[[], object], stop: Callable[[], None], grace_s: float = 3.0) -> None:
-    """Watch for the end of the parent on a thread: then stop, and after a grace period end without asking.
+    """Stop when the parent process ends; after `grace_s` more seconds end this process with exit code 1.
 
     parent_gone  blocks until the parent is gone, as `wait([parent_process().sentinel])` does
     """

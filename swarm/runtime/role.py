@@ -1,4 +1,4 @@
-"""What a role is started with, the same for every role, live or simulated."""
+"""What a process is started with: the same for every role, live or simulated."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ class RoleSetup:
     """One process of a run.
 
     incarnation  nanoseconds at its start: a later start of the same (role, id) has a larger one
+    started_ns   start of the run
     run_dir      where this machine keeps the run: prepared terrain, the keeper's store, logs; None if nowhere
     """
 
@@ -27,6 +28,7 @@ class RoleSetup:
     run_dir: Path | None = None
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
+        """What this process answers when others ask which run it belongs to."""
         return RunInfo(
             run_id=self.run_id,
             role=self.role,
@@ -42,5 +44,5 @@ class RoleSetup:
 
     @property
     def author(self) -> str:
-        """Name under which this incarnation writes marks: nobody else ever writes under it."""
+        """Name under which this incarnation writes marks. No other process or incarnation has the same."""
         return f"{self.id}.{self.incarnation:x}"

@@ -25,14 +25,14 @@ class Histogram:
         self.buckets: dict[int, int] = dict(buckets or {})
 
     def add(self, value: float, times: int = 1) -> None:
-        """Count a value: what is not positive as zero, what is not finite not at all."""
+        """Count a value. Zero and below count as zero; infinities and NaN are ignored."""
         if not math.isfinite(value):
             return
         bucket = ZERO_BUCKET if value <= 0 else min(round(math.log(value) / _LOG_BASE), TOP_BUCKET)
         self.buckets[bucket] = self.buckets.get(bucket, 0) + times
 
     def add_all(self, values: NDArray[np.float64]) -> None:
-        """As `add`, of many."""
+        """As `add` of each."""
         values = values[np.isfinite(values)]
         positive = values[values > 0]
         found = np.minimum(np.rint(np.log(positive) / _LOG_BASE), TOP_BUCKET).astype(np.int64)
@@ -42,6 +42,7 @@ class Histogram:
             self.merge({ZERO_BUCKET: values.size - positive.size})
 
     def merge(self, buckets: Mapping[int, int]) -> None:
+        """Add the counts of another histogram's buckets."""
         for bucket, count in buckets.items():
             self.buckets[bucket] = self.buckets.get(bucket, 0) + count
 
@@ -50,7 +51,7 @@ class Histogram:
         return sum(self.buckets.values())
 
     def quantile(self, q: float) -> float | None:
-        """The value below which a share `q` of all values lies; None of nothing."""
+        """The value below which a share `q` of all values lies, within 2 %; None if there are none."""
         total = self.count
         if total == 0:
             return None
@@ -63,6 +64,7 @@ class Histogram:
         raise AssertionError("unreachable")
 
     def mean(self) -> float | None:
+        """The mean within 2 %; None if there are no values."""
         total = self.count
         if total == 0:
             return None
@@ -75,7 +77,7 @@ def _value(bucket: int) -> float:
 
 
 def merged(parts: Iterable[Mapping[int, int]]) -> Histogram:
-    """One histogram of many processes'."""
+    """The histogram of all values of many processes, from their buckets."""
     whole = Histogram()
     for part in parts:
         whole.merge(part)
@@ -83,7 +85,10 @@ def merged(parts: Iterable[Mapping[int, int]]) -> Histogram:
 
 
 class Counters:
-    """What a process counts, gauges and times, by name. Names carry units: `route_query_ms`."""
+    """What a process counts, measures and times, by name. Names carry units: `route_query_ms`.
+
+    Used by the thread that owns the service only; published by `Member` and never reset.
+    """
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
@@ -94,13 +99,14 @@ class Counters:
         self.counts[name] = self.counts.get(name, 0) + by
 
     def gauge(self, name: str, value: float) -> None:
-        """Note the present value; what is not finite is no value."""
+        """Set the present value; infinities and NaN remove it."""
         if math.isfinite(value):
             self.gauges[name] = value
         else:
             self.gauges.pop(name, None)
 
     def observe(self, name: str, value: float) -> None:
+        """Add a value to a histogram."""
         self.histograms.setdefault(name, Histogram()).add(value)
 
     def observe_all(self, name: str, values: NDArray[np.float64]) -> None:

@@ -1,1 +1,1 @@
-"""What travels: messages, their fields and columns, keys, and the codec at the door."""
+"""What travels between processes: messages, their fields and columns, topics and keys, and the codec."""

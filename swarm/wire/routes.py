@@ -1,4 +1,4 @@
-"""Routes: one by one as people and vehicles read them, and many at once as arrays and as columns on the wire."""
+"""Routes: one as vehicles follow it, many as arrays, and many as columns on the wire."""
 
 from __future__ import annotations
 
@@ -17,25 +17,28 @@ from swarm.wire.fields import Cell, check_column, check_directions, column, pack
 
 
 class RouteStatus(enum.StrEnum):
+    """Whether a planner has a route from a cell, and why not."""
+
     OK = "ok"
     UNREACHABLE = "unreachable"
     OUTSIDE = "outside"
     LETHAL_START = "lethal_start"
     NO_TARGET = "no_target"
-    """The planner has not heard yet where the target is, or it stands on a lethal or outside cell."""
+    """The planner does not know yet where the target is, or it stands on a lethal cell or outside."""
 
 
 STATUSES = tuple(RouteStatus)
-"""Columns hold a status as its index in here."""
+"""Columns hold the index of a status in this tuple."""
 OK, UNREACHABLE, OUTSIDE, LETHAL_START, NO_TARGET = range(len(STATUSES))
 
 
 class Route(msgspec.Struct, frozen=True, kw_only=True):
-    """One route. `directions` holds one code 0..7 a step, clockwise from north.
+    """One route. `directions` holds one code 0..7 per step, clockwise from north.
 
     cost_s         travel time of the whole route, as driven along its cells
-    lower_bound_s  proven: no route from `start` can be quicker at this moment
-    length_m       of the part given; remaining_s is the cost-to-go after it, 0 at the target
+    lower_bound_s  proven: no route from `start` is quicker on the planner's present map
+    length_m       length of the steps given
+    remaining_s    cost-to-go after them, 0 at the target
     """
 
     status: RouteStatus
@@ -53,7 +56,7 @@ class Route(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def gap(self) -> float:
-        """Cost over proven optimum, 1 where the route is proven optimal."""
+        """Cost over lower bound: 1 is proven optimal, inf is nothing proven. 1 where there is no route."""
         if self.status is not RouteStatus.OK or self.lower_bound_s >= self.cost_s:
             return 1.0
         return self.cost_s / self.lower_bound_s if self.lower_bound_s > 0 else math.inf
@@ -61,7 +64,7 @@ class Route(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class RouteBatch:
-    """Many routes as arrays: what `Route` says of one, of each.
+    """Many routes as arrays, with the fields of `Route`.
 
     statuses    uint8    index into STATUSES
     starts      int64    cell
@@ -122,7 +125,7 @@ class RouteBatch:
 
     @property
     def gaps(self) -> NDArray[np.float64]:
-        """Cost over proven optimum of the routes there are; inf where nothing is proven."""
+        """As `Route.gap`, of the routes whose status is OK, float64."""
         found = self.statuses == OK
         cost, bound = self.cost_s[found], self.lower_bound_s[found]
         gaps = np.ones(cost.size)
@@ -131,6 +134,7 @@ class RouteBatch:
         return gaps
 
     def columns(self) -> Routes:
+        """As on the wire."""
         return Routes(
             statuses=self.statuses.tobytes(),
             starts=pack_column(self.starts, "<i8"),
@@ -141,11 +145,11 @@ class RouteBatch:
 
 
 class Routes(msgspec.Struct, frozen=True, kw_only=True, dict=True):
-    """Many routes, as columns: what `Route` says of one, of each.
+    """Many routes as columns, with the fields of `Route`.
 
-    statuses    uint8    RouteStatus, by its place in the list of values
+    statuses    uint8    RouteStatus, as its index
     starts      int64    cell, -2^31 ... 2^32 - 1
-    steps       uint32   how many steps are given
+    steps       uint32   number of steps given
     directions  of all routes, one after the other: eight steps in three bytes, the first in the lowest three bits
     cost_s, lower_bound_s, length_m, remaining_s  float64
     """
@@ -178,7 +182,7 @@ class Routes(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 
     @cached_property
     def batch(self) -> RouteBatch:
-        """As arrays; read-only ones."""
+        """As read-only arrays, made once."""
         ends = np.cumsum(column(self.steps, "<u4"), dtype=np.int64)
         many = int(ends[-1]) if ends.size else 0
         return RouteBatch(

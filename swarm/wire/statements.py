@@ -1,4 +1,4 @@
-"""What the columns of a set of marks may hold, checked for one set or for thousands at once."""
+"""The statements of mark sets: their kinds and times, and the rules of their columns, for one set or for many."""
 
 from __future__ import annotations
 
@@ -14,30 +14,32 @@ from swarm.wire.fields import check_column, column
 TILE_AREA = TILE_CELLS * TILE_CELLS
 
 STAMP_LIMIT_NS = 1 << 62
-"""Marks stamped from here on (year 2116) are refused by everybody alike, so that there is always a newer stamp."""
+"""Marks stamped from here on (year 2116) are rejected by all processes, so that there is always a newer stamp."""
 
 FOREVER = (1 << 63) - 1
-"""The end of a mark that does not end by itself."""
+"""`until_ns` of a mark that does not expire."""
 
 
 class MarkKind(enum.IntEnum):
+    """What a mark states about a cell."""
+
     PACE = 0
-    """The cell can be driven at this pace."""
+    """It can be driven at this pace, in s/m."""
     LETHAL = 1
-    """The cell must not be entered."""
+    """It must not be entered."""
     CLEAR = 2
-    """The cell is as the prior map says: undoes an older mark."""
+    """It is as the prior map has it: undoes older marks."""
 
 
 LAST_KIND = int(max(MarkKind))
 _FEW = 100
-"""Up to so many statements, as most sets have, lists are checked several times faster than arrays."""
+"""Up to this many statements, which most sets have, lists are checked several times faster than arrays."""
 
 
 def check_lengths(
     count: int, cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes, untils_ns: bytes = b""
 ) -> None:
-    """Raises ValueError unless these are columns of `count` statements; `untils_ns` may be missing."""
+    """Raise ValueError unless these are columns of `count` statements; `untils_ns` may be empty."""
     if (
         len(kinds) == count
         and len(cells) == 2 * count
@@ -55,7 +57,7 @@ def check_lengths(
 
 
 def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes) -> None:
-    """Raises ValueError with the rule that one set's columns, one or more statements long, break."""
+    """Raise ValueError with the rule that the columns of one set break. It has one or more statements."""
     if max(kinds) > LAST_KIND:
         raise ValueError(f"kind {max(kinds)} is not in 0..{LAST_KIND}")
     if len(kinds) > _FEW:
@@ -85,7 +87,7 @@ def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes)
 def faulty_sets(
     counts: NDArray[np.int64], cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes
 ) -> NDArray[np.int64]:
-    """Which of many sets break a rule of `check_statements`: their numbers, in order.
+    """Numbers of the sets that break a rule of `check_statements`, in order.
 
     counts  int64 (sets,)  statements of each set; the columns hold those of all sets, one set after the other
     """

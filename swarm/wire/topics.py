@@ -1,5 +1,5 @@
-"""Every key expression of the wire, with its message, rate and quality of service. `docs/wire.md` is made
-of this."""
+"""The topics: every key of the wire with its message, rate and quality of service. `docs/wire.md` is made of
+them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Claims, Fleet, Followed, Grounds
+from swarm.wire.messages.vehicles import Fleet, Followed, Reservations, TerritoryReply, TerritoryRequest
 
 
 class Priority(Enum):
-    """Zenoh's priorities that we use."""
+    """The priorities of Zenoh that topics use."""
 
     INTERACTIVE = "interactive"
     DATA = "data"
@@ -36,14 +36,18 @@ class Priority(Enum):
 
 @dataclass(frozen=True)
 class Topic:
-    """One row of the wire.
+    """One topic.
 
-    key       template below the namespace; `{name}` stands for one chunk
-    message   what is put, or what a query is answered with
-    request   for a queryable: what is asked; None for a topic that is only published
-    bulk      for a queryable: what may carry many values in one reply, to those who ask for it so
-    newest    each value says all there is under its key, so a reader may skip to the newest
-    buffer    samples that a slow reader keeps; the oldest are dropped first
+    key        template below the namespace; `{name}` stands for one chunk
+    message    what is put, or what a query is answered with
+    what       its meaning, for `docs/wire.md`
+    rate       how often it is put or asked, for `docs/wire.md`
+    request    for a queryable: what is asked; None for a topic that is only published
+    bulk       for a queryable: a message that carries many values, if the request asks for it
+    published  whether values are put, not only answered
+    newest     each value carries the whole state of its key, so a reader may skip to the newest
+    buffer     samples that wait for a slow reader; the oldest are dropped first
+    fields     names of the chunks in `key`, in order
     """
 
     name: str
@@ -66,7 +70,7 @@ class Topic:
         object.__setattr__(self, "_pattern", re.compile(pattern))
         for message_type in (self.message, self.request, self.bulk):
             if message_type is not None:
-                prime(message_type)  # before there are threads to meet it half described
+                prime(message_type)  # on one thread, before others decode it
         object.__setattr__(self, "fields", tuple(re.findall(r"{(\w+)}", self.key)))
         said_twice = tuple(name for name in self.fields if name in self.message.__struct_fields__)
         object.__setattr__(self, "_said_twice", said_twice)
@@ -74,7 +78,7 @@ class Topic:
     def every(self, fields: Mapping[str, str | int]) -> dict[str, str]:
         """All fields as chunks of a key; those not given become `*`.
 
-        Raises TypeError on a field that the topic has not, ValueError on what is not one chunk.
+        Raises TypeError on an unknown field, ValueError on a value that is not one chunk.
         """
         named = {name: _chunk(fields[name]) if name in fields else "*" for name in self.fields}
         if len(fields) > len(named) or any(name not in named for name in fields):
@@ -83,7 +87,7 @@ class Topic:
         return named
 
     def one(self, fields: Mapping[str, str | int]) -> dict[str, str]:
-        """All fields of one value: every one must be given, and none may be a wildcard."""
+        """All fields of one value, without wildcards. Raises TypeError on a missing one, and as `every`."""
         named = self.every(fields)
         for name, chunk in named.items():
             if chunk == "*":
@@ -91,23 +95,23 @@ class Topic:
         return named
 
     def expression(self, namespace: str, **fields: str | int) -> str:
-        """The key expression: fields that are not given become `*`."""
+        """The key expression for these fields; those not given become `*`. Raises as `every`."""
         return f"{namespace}/{self.key.format(**self.every(fields))}"
 
     def keyed(self, namespace: str, **fields: str | int) -> str:
-        """The key of one value."""
+        """The key of one value. Raises as `one`."""
         return f"{namespace}/{self.key.format(**self.one(fields))}"
 
     def parse(self, namespace: str, key: str) -> dict[str, str] | None:
-        """The fields of a key, None of a key that is not this topic's."""
+        """The fields of a key; None if it is not a key of this topic."""
         if not key.startswith(namespace + "/"):
             return None
         match = self._pattern.fullmatch(key, len(namespace) + 1)
         return match.groupdict() if match else None
 
     def check_key(self, fields: Mapping[str, str], message: Message) -> None:
-        """Raise ProtocolError where a message that was put says it is another's than its key says: access is
-        granted by key, so nobody may speak for somebody else under its own."""
+        """Raise ProtocolError on a message with a field that differs from its key. Routers grant access by key, so
+        the key decides who a sender is."""
         for name in self._said_twice:
             said = str(getattr(message, name))
             if said != fields[name]:
@@ -150,15 +154,15 @@ BASE_TILES = Topic(
 FLEET = Topic(
     "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
 )  # fmt: skip
-CLAIMS = Topic(
-    "claims", "claims/{agent}", Claims,
-    "which cells vehicles hold and want, for neighbours and witnesses; who heard an agent answers with its last",
+RESERVATIONS = Topic(
+    "reservations", "reservations/{agent}", Reservations,
+    "which cells vehicles hold and request; an agent answers with its own and the newest of those that died",
     "every tick, on change", request=Nothing, priority=Priority.INTERACTIVE,
 )  # fmt: skip
-GROUNDS = Topic(
-    "grounds", "grounds/{agent}", Grounds,
-    "in which plots agents claim cells: asked of all before one is entered", "on change", request=Grounds,
-    published=False, priority=Priority.INTERACTIVE,
+TERRITORY = Topic(
+    "territory", "territory/{agent}", TerritoryReply,
+    "in which plots agents reserve cells: asked of all before one is entered", "on change",
+    request=TerritoryRequest, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
@@ -198,7 +202,7 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CLAIMS, GROUNDS, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, RESERVATIONS, TERRITORY, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED,
     TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
 )  # fmt: skip
 

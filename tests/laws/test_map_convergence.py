@@ -1,6 +1,6 @@
 """How soon replicas are equal again after loss, partitions and coming and going, on the memory bus, seeded.
 
-By hand, as in docs/map-figures.md: `python tests/laws/test_map_convergence.py`"""
+By hand, as in docs/map-figures.md: `PYTHONPATH=.:tests python tests/laws/test_map_convergence.py`"""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from support.map_strategies import FeedService, LossyLinks, MapSwarm
+from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
@@ -19,14 +19,14 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.wire.statements import MarkKind
 
 STEP_S = 0.1
-Services = Sequence[FeedService | KeeperService]
+Services = Sequence[SyncService | KeeperService]
 
 
 def equal(services: Services) -> bool:
-    return len({service.replica.fingerprint() for service in services}) == 1
+    return len({service.replica.held.fingerprint() for service in services}) == 1
 
 
-def until_equal_s(swarm: MapSwarm, services: Services, at_most_s: float = 60.0) -> float:
+def until_equal_s(swarm: SwarmModel, services: Services, at_most_s: float = 60.0) -> float:
     waited_s = 0.0
     while not equal(services):
         assert waited_s < at_most_s, "not equal in time"
@@ -35,21 +35,21 @@ def until_equal_s(swarm: MapSwarm, services: Services, at_most_s: float = 60.0) 
     return round(waited_s, 1)
 
 
-def scribble(swarm: MapSwarm, chance: random.Random, author: FeedService, marks: int) -> None:
+def scribble(swarm: SwarmModel, chance: random.Random, author: SyncService, marks: int) -> None:
     """Say something about cells of one place, as a vehicle does."""
     grid = swarm.terrain.grid
     row, col = chance.randrange(grid.rows), chance.randrange(grid.cols)
     near = [(row + chance.randrange(32), col + chance.randrange(32)) for _ in range(marks)]
     cells = [grid.cell(min(r, grid.rows - 1), min(c, grid.cols - 1)) for r, c in near]
     kinds = [chance.choice((MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE)) for _ in cells]
-    author.feed.publish(author.replica.write(cells, kinds, 2.0, swarm.now_ns))
+    author.sync.publish(author.replica.write(cells, kinds, 2.0, swarm.now_ns))
 
 
 def after_loss_s(seed: int) -> float:
     """4 authors, a planner and a keeper write for 10 s at 30 % lost, 10 % doubled, 500 ms jitter; then quiet, with
     the links as bad as before."""
     chance = random.Random(seed)
-    swarm = MapSwarm(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
+    swarm = SwarmModel(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     authors = [swarm.writer(f"a{n}.1") for n in range(4)]
     listener = swarm.listener("p")
@@ -63,7 +63,7 @@ def after_partition_s(seed: int) -> float:
     """Writes on both sides of a partition of 30 s; from its healing on."""
     chance = random.Random(seed)
     links = LossyLinks(seed)
-    swarm = MapSwarm(links)
+    swarm = SwarmModel(links)
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     authors = [swarm.writer(f"a{n}.1") for n in range(4)]
     listener = swarm.listener("p")
@@ -79,11 +79,13 @@ def after_partition_s(seed: int) -> float:
 def lost_while_coming_and_going(seed: int, marks: int, agents: int = 6) -> dict[str, float]:
     """Agents start, write and are killed all the time; at the end nothing that any of them published is missing."""
     chance = random.Random(seed)
-    swarm = MapSwarm(LossyLinks(seed, dropped=0.02, jitter_ms=20), terrain_of_pace(np.ones((512, 512), np.float32)))
+    swarm = SwarmModel(
+        LossyLinks(seed, dropped=0.02, jitter_ms=20), terrain_of_pace(np.ones((512, 512), np.float32))
+    )
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     listener = swarm.listener("p")
-    living: dict[str, FeedService] = {}
-    said: dict[str, FeedService] = {}
+    living: dict[str, SyncService] = {}
+    said: dict[str, SyncService] = {}
     written = 0
     while written < marks:
         while len(living) < agents:
@@ -103,7 +105,7 @@ def lost_while_coming_and_going(seed: int, marks: int, agents: int = 6) -> dict[
     lost = 0
     for replica in (keeper.replica, listener.replica, *(each.replica for each in living.values())):
         for name, author in said.items():
-            lost += len(author.replica.ahead_of(replica.digest(), [name]))
+            lost += len(author.replica.held.ahead_of(replica.held.ledger.held(), [name]))
     return {"marks": written, "agents": len(said), "equal_after_s": equal_s, "sets_lost": lost}
 
 

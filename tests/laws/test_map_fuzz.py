@@ -10,7 +10,8 @@ import random
 import msgspec
 import numpy as np
 import pytest
-from support.map_strategies import GRID, Composite, MapSwarm, held_winners, naive_winners, set_of
+from support.map_strategies import GRID, Acknowledged, Composite, held_winners, naive_winners, set_of
+from support.swarm_model import SwarmModel
 
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.mark_sets import packed, unpacked
@@ -66,12 +67,12 @@ def test_mutated_sets_merge_by_the_rules_or_not_at_all() -> None:
     for order in (through, through[::-1]):
         replica = MapReplica(GRID, Composite())
         for each in order:
-            replica.merge(each)
+            replica.merge([each])
         replicas.append(replica)
     lasting = [each for each in through if fault(each, GRID) is None]
     if not any(each.untils_ns for each in lasting):
         assert held_winners(replicas[0]) == naive_winners(lasting)
-    assert replicas[0].answer(MarksRequest()) == replicas[1].answer(MarksRequest())
+    assert replicas[0].held.answer(MarksRequest()) == replicas[1].held.answer(MarksRequest())
     assert held_winners(replicas[0]) == held_winners(replicas[1])
 
 
@@ -88,10 +89,10 @@ def test_mutated_messages_of_many_sets_merge_by_the_rules_or_not_at_all() -> Non
     singly, together = MapReplica(GRID, Composite()), MapReplica(GRID, Composite())
     for each in through:
         each.check()  # what the columns pass, each set passes by itself
-        singly.merge(each)
+        singly.merge([each])
     for first in range(0, len(through), 500):
-        together.merge_many(through[first : first + 500])
-    assert together.answer(MarksRequest()) == singly.answer(MarksRequest())
+        together.merge(through[first : first + 500])
+    assert together.held.answer(MarksRequest()) == singly.held.answer(MarksRequest())
     assert held_winners(together) == held_winners(singly)
 
 
@@ -110,10 +111,11 @@ def test_mutated_payloads_that_wait_together_pass_the_door_as_each_would_alone()
 @pytest.mark.parametrize("topic", [MARKS, DIGEST])
 def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_from_it(topic: object) -> None:
     chance = random.Random(5)
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     store = KeeperStore(":memory:")
     keeper = swarm.keeper("keeper", store)
     author, listener = swarm.writer("a1.1"), swarm.listener("p")
+    acknowledged = Acknowledged(swarm.network.bus("ear"))
     hostile = swarm.network.bus("hostile")
     rows = np.array([(0, 1, 5), (2, 1, 7), (5, 2, 0)], DIGEST_ROW).tobytes()
     lies = [encode(Digest(author=a, role=r, held={"b2.2": rows, "a1.1": rows})) for a, r in
@@ -125,18 +127,18 @@ def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_
         hostile.publish_bytes(topic, payload, fields)  # type: ignore[arg-type]
         if n % 50 == 0:
             swarm.run(0.1)
-    author.feed.publish(author.replica.write([5, 2700], MarkKind.LETHAL, 0.0, swarm.now_ns))
+    author.sync.publish(author.replica.write([5, 2700], MarkKind.LETHAL, 0.0, swarm.now_ns))
     swarm.run(3)
     for replica in (listener.replica, keeper.replica):
-        assert replica.answer(FEW) == author.replica.answer(FEW)
-    assert author.feed.unacknowledged == 0
-    assert len(list(store.load())) == len(keeper.replica.answer(MarksRequest()))
+        assert replica.held.answer(FEW) == author.replica.held.answer(FEW)
+    assert acknowledged.not_yet(author) == 0
+    assert len(list(store.load())) == len(keeper.replica.held.answer(MarksRequest()))
 
 
 def test_requests_for_what_nobody_has_are_answered_with_nothing() -> None:
     replica = MapReplica(GRID)
     for each in examples():
-        replica.merge(each)
+        replica.merge([each])
     odd = msgspec.structs.replace(FEW, authors=["x" * 64], tiles=[10**9])
-    assert replica.answer(odd) == []
-    assert replica.compare({"a1.1": np.array([(4_000_000_000, 9, 9)], DIGEST_ROW).tobytes()}) == []
+    assert replica.held.answer(odd) == []
+    assert replica.missing({"a1.1": np.array([(4_000_000_000, 9, 9)], DIGEST_ROW).tobytes()}) == []

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from live.test_by_hand import Hands
-from live.test_by_hand import hands as hands
 from rasterio.transform import from_origin
-from support.live_swarm import ask, client, swarm, write_scenario
+from support.live_swarm import Hands, ask, client, swarm, write_scenario
 from support.processes import eventually
 
 from swarm.config.load import load_scenario

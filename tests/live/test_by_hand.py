@@ -4,66 +4,30 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from support.live_swarm import SWARM, ask, client, swarm, write_scenario
+from support.live_swarm import Hands, ask, client, swarm
 from support.processes import eventually
 
-from swarm.config.load import load_scenario
-from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.routes import RouteStatus
-from swarm.wire.topics import ROUTE, RUN
+from swarm.wire.topics import ROUTE
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 
-class Hands:
-    """Processes started one by one."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.path = write_scenario(folder)
-        self.network = load_scenario(self.path).network
-        self.started: list[subprocess.Popen[str]] = []
-
-    def start(self, *arguments: str, runs: Path | None = None) -> subprocess.Popen[str]:
-        name = "-".join(arguments[:3]).replace("/", "_")
-        with (self.folder / f"{name}.log").open("w") as log:
-            process = subprocess.Popen(
-                [*SWARM, *arguments, "--runs", str(runs or self.folder / "runs")], stdout=log, stderr=log, text=True
-            )
-        self.started.append(process)
-        return process
-
-    def members(self) -> list[tuple[str, str, str]]:
-        with client(self.network) as bus:
-            return sorted((info.role, info.id, info.run_id) for info in ask(bus, RUN, Nothing(), timeout_s=1.0))
-
-    def logs(self) -> str:
-        return "\n".join(f"{path.name}:\n{path.read_text()}" for path in self.folder.glob("*.log"))
-
-
-@pytest.fixture
-def hands(tmp_path: Path) -> Iterator[Hands]:
-    hands = Hands(tmp_path)
-    yield hands
-    for process in hands.started:
-        process.kill()
-        process.wait(10)
-
-
 def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) -> None:
     scenario = (str(hands.path),)
-    hands.start("router", *scenario, "--run-id", "by-hand")
+    hands.start("router", *scenario)
     eventually(lambda: swarm("status", "--connect", hands.network.connect[0]).returncode == 0, 30, "the router")
-    for role in (("keeper",), ("targets",), ("planner", "--target", "t0")):
+    hands.start("keeper", *scenario, "--run-id", "by-hand")
+    eventually(lambda: ("keeper", "0", "by-hand") in hands.members(), 60, "the keeper")
+    for role in (("targets",), ("planner", "--target", "t0")):
         hands.start(*role, *scenario)
     eventually(lambda: len(hands.members()) == 4, 60, "all four")
-    assert {run_id for _, _, run_id in hands.members()} == {"by-hand"}
+    assert {(role, run_id) for role, _, run_id in hands.members()} == {
+        ("router", ""), ("keeper", "by-hand"), ("targets", "by-hand"), ("planner", "by-hand"),
+    }  # fmt: skip
 
     def is_served() -> bool:
         with client(hands.network) as bus:

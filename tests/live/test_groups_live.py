@@ -11,9 +11,9 @@ from support.processes import eventually
 
 from launch_scripts.launcher.options import free_ports
 from shared_map.cost_map import CostMap
-from shared_map.replication.filter import Reading, author_of, readable_groups
+from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.load import parse_scenario
@@ -41,21 +41,21 @@ class Member:
     def __init__(self, network: NetworkConfig, group: str, *, near: bool = False) -> None:
         self.bus: ZenohBus = open_bus(network)
         self.inbox = Inbox()
-        reading = Reading(TERRAIN.grid, readable_groups(SCENARIO, group))
+        filter = MarkFilter(TERRAIN.grid, readable_groups(SCENARIO, group))
         self.cost_map = CostMap(TERRAIN)
         author = author_of(group, f"a-{group}.1")
-        self.replica = MapReplica(TERRAIN.grid, self.cost_map, author=author, group=group, reading=reading)
-        self.feed = MapFeed(self.replica, self.bus, self.inbox.post, MapConfig(), "agent", near=near)
-        self.feed.start(time.time_ns())
+        self.replica = MapReplica(TERRAIN.grid, self.cost_map, author=author, group=group, filter=filter)
+        self.sync = MapSync(self.replica, self.bus, self.inbox.post, MapConfig(), "agent", near=near)
+        self.sync.start(time.time_ns())
 
     def mark(self, cell: int) -> None:
-        self.feed.publish(self.replica.write([cell], [MarkKind.LETHAL], [0.0], time.time_ns()))
+        self.sync.publish(self.replica.write([cell], [MarkKind.LETHAL], [0.0], time.time_ns()))
 
     def closed(self, cell: int) -> bool:
         """After everything that has come by now."""
         while (event := self.inbox.take(0.0)) is not None:
-            self.feed.handle(event, time.time_ns())
-        self.feed.tick(time.time_ns())
+            self.sync.handle(event, time.time_ns())
+        self.sync.tick(time.time_ns())
         return bool(np.isinf(self.cost_map.ground_s_per_m.reshape(-1)[cell]))
 
 
@@ -92,7 +92,7 @@ def test_who_comes_near_learns_what_was_said_there_and_forgets_it_on_leaving(net
     red, grey = Member(network, "red"), Member(network, "grey", near=True)
     try:
         time.sleep(0.3)
-        grey.feed.look_at(frozenset({0}))
+        grey.sync.enter(frozenset({0}))
         red.mark(550)  # in region 2
         red.mark(20)
 
@@ -102,10 +102,10 @@ def test_who_comes_near_learns_what_was_said_there_and_forgets_it_on_leaving(net
 
         eventually(both, within_s=10)
         assert not grey.closed(550)
-        grey.feed.look_at(frozenset({1, 2}))
+        grey.sync.enter(frozenset({1, 2}))
         eventually(lambda: red.closed(20) and grey.closed(550), within_s=10)
         assert not grey.closed(20)
-        assert grey.replica.tiles == [550 // 32]
+        assert grey.replica.held.tiles == [550 // 32]
     finally:
         for member in (red, grey):
             member.bus.close()

@@ -28,7 +28,7 @@ from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.marks import DIGEST_ROW, FOLDS, Digest
+from swarm.wire.messages.marks import DIGEST_ROW, SEQ_STEP, Digest
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import DIGEST, MARKS
 
@@ -71,7 +71,9 @@ class Load:
             for tile in range(TILES):
                 self.put += 1
                 stamps = np.full(PER_TILE, self.put, np.int64)
-                each = mark_set("load.1", "all", tile, 1, self.put * FOLDS, Statements(cells, kinds, paces, stamps))
+                each = mark_set(
+                    "load.1", "all", tile, 1, self.put * SEQ_STEP, Statements(cells, kinds, paces, stamps)
+                )
                 self._bus.publish(MARKS, each, region=0, tile=tile, author="load.1")
             time.sleep(0.002)
 

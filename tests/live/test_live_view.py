@@ -82,10 +82,10 @@ def until_complete(screenshot: Callable[[], bytes], folder: Path, within_s: floa
 def test_a_browser_shows_the_ground_green_vehicles_and_red_targets_and_asks_nobody_else(
     shown: Rig, tmp_path: Path
 ) -> None:
-    assert shown.outlets.live_url is not None
+    assert shown.sinks.live_url is not None
     browser = Browser(tmp_path / "profile", SIZE)
     try:
-        browser.open(shown.outlets.live_url)
+        browser.open(shown.sinks.live_url)
         until_complete(browser.screenshot, tmp_path, within_s=200)
         hosts = {urllib.parse.urlparse(url).hostname for url in browser.reached if url.startswith("http")}
         assert hosts == {"127.0.0.1"}
@@ -100,7 +100,7 @@ def test_a_browser_shows_the_ground_green_vehicles_and_red_targets_and_asks_nobo
 def test_the_native_viewer_shows_the_same(shown: Rig, tmp_path: Path) -> None:
     from rerun.experimental import ViewerClient
 
-    location = shown.outlets.stream_url
+    location = shown.sinks.stream_url
     assert location is not None
     port = free_port()
     viewer = subprocess.Popen(

@@ -21,7 +21,7 @@ from launch_scripts.deploy.zenohd import zenohd_config
 from launch_scripts.launcher.options import free_ports, listening
 from shared_map.replication.marks import mark_set, statements
 from shared_map.replication.replica import MapReplica, PublishSet
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from swarm.bus.bus import Asked, Event, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
@@ -30,11 +30,11 @@ from swarm.errors import BusError
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.base import Nothing
-from swarm.wire.messages.marks import FOLDS, Digest
+from swarm.wire.messages.marks import SEQ_STEP, Digest
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.vehicles import Claims
+from swarm.wire.messages.vehicles import Reservations
 from swarm.wire.statements import MarkKind
-from swarm.wire.topics import CLAIMS, DIGEST, MARKS, STATS
+from swarm.wire.topics import DIGEST, MARKS, RESERVATIONS, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.zenohd]
 
@@ -80,19 +80,19 @@ class Participant:
         self.replica = MapReplica(GRID, author=author)
         self.inbox = Inbox()
         self.clock = MonotonicClock()
-        self.feed = MapFeed(self.replica, bus, self.inbox.post, MapConfig(), "agent" if author else "planner")
-        self.feed.start(self.clock.now_ns())
+        self.sync = MapSync(self.replica, bus, self.inbox.post, MapConfig(), "agent" if author else "planner")
+        self.sync.start(self.clock.now_ns())
 
     def run(self, seconds: float) -> None:
         until_s = time.monotonic() + seconds
         while time.monotonic() < until_s:
             event = self.inbox.take(0.01)
             if event is not None:
-                self.feed.handle(event, self.clock.now_ns())
-            self.feed.tick(self.clock.now_ns())
+                self.sync.handle(event, self.clock.now_ns())
+            self.sync.tick(self.clock.now_ns())
 
     def write(self, cells: object, kind: MarkKind) -> None:
-        self.feed.publish(self.replica.write(np.asarray(cells), kind, 0.0, time.time_ns()))
+        self.sync.publish(self.replica.write(np.asarray(cells), kind, 0.0, time.time_ns()))
 
 
 @pytest.fixture
@@ -115,19 +115,19 @@ def test_who_comes_late_gets_everything_from_the_storages_of_zenohd_alone(router
             author.run(1.5)
             # Zenoh drops puts where a link is congested, and a storage tells nobody what it has: without a keeper,
             # which would ask again, what was dropped is only there if it is said again.
-            for tile in author.replica.tiles:
-                own = [PublishSet(each) for each in author.replica.sets(tile) if each.author == name]
-                author.feed.publish(own)
+            for tile in author.replica.held.tiles:
+                own = [PublishSet(each) for each in author.replica.held.of_tile(tile) if each.author == name]
+                author.sync.publish(own)
                 author.run(0.01)
             authors[name] = author
     with open_bus(router.network) as bus:  # nobody else is left
         late = Participant(bus)
-        eventually(lambda: late.run(0.2) or late.feed.joined, 20, "the late join")
-        assert sum(len(late.replica.sets(tile)) for tile in late.replica.tiles) == 2 * GRID.tiles
+        eventually(lambda: late.run(0.2) or late.sync.joined, 20, "the late join")
+        assert sum(len(late.replica.held.of_tile(tile)) for tile in late.replica.held.tiles) == 2 * GRID.tiles
         for name, author in authors.items():
-            own = {tile: each for tile in author.replica.tiles for each in author.replica.sets(tile)}
-            for tile in late.replica.tiles:
-                for each in late.replica.sets(tile):
+            own = {tile: each for tile in author.replica.held.tiles for each in author.replica.held.of_tile(tile)}
+            for tile in late.replica.held.tiles:
+                for each in late.replica.held.of_tile(tile):
                     if each.author == name:
                         assert (each.epoch, each.seq, each.cells) == (
                             own[tile].epoch,
@@ -139,7 +139,7 @@ def test_who_comes_late_gets_everything_from_the_storages_of_zenohd_alone(router
 def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_is_applied(router: Router) -> None:
     """The storage goes by the time of arrival; replicas go by (epoch, seq)."""
     everything = statements(mark_set("a0.1", "all", 0, 1, 0, MapReplica(GRID).winners(0)))
-    newer, older = (mark_set("a0.1", "all", 0, 1, n * FOLDS, everything) for n in (5, 2))
+    newer, older = (mark_set("a0.1", "all", 0, 1, n * SEQ_STEP, everything) for n in (5, 2))
     with open_bus(router.network) as bus:
         replica = Participant(bus)
         replica.run(0.5)
@@ -148,11 +148,11 @@ def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_
             replica.run(0.3)
         late = Participant(bus)
         late.run(2.0)
-        assert [each.seq for each in late.replica.sets(0)] == [2 * FOLDS]  # what the storage has
-        assert [each.seq for each in replica.replica.sets(0)] == [5 * FOLDS]
+        assert [each.seq for each in late.replica.held.of_tile(0)] == [2 * SEQ_STEP]  # what the storage has
+        assert [each.seq for each in replica.replica.held.of_tile(0)] == [5 * SEQ_STEP]
         bus.publish(MARKS, newer, region=0, tile=0, author="a0.1")  # as the author or a keeper says it again
         late.run(0.5)
-        assert [each.seq for each in late.replica.sets(0)] == [5 * FOLDS]
+        assert [each.seq for each in late.replica.held.of_tile(0)] == [5 * SEQ_STEP]
 
 
 def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_nothing(tmp_path: Path) -> None:
@@ -186,7 +186,7 @@ def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_not
             author = Participant(own, "blue.a0.1")
             listener.run(0.5)
             author.write([1, 2, 3], MarkKind.LETHAL)
-            forged = mark_set("red.a1.1", "all", 0, 1, FOLDS, statements(author.replica.sets(0)[0]))
+            forged = mark_set("red.a1.1", "all", 0, 1, SEQ_STEP, statements(author.replica.held.of_tile(0)[0]))
             for bus in (own, stranger):
                 bus.publish(MARKS, forged, region=0, tile=0, author="red.a1.1")
                 bus.publish(DIGEST, Digest(author="red.a1.1", role="agent", held={}), author="red.a1.1")
@@ -195,15 +195,15 @@ def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_not
             for _ in range(10):
                 author.run(0.1)
                 listener.run(0.1)
-            assert list(listener.replica.digest()) == ["blue.a0.1"]
+            assert list(listener.replica.held.ledger.held()) == ["blue.a0.1"]
             assert set(heard) == {"blue.a0.1"}
             spy = Participant(stranger)
             spy.run(1.5)
-            assert spy.replica.digest() == {}
+            assert spy.replica.held.ledger.held() == {}
         with open_bus(network("keeper")) as trusted:
             late = Participant(trusted)
-            eventually(lambda: late.run(0.2) or late.replica.digest(), 10, "the storage's answer")
-            assert list(late.replica.digest()) == ["blue.a0.1"]
+            eventually(lambda: late.run(0.2) or late.replica.held.ledger.held(), 10, "the storage's answer")
+            assert list(late.replica.held.ledger.held()) == ["blue.a0.1"]
     finally:
         router.stop()
 
@@ -219,27 +219,29 @@ def test_with_certificates_an_agent_that_starts_again_is_told_where_its_vehicles
         tls = TlsConfig(**dict(zip(("ca", "certificate", "key"), files, strict=True)))
         return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=tls)
 
-    def claims(agent: str) -> Claims:
-        return Claims(agent=agent, incarnation=1, seq=3, clock=0, holds={f"{agent}-00": [7]}, wants=[], seen={})
+    def reservations(agent: str) -> Reservations:
+        return Reservations(
+            agent=agent, incarnation=1, seq=3, clock=0, held={f"{agent}-00": [7]}, requested=[], seen={}
+        )
 
     def answer(event: Event) -> None:
         assert isinstance(event, Asked)
         for agent in ("a0", "a1"):
-            event.answer(claims(agent), agent=agent)
+            event.answer(reservations(agent), agent=agent)
         event.end()
 
     router = Router(tmp_path, network("router"), trusted=["router"], agents=["all.a0", "all.a1"])
     try:
         with open_bus(network("all.a0")) as neighbour, open_bus(network("all.a1")) as starting:
-            neighbour.serve(CLAIMS, answer)
+            neighbour.serve(RESERVATIONS, answer)
             heard: list[Event] = []
 
-            def told() -> list[Claims]:
-                starting.ask(CLAIMS, Nothing(), heard.append, tag="claims", timeout_s=1.0)
+            def told() -> list[Reservations]:
+                starting.ask(RESERVATIONS, Nothing(), heard.append, tag="reservations", timeout_s=1.0)
                 time.sleep(0.3)
                 return [event.message for event in heard if isinstance(event, Replied)]
 
-            eventually(lambda: claims("a1") in told(), 5, "the last words of the agent that starts again")
+            eventually(lambda: reservations("a1") in told(), 5, "the last words of the agent that starts again")
     finally:
         router.stop()
 

@@ -58,7 +58,7 @@ def check_all(simulation: Simulation, laws: Laws) -> None:
         if node.service is not None and (replica := replica_of(node)) is not None
     }
     assert sorted(left) == ["keeper-0", "planner-t0", "planner-t1"]
-    assert len({replica.fingerprint() for replica in left.values()}) == 1
+    assert len({replica.held.fingerprint() for replica in left.values()}) == 1
     assert missing(laws.stored(), laws.acknowledged) == []
     planners: list[np.ndarray] = [
         simulation.nodes[name].service._cost_map.pace_s_per_m  # type: ignore[union-attr]
@@ -116,7 +116,7 @@ def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
     simulation.run_until(4)
     agent = agent_of(simulation, "agent-a1")
     simulation.run_until(4.2)  # what was echoed before the cut may still be granted
-    held = {id: [*agent.rights.holds(id), *agent.rights.wants(id)] for id in agent.vehicles}
+    held = {id: [*agent.rights.held(id), *agent.rights.requested(id)] for id in agent.vehicles}
     simulation.run_until(12)
     assert all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
     simulation.run_until(20)

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from support.slow_tree import naive_tree
+from support.slow_twins import cost_to_go, way_down
+from support.swarm_model import SwarmModel
 
-from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Asked, Event, Heard
-from swarm.bus.memory_bus import LinkModel, MemoryBus, MemoryNetwork, PerfectLinks
-from swarm.bus.scheduler import Scheduler
-from swarm.clock import NS_PER_S, ManualClock
+from swarm.bus.memory_bus import LinkModel
+from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import AgentPlan, Scenario, plan_agents
-from swarm.grid import STEP_COL, STEP_ROW
+from swarm.config.scenario import AgentPlan, plan_agents
+from swarm.grid import walk
 from swarm.liveness import Peer
-from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
@@ -29,8 +28,6 @@ from swarm.wire.statements import MarkKind
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.service import AgentService
-
-START_NS = 1_000 * NS_PER_S
 
 
 def pace_of(picture: Sequence[str], pace: float = 0.1) -> NDArray[np.float32]:
@@ -54,8 +51,8 @@ class FakePlanner:
         self.requests: list[RouteRequest] = []
         self.mute = False
         self.incarnation = incarnation
-        self._tree: tuple[NDArray[np.float64], NDArray[np.uint8]] | None = None
-        self.bus = world.network.bus(f"planner-{target}-{incarnation}")
+        self._cost: NDArray[np.float64] | None = None
+        self.bus = world.bus(f"planner-{target}-{incarnation}")
         self.bus.subscribe(POSE, self.handle, target=target)
         self.bus.subscribe(MARKS, self.handle)
         self.bus.serve(ROUTE, self.handle, target=target)
@@ -66,7 +63,7 @@ class FakePlanner:
         match event:
             case Heard(message=TargetPose() as pose):
                 if pose.cell != self.cell:
-                    self._tree = None
+                    self._cost = None
                 self.cell = pose.cell
             case Heard(message=MarkSet() as marks):
                 self._mark(marks)
@@ -91,36 +88,32 @@ class FakePlanner:
             row, col = window.row0 + int(inner) // 32, window.col0 + int(inner) % 32
             value = {MarkKind.PACE: float(pace), MarkKind.LETHAL: math.inf}.get(MarkKind(kind), prior[row, col])
             self.pace[row, col] = value
-        self._tree = None
+        self._cost = None
 
-    def tree(self) -> tuple[NDArray[np.float64], NDArray[np.uint8]] | None:
-        if self.cell is None:
-            return None
-        if self._tree is None:
-            self._tree = naive_tree(self.pace, self.cell, self.world.terrain.grid.resolution_m)
-        return self._tree
+    def cost(self) -> NDArray[np.float64] | None:
+        """Cost-to-go of every cell, for cells of one metre; None before the first pose."""
+        if self._cost is None and self.cell is not None:
+            self._cost = cost_to_go(self.pace, self.cell)
+        return self._cost
 
     def route(self, start: int, max_cells: int = 0) -> Route:
-        tree = self.tree()
-        if tree is None:
+        cost = self.cost()
+        if cost is None:
             return Route(status=RouteStatus.NO_TARGET, start=start)
-        cost, parent = tree
-        if not math.isfinite(cost[start]):
+        if not math.isfinite(cost.flat[start]):
             return Route(status=RouteStatus.UNREACHABLE, start=start)
-        cols = self.world.terrain.grid.cols
-        codes: list[int] = []
-        cell = start
-        while cell != self.cell and (not max_cells or len(codes) < max_cells):
-            code = int(parent[cell])
-            codes.append(code)
-            cell += STEP_ROW[code] * cols + STEP_COL[code]
+        grid = self.world.terrain.grid
+        directions = way_down(self.pace, cost, start, max_cells)
+        cost_s, remaining_s = (
+            float(cost.flat[cell]) * grid.resolution_m for cell in (start, walk(grid, start, directions)[-1])
+        )
         return Route(
             status=RouteStatus.OK,
             start=start,
-            directions=bytes(codes),
-            cost_s=float(cost[start]),
-            lower_bound_s=float(cost[start]),
-            remaining_s=float(cost[cell]),
+            directions=directions,
+            cost_s=cost_s,
+            lower_bound_s=cost_s,
+            remaining_s=remaining_s,
         )
 
     def _routes(self, request: RouteRequest) -> RouteReply:
@@ -137,8 +130,8 @@ class FakePlanner:
         )
 
     def _costs(self, request: CostRequest) -> CostReply:
-        tree = self.tree()
-        costs = [math.inf] * len(request.cells) if tree is None else [tree[0][cell] for cell in request.cells]
+        cost, metres = self.cost(), self.world.terrain.grid.resolution_m
+        costs = [math.inf if cost is None else cost.flat[cell] * metres for cell in request.cells]
         return CostReply(
             target=self.target,
             incarnation=self.incarnation,
@@ -149,8 +142,8 @@ class FakePlanner:
         )
 
 
-class AgentWorld:
-    """A terrain, its agents, a planner per target, and a watchman who sees every vehicle at every tick."""
+class AgentWorld(SwarmModel):
+    """A terrain, its agents, a fake planner per target, and a watchman who sees every vehicle at every tick."""
 
     def __init__(
         self,
@@ -160,13 +153,9 @@ class AgentWorld:
         links: LinkModel | None = None,
         resolution_m: float = 10.0,
     ) -> None:
-        self.scenario: Scenario = parse_scenario(scenario)
-        self.terrain: Terrain = terrain_of_pace(prior, resolution_m)
+        super().__init__(links, terrain_of_pace(prior, resolution_m), parse_scenario(scenario))
         self.truth = np.array(self.terrain.ground_s_per_m if truth is None else truth, np.float32)
-        self.scheduler = Scheduler(ManualClock(START_NS))
-        self.network = MemoryNetwork(self.scheduler, links or PerfectLinks())
         self.agents: dict[str, AgentService] = {}
-        self.buses: dict[str, MemoryBus] = {}
         self.planners: dict[str, FakePlanner] = {}
         self.poses: dict[str, TargetPose] = {}
         self.fleets: list[Fleet] = []
@@ -174,13 +163,10 @@ class AgentWorld:
         self.ghosts: dict[str, dict[str, int]] = {}
         self.meetings: list[str] = []
         self.lethal: list[str] = []
-        self._watch = self.network.bus("watch")
+        self.after_tick.append(self._look_around)
+        self._watch = self.bus("watch")
         self._watch.subscribe(FLEET, self._hear)
         self._watch.subscribe(FOLLOWED, self._hear)
-
-    @property
-    def now_ns(self) -> int:
-        return self.scheduler.clock.now_ns()
 
     def _hear(self, event: Event) -> None:
         match event:
@@ -211,36 +197,22 @@ class AgentWorld:
         self.planners.pop(target).bus.close()
 
     def start_agent(self, id: str) -> AgentService:
-        incarnation = self.now_ns
-        setup = RoleSetup(self.scenario, "run", "agent", id, incarnation, START_NS)
-        bus = self.network.bus(f"agent-{id}")
-        service: AgentService
-
-        def post(event: Event) -> None:
-            if not bus.closed:
-                service.handle(event, self.now_ns)
-
-        service = AgentService(setup, self.terrain, self.truth, bus, post)
-        self.agents[id], self.buses[id] = service, bus
-        service.start(self.now_ns)
-        period_ns = int(NS_PER_S / self.scenario.vehicles.tick_hz)
-
-        def tick() -> None:
-            if not bus.closed:
-                service.tick(self.now_ns)
-                self._look_around()
-                self.scheduler.after(period_ns, tick)
-
-        # Agents tick at different moments.
-        self.scheduler.after(period_ns * (1 + len(self.agents)) // 7, tick)
-        return service
+        setup = self.setup("agent", id, self.now_ns)
+        hz = self.scenario.vehicles.tick_hz
+        self.agents[id] = self.start(
+            f"agent-{id}",
+            lambda bus, post: AgentService(setup, self.terrain, self.truth, bus, post),
+            hz,
+            int(NS_PER_S / hz) * (2 + len(self.agents)) // 7,  # agents tick at different moments
+        )
+        return self.agents[id]
 
     def crash_agent(self, id: str) -> None:
         """The process is gone; its vehicles stand where they were."""
         service = self.agents.pop(id)
         if service.agent.vehicles:
             self.ghosts[id] = {v.id: v.cell for v in service.agent.vehicles.values()}
-        self.buses.pop(id).close()
+        self.kill(f"agent-{id}")
 
     def _look_around(self) -> None:
         where: dict[int, str] = {}
@@ -292,18 +264,8 @@ class AgentWorld:
         self._watch.publish(POSE, self.poses[target], target=target)
         self.scheduler.after(NS_PER_S // 10, lambda: self._tell(target))
 
-    def run_s(self, seconds: float) -> None:
-        self.scheduler.run_until(self.now_ns + int(seconds * NS_PER_S))
-
-    def until(self, true: object, within_s: float) -> float:
-        """Run until a condition holds; returns the seconds that it took."""
-        assert callable(true)
-        began_ns = self.now_ns
-        while not true():
-            if self.now_ns - began_ns > within_s * NS_PER_S:
-                raise AssertionError(f"not within {within_s} s: {self.describe()}")
-            self.run_s(0.1)
-        return (self.now_ns - began_ns) / NS_PER_S
+    def until(self, true: Callable[[], object], within_s: float = 5.0, step_s: float = 0.1) -> float:
+        return super().until(true, within_s, step_s)
 
     # --- what there is to see -------------------------------------------------------------------------------
 

@@ -1,5 +1,5 @@
-"""What every bus does, as tests: `test_memory_bus` runs them on the simulated network, `integration/test_zenoh_bus`
-on real sessions. Whatever holds on one and not on the other would make the simulation lie."""
+"""The rules of `swarm.bus.bus.Bus` as tests: `tests/unit/swarm/test_memory_bus` runs them on the simulated network,
+`tests/live/test_zenoh_bus` on real sessions. A rule that held on one only would make simulations misleading."""
 
 from __future__ import annotations
 
@@ -15,12 +15,17 @@ from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import MarkSet, MarksRequest
 from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Claims
-from swarm.wire.topics import CLAIMS, MARKS, NOTE, POSE, RUN, Topic
+from swarm.wire.messages.vehicles import Reservations
+from swarm.wire.topics import MARKS, NOTE, POSE, RESERVATIONS, RUN, Topic
 
 
 class World(Protocol):
-    """A network under test."""
+    """A network under test.
+
+    until   waits until `true()` is; fails after `within_s`
+    settle  waits until declarations have reached all buses
+    cut     takes the link of one bus down; `heal` brings it back
+    """
 
     def bus(self, name: str, namespace: str = "swarm") -> Bus: ...
     def put_bytes(self, bus: Bus, topic: Topic, payload: bytes, **fields: str) -> None: ...
@@ -31,7 +36,7 @@ class World(Protocol):
 
 
 class Box(list[Any]):
-    """A post that keeps what it is given."""
+    """A `Post` that keeps the events."""
 
     def __call__(self, event: Event) -> None:
         self.append(event)
@@ -62,7 +67,7 @@ def marks(author: str, tile: int) -> MarkSet:
 
 
 def answering(*replies: Any) -> Callable[[Event], None]:
-    """A queryable that gives (message, fields) replies."""
+    """A `Post` for `serve` that answers with these (message, fields) and ends."""
 
     def post(event: Event) -> None:
         assert isinstance(event, Asked)
@@ -74,7 +79,7 @@ def answering(*replies: Any) -> Callable[[Event], None]:
 
 
 def asked(world: World, bus: Bus, topic: Topic, request: Any, **options: Any) -> Box:
-    """Everything that came of one query, once it has ended."""
+    """The events of one query, once it has ended."""
     box = Box()
     bus.ask(topic, request, box, tag="q", **options)
     world.until(lambda: box.of(AskEnded))
@@ -290,9 +295,9 @@ def test_a_refusal_reaches_who_asked(world: World):
         event.refuse("not today")
         event.end()
 
-    b.serve(CLAIMS, refuse, agent="a0")
+    b.serve(RESERVATIONS, refuse, agent="a0")
     world.settle()
-    assert asked(world, a, CLAIMS, Nothing(), agent="a0") == [AskEnded("q", CLAIMS, 0, "not today")]
+    assert asked(world, a, RESERVATIONS, Nothing(), agent="a0") == [AskEnded("q", RESERVATIONS, 0, "not today")]
 
 
 def test_a_query_that_is_never_ended_times_out_with_what_came(world: World):
@@ -337,13 +342,15 @@ def test_an_answer_after_the_end_is_a_bug_that_raises(world: World):
 
 def test_one_that_hears_a_topic_may_serve_it_too(world: World):
     a, b, heard = world.bus("a"), world.bus("b"), Box()
-    claims = Claims(agent="a0", incarnation=1, seq=1, clock=1, holds={"v": [3]}, wants=[], seen={})
-    b.subscribe(CLAIMS, heard)
-    b.serve(CLAIMS, answering((claims, {"agent": "a0"})))
+    reservations = Reservations(agent="a0", incarnation=1, seq=1, clock=1, held={"v": [3]}, requested=[], seen={})
+    b.subscribe(RESERVATIONS, heard)
+    b.serve(RESERVATIONS, answering((reservations, {"agent": "a0"})))
     world.settle()
-    a.publish(CLAIMS, claims, agent="a0")
+    a.publish(RESERVATIONS, reservations, agent="a0")
     world.until(lambda: heard)
-    assert [event.message for event in asked(world, a, CLAIMS, Nothing(), agent="a0").of(Replied)] == [claims]
+    assert [event.message for event in asked(world, a, RESERVATIONS, Nothing(), agent="a0").of(Replied)] == [
+        reservations
+    ]
 
 
 # --- tokens and links ---------------------------------------------------------------------------------------

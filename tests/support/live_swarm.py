@@ -1,4 +1,4 @@
-"""A whole swarm of real processes for the tests beside this file."""
+"""A swarm of real processes on free ports of this machine: all at once (`LiveSwarm`) or one by one (`Hands`)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.load import load_scenario
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.base import Message
-from swarm.wire.topics import Topic
+from swarm.wire.messages.base import Message, Nothing
+from swarm.wire.topics import RUN, Topic
 
 SWARM = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
 
@@ -123,6 +123,32 @@ class LiveSwarm:
         if session_of(self.process.pid):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait(10)
+
+
+class Hands:
+    """Processes of one run, started one by one as on several machines."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = write_scenario(folder)
+        self.network = load_scenario(self.path).network
+        self.started: list[subprocess.Popen[str]] = []
+
+    def start(self, *arguments: str, runs: Path | None = None) -> subprocess.Popen[str]:
+        name = "-".join(arguments[:3]).replace("/", "_")
+        with (self.folder / f"{name}.log").open("w") as log:
+            process = subprocess.Popen(
+                [*SWARM, *arguments, "--runs", str(runs or self.folder / "runs")], stdout=log, stderr=log, text=True
+            )
+        self.started.append(process)
+        return process
+
+    def members(self) -> list[tuple[str, str, str]]:
+        with client(self.network) as bus:
+            return sorted((info.role, info.id, info.run_id) for info in ask(bus, RUN, Nothing(), timeout_s=1.0))
+
+    def logs(self) -> str:
+        return "\n".join(f"{path.name}:\n{path.read_text()}" for path in self.folder.glob("*.log"))
 
 
 def ask(bus: ZenohBus, topic: Topic, request: Message, timeout_s: float = 2.0, **fields: str) -> list[Any]:

@@ -1,29 +1,21 @@
-"""Hypothesis strategies for marks, and a little swarm of map services on a memory bus."""
+"""Hypothesis strategies for marks, and the merge law said the slow way."""
 
 from __future__ import annotations
 
-import random
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
-from shared_map.terrain.terrain import Terrain, terrain_of_pace
-from swarm.bus.bus import Event
-from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
-from swarm.bus.scheduler import Scheduler
-from swarm.clock import NS_PER_S, ManualClock
-from swarm.config.scenario import MapConfig, Scenario
+from swarm.bus.bus import Bus, Event, Heard
 from swarm.grid import GridSpec
-from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.marks import FOLDS, MarkSet
+from swarm.wire.messages.marks import SEQ_STEP, Digest, MarkSet
 from swarm.wire.statements import MarkKind
+from swarm.wire.topics import DIGEST
 
 settings.register_profile(
     "shared-cores", deadline=None, suppress_health_check=[HealthCheck.too_slow]
@@ -33,7 +25,6 @@ settings.load_profile("shared-cores")
 GRID = GridSpec(40, 70, 10.0)
 """2 x 3 tiles, those at the border cut off."""
 AUTHORS = ("a1.1", "a2.1", "a2.2", "b1.1")
-TICK_NS = NS_PER_S // 10
 
 
 def set_of(
@@ -47,7 +38,7 @@ def set_of(
 ) -> MarkSet:
     """said: cell in the tile -> (kind, pace, stamp); seq counts the author's own sets"""
     cells = sorted(said)
-    seq *= FOLDS
+    seq *= SEQ_STEP
     return mark_set(
         author,
         group,
@@ -91,14 +82,26 @@ class Composite:
     def __init__(self, grid: GridSpec = GRID) -> None:
         self.kinds = np.full(grid.cells, MarkKind.CLEAR, np.uint8)
         self.paces = np.zeros(grid.cells, np.float32)
+        self.changed: list[int] = []  # cells of which the last `apply` told
 
     def apply(self, cells: np.ndarray, kinds: np.ndarray, paces: np.ndarray) -> None:
         assert len(np.unique(cells)) == len(cells)
+        self.changed = sorted(cells.tolist())
         self.kinds[cells] = kinds
         self.paces[cells] = paces
 
     def same(self, other: Composite) -> bool:
         return bool((self.kinds == other.kinds).all() and (self.paces == other.paces).all())
+
+
+def merge_one(replica: MapReplica, each: MarkSet) -> list[int] | None:
+    """The cells whose winner a set changes, of a replica with a `Composite`; None if it is not taken in."""
+    sink = replica._cost_map
+    assert isinstance(sink, Composite)
+    sink.changed = []
+    merged = replica.merge([each])
+    assert merged.changed in ([], [len(sink.changed)])
+    return sink.changed if merged.sets else None
 
 
 def naive_winners(sets: Sequence[MarkSet]) -> dict[tuple[int, int], tuple[int, float]]:
@@ -125,118 +128,38 @@ def naive_winners(sets: Sequence[MarkSet]) -> dict[tuple[int, int], tuple[int, f
     return {at: (kind, pace) for at, (_, _, kind, pace) in best.items()}
 
 
-class FeedService:
-    """The least service that takes part in the map."""
-
-    def __init__(self, feed: MapFeed) -> None:
-        self.feed = feed
-        self.replica = feed.replica
-
-    def start(self, now_ns: int) -> None:
-        self.feed.start(now_ns)
-
-    def handle(self, event: Event, now_ns: int) -> None:
-        self.feed.handle(event, now_ns)
-
-    def tick(self, now_ns: int) -> None:
-        self.feed.tick(now_ns)
-
-
-class LossyLinks:
-    """Drops, repeats and delays by chance; a cut keeps apart what lies on its two sides."""
-
-    def __init__(self, seed: int, dropped: float = 0.0, repeated: float = 0.0, jitter_ms: float = 0.0) -> None:
-        self._random = random.Random(seed)
-        self.dropped, self.repeated, self.jitter_ms = dropped, repeated, jitter_ms
-        self.far_side: set[str] = set()
-
-    def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        return (source in self.far_side) == (destination in self.far_side)
-
-    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
-        if not self.connected(source, destination, now_ns) or self._random.random() < self.dropped:
-            return ()
-        copies = 2 if self._random.random() < self.repeated else 1
-        return [int(2e5 + self._random.random() * self.jitter_ms * 1e6) for _ in range(copies)]
-
-
-class MapSwarm:
-    """Map services on one memory network, ticking ten times a second."""
-
-    def __init__(self, links: LossyLinks | None = None, terrain: Terrain | None = None) -> None:
-        self.clock = ManualClock(1_000 * NS_PER_S)
-        self.scheduler = Scheduler(self.clock)
-        self.links = links
-        self.network = MemoryNetwork(self.scheduler, PerfectLinks() if links is None else links)
-        self.terrain = terrain or terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))
-        self.config = MapConfig()
-        self.alive: dict[str, object] = {}
-
-    def writer(self, author: str) -> FeedService:
-        return self._feed(author, author, "agent")
-
-    def listener(self, node: str) -> FeedService:
-        return self._feed(node, None, "planner")
-
-    def _feed(self, node: str, author: str | None, role: str) -> FeedService:
-        replica = MapReplica(self.terrain.grid, Composite(self.terrain.grid), author=author)
-        bus = self.network.bus(node)
-        service: FeedService | None = None
-
-        def post(event: Event) -> None:
-            assert service is not None
-            if node in self.alive:
-                service.handle(event, self.clock.now_ns())
-
-        service = FeedService(MapFeed(replica, bus, post, self.config, role))
-        self._run(node, service)
-        return service
-
-    def keeper(self, id: str, store: KeeperStore, incarnation: int = 1) -> KeeperService:
-        setup = RoleSetup(Scenario(map=self.config), "run", "keeper", id, incarnation, 0)
-        node = f"{id}.{incarnation}"
-        bus = self.network.bus(node)
-        service: KeeperService | None = None
-
-        def post(event: Event) -> None:
-            assert service is not None
-            if node in self.alive:
-                service.handle(event, self.clock.now_ns())
-
-        service = KeeperService(setup, self.terrain, bus, post, store)
-        self._run(node, service)
-        return service
-
-    def _run(self, node: str, service: FeedService | KeeperService) -> None:
-        self.alive[node] = service
-        service.start(self.clock.now_ns())
-
-        def tick() -> None:
-            if self.alive.get(node) is service:
-                service.tick(self.clock.now_ns())
-                self.scheduler.after(TICK_NS, tick)
-
-        self.scheduler.after(TICK_NS, tick)
-
-    def kill(self, node: str) -> None:
-        """As kill -9: no last words."""
-        del self.alive[node]
-        for bus in list(self.network.buses):
-            if bus.node == node:
-                bus.close()
-
-    def run(self, seconds: float) -> None:
-        self.scheduler.run_until(self.clock.now_ns() + int(seconds * NS_PER_S))
-
-    @property
-    def now_ns(self) -> int:
-        return self.clock.now_ns()
-
-
 def held_winners(replica: MapReplica) -> dict[tuple[int, int], tuple[int, float]]:
     """(tile, cell) -> (kind, pace) as a replica sees it."""
     return {
         (tile, cell): (kind, pace)
-        for tile in replica.tiles
+        for tile in replica.held.tiles
         for cell, kind, pace in zip(*(v.tolist() for v in replica.winners(tile)[:3]), strict=True)
     }
+
+
+def replica_of(sets: list[MarkSet]) -> tuple[MapReplica, Composite]:
+    composite = Composite()
+    replica = MapReplica(GRID, composite)
+    for each in sets:
+        replica.merge([each])
+    return replica, composite
+
+
+class Acknowledged:
+    """What the keepers' whole digests say is committed."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._committed: dict[str, bytes] | None = None
+        bus.subscribe(DIGEST, self._hear)
+
+    def _hear(self, event: Event) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Digest):
+            digest = event.message
+            if digest.role == "keeper" and digest.whole:
+                self._committed = digest.held
+
+    def not_yet(self, author: Any) -> int | None:
+        """How many of an author's sets no keeper has committed yet; None before any keeper spoke."""
+        if self._committed is None or author.replica.author is None:
+            return None
+        return len(author.replica.held.ahead_of(self._committed, [author.replica.author]))

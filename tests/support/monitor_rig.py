@@ -7,20 +7,18 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.scene import Ground
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.monitor.sinks import Outlets
+from launch_scripts.monitor.sinks import Sinks
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
-from swarm.bus.bus import Event
-from swarm.bus.memory_bus import MemoryBus, MemoryNetwork, PerfectLinks
-from swarm.bus.scheduler import Scheduler
-from swarm.clock import NS_PER_S, ManualClock
+from swarm.bus.memory_bus import MemoryBus
+from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.liveness import Peer
-from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import PlannerStatus
@@ -30,7 +28,7 @@ from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import FLEET, FOLLOWED, MARKS, NOTE, POSE, SIGHTED, STATS, STATUS
 
 SILENT = MonitorConfig(live=False)
-LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0, memory_mib=16)
+LIVE = MonitorConfig(live=True, grpc_port=0, web_port=0)
 FRAME_NS = NS_PER_S // 10
 
 
@@ -54,8 +52,8 @@ def hidden_truth(terrain: Terrain) -> NDArray[np.float32]:
     return truth
 
 
-class Rig:
-    """A monitor on a memory bus, and somebody else who speaks."""
+class Rig(SwarmModel):
+    """A monitor on a memory bus, and somebody else who speaks. Frames are drawn while a run is played."""
 
     def __init__(
         self,
@@ -65,46 +63,34 @@ class Rig:
         live_url: str | None = None,
         config: MonitorConfig = SILENT,
     ) -> None:
-        self.scheduler = Scheduler(ManualClock(0))
-        self.said: set[str] = set()
-
-        def trace(now_ns: int, source: str, destination: str, what: str, payload: bytes) -> None:
-            if source == "monitor":
-                self.said.add(what)
-
-        network = MemoryNetwork(self.scheduler, PerfectLinks(), trace)
-        self.speaker, bus = network.bus("speaker"), network.bus("monitor")
-        self.network, self.terrain, self.scenario = network, terrain, scenario
-        setup = RoleSetup(scenario, "run", "monitor", "0", incarnation=1, started_ns=0)
+        super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
+        self.speaker = self.bus("speaker")
         ground = Ground(terrain)
-        self.outlets = Outlets("run.1", path, config, make_blueprint(ground))
+        self.sinks = Sinks("run.1", path, config, make_blueprint(ground))
+        setup = self.setup("monitor", "0")
+        self.service = self.start(
+            "monitor",
+            lambda bus, post: MonitorService(
+                setup, terrain, bus, post, self.sinks.rec, ground=ground, live_url=live_url
+            ),
+        )
 
-        def post(event: Event) -> None:
-            self.service.handle(event, self.scheduler.clock.now_ns())
-
-        self.service = MonitorService(setup, terrain, bus, post, self.outlets.rec, ground=ground, live_url=live_url)
-        self.service.start(0)
+    @property
+    def said(self) -> set[str]:
+        return {what for _, source, _, what, _ in self.deliveries if source == "monitor"}
 
     def play(self, told: Iterable[tuple[int, Message | Peer]]) -> None:
         for now_ns, message in told:
-            self.until(now_ns)
+            self.run_until(now_ns)
             if isinstance(message, Peer):
                 self.speaker.declare_alive(message)
             else:
                 say(self.speaker, self.terrain, message)
-        self.until(self.scheduler.clock.now_ns() + NS_PER_S)
-
-    def until(self, end_ns: int) -> None:
-        """Frames up to a moment."""
-        while self.scheduler.clock.now_ns() < end_ns:
-            now_ns = self.scheduler.clock.now_ns()
-            self.scheduler.run_until(min(now_ns + FRAME_NS - now_ns % FRAME_NS, end_ns))
-            if self.scheduler.clock.now_ns() % FRAME_NS == 0:
-                self.service.tick(self.scheduler.clock.now_ns())
+        self.run(1)
 
     def close(self) -> None:
-        self.service.stop(self.scheduler.clock.now_ns())
-        self.outlets.close()
+        self.service.stop(self.now_ns)
+        self.sinks.close()
 
 
 def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:

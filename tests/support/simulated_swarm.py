@@ -133,7 +133,9 @@ class Laws:
         """What each living process holds."""
         nodes = self.simulation.nodes.values()
         replicas = {node.name: replica_of(node) for node in nodes if node.service is not None}
-        return {name: sets_of(replica.digest()) for name, replica in replicas.items() if replica is not None}
+        return {
+            name: sets_of(replica.held.ledger.held()) for name, replica in replicas.items() if replica is not None
+        }
 
     def stored(self) -> Sets:
         """What is on the keeper's disk."""

@@ -23,7 +23,16 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import NO_TARGET, Claims, Fleet, Followed, Grounds, VehicleState, Want
+from swarm.wire.messages.vehicles import (
+    NO_TARGET,
+    Fleet,
+    Followed,
+    RequestedCell,
+    Reservations,
+    TerritoryReply,
+    TerritoryRequest,
+    VehicleState,
+)
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 from swarm.wire.statements import TILE_AREA, MarkKind
 
@@ -129,10 +138,10 @@ def route_requests(draw: st.DrawFn) -> RouteRequest:
     )
 
 
-claims = st.builds(
-    Claims, agent=ids, incarnation=naturals, seq=naturals, clock=naturals,
-    holds=st.dictionaries(ids, st.lists(cells, min_size=1, max_size=4), max_size=3),
-    wants=st.lists(st.builds(Want, vehicle=ids, cell=cells, ticket=naturals), max_size=3),
+reservations = st.builds(
+    Reservations, agent=ids, incarnation=naturals, seq=naturals, clock=naturals,
+    held=st.dictionaries(ids, st.lists(cells, min_size=1, max_size=4), max_size=3),
+    requested=st.lists(st.builds(RequestedCell, vehicle=ids, cell=cells, ticket=naturals), max_size=3),
     seen=st.dictionaries(ids, st.tuples(naturals, naturals), max_size=3),
 )  # fmt: skip
 
@@ -155,10 +164,14 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     BaseMapRequest: st.builds(BaseMapRequest, layers=st.lists(texts, max_size=3), regions=st.lists(naturals)),
     BaseMapTile: st.builds(BaseMapTile, layer=texts, region=naturals, data=st.binary(max_size=50)),
     Fleet: fleets(),
-    Claims: claims,
-    Grounds: st.builds(
-        Grounds, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(naturals, max_size=3),
-        silent=st.lists(ids, max_size=2), words=st.lists(claims, max_size=2),
+    Reservations: reservations,
+    TerritoryRequest: st.builds(
+        TerritoryRequest, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(naturals, max_size=3),
+        silent=st.lists(ids, max_size=2),
+    ),
+    TerritoryReply: st.builds(
+        TerritoryReply, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(naturals, max_size=3),
+        reservations=st.lists(reservations, max_size=2),
     ),
     Followed: st.builds(
         Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite, lower_bound_s=finite
@@ -234,13 +247,16 @@ EXAMPLES: tuple[Message, ...] = (
         south_m=pack_column([1.0, 2.0], "<f4"), heading_rad=pack_column([0.0, 3.0], "<f4"), states=bytes([2, 0]),
         targets=bytes([0, NO_TARGET]),
     ),
-    Claims(
-        agent="a0", incarnation=7, seq=3, clock=4, holds={"a0-00": [4, 5]},
-        wants=[Want(vehicle="a0-00", cell=6, ticket=3)], seen={"a1": (7, 2)},
+    Reservations(
+        agent="a0", incarnation=7, seq=3, clock=4, held={"a0-00": [4, 5]},
+        requested=[RequestedCell(vehicle="a0-00", cell=6, ticket=3)], seen={"a1": (7, 2)},
     ),
-    Grounds(
-        agent="a0", incarnation=7, seq=2, plots=[0, 3], silent=["a1"],
-        words=[Claims(agent="a1", incarnation=7, seq=2, clock=1, holds={"a1-00": [9]}, wants=[], seen={})],
+    TerritoryRequest(agent="a0", incarnation=7, seq=2, plots=[0, 3], silent=["a1"]),
+    TerritoryReply(
+        agent="a0", incarnation=7, seq=2, plots=[0, 3],
+        reservations=[
+            Reservations(agent="a1", incarnation=7, seq=2, clock=1, held={"a1-00": [9]}, requested=[], seen={})
+        ],
     ),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),

@@ -1,4 +1,4 @@
-"""Where a vehicle is between two cells, and how far it gets in a while."""
+"""The motion of one vehicle: where it is between two cells, and how far it gets in a given time."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from swarm.grid import GridSpec
 
 
 class Motion:
-    """A vehicle on its way from the middle of cell `tail` to the middle of cell `head`; at rest they are one cell.
+    """A step from the middle of cell `tail` to the middle of cell `head`; at rest both are the same cell.
 
-    It occupies the cell that its point is in: `tail` up to half way, `head` from there on.
+    The vehicle is a point. It occupies `tail` up to half of the way, and `head` from there on.
+
+    done_m       metres driven of the step
+    heading_rad  clockwise from north
     """
 
     __slots__ = ("_grid", "_length_m", "done_m", "head", "heading_rad", "tail")
@@ -30,16 +33,16 @@ class Motion:
 
     @property
     def at_rest(self) -> bool:
-        """Whether it stands in the middle of a cell, free to go anywhere."""
+        """Whether it stands in the middle of a cell, so that it may set out in any direction."""
         return self.tail == self.head
 
     @property
     def entering(self) -> int | None:
-        """The cell that it moves towards and does not occupy yet."""
+        """The cell that it drives towards and does not occupy yet; None if there is none."""
         return None if self.cell == self.head else self.head
 
     def set_out(self, cell: int) -> None:
-        """Begin a step to a neighbour of the cell in whose middle it stands."""
+        """Begin a step to a neighbour cell. Raises ValueError if it is not at rest or the cell is no neighbour."""
         rows = cell // self._grid.cols - self.head // self._grid.cols
         cols = cell % self._grid.cols - self.head % self._grid.cols
         if not self.at_rest or max(abs(rows), abs(cols)) != 1:
@@ -50,14 +53,14 @@ class Motion:
         self.heading_rad = math.atan2(cols, -rows) % math.tau
 
     def turn_back(self) -> None:
-        """Go back to the middle of the cell that it occupies, if it has not left it."""
+        """Return to the middle of the cell that it occupies, if it has not entered the next one."""
         if self.entering is not None:
             self.tail, self.head = self.head, self.tail
             self.done_m = self._length_m - self.done_m
             self.heading_rad = (self.heading_rad + math.pi) % math.tau
 
     def advance(self, seconds: float, pace_s_per_m: float) -> float:
-        """Drive at a pace, at most to the border into `head` or to its middle, whichever comes first.
+        """Drive for some seconds at a pace in s/m, at most to the border of `head` or, behind it, to its middle.
 
         Returns the seconds that are left.
         """
@@ -74,7 +77,7 @@ class Motion:
         return seconds - needed_s
 
     def place_m(self) -> tuple[float, float]:
-        """(east, south) metres from the grid's north-west corner."""
+        """(east, south) in metres from the north-west corner of the grid."""
         cols, resolution_m = self._grid.cols, self._grid.resolution_m
         share = self.done_m / self._length_m if self._length_m else 0.0
         row0, col0 = divmod(self.tail, cols)

@@ -1,4 +1,4 @@
-"""A route on its way to be driven: which cells come next from here."""
+"""A route while it is driven: which cells come next."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _STEP_COL = np.array(STEP_COL, np.int64)
 
 
 class Follower:
-    """The cells of a route and how far along it the vehicle is. Without a route nothing is ahead."""
+    """The cells of a route and how far along it the vehicle is. Without a route no cell is ahead."""
 
     __slots__ = ("_at", "_cells", "partial")
 
@@ -21,10 +21,10 @@ class Follower:
         self._cells: list[int] = []
         self._at = 0
         self.partial = False
-        """Whether the route goes on beyond the part that was given."""
+        """Whether the route ends before its target, because the planner gave a part of it."""
 
     def begin(self, cells: Sequence[int], here: int, partial: bool = False) -> bool:
-        """Follow a route from `here` on. False, and nothing changes, if it does not pass here."""
+        """Follow a route from the cell `here` on. False if it does not pass there; then nothing changes."""
         try:
             at = cells.index(here)
         except ValueError:
@@ -40,12 +40,12 @@ class Follower:
         self.partial = False
 
     def moved(self, cell: int) -> None:
-        """The vehicle came to the next cell of the route."""
+        """The vehicle has entered a cell; on its route if it is the next one."""
         if self._at + 1 < len(self._cells) and self._cells[self._at + 1] == cell:
             self._at += 1
 
     def ahead(self, count: int | None = None) -> list[int]:
-        """The next cells, the vehicle's own not among them."""
+        """The next `count` cells, or all that are left, without the one on which the vehicle is."""
         first = self._at + 1
         return self._cells[first:] if count is None else self._cells[first : first + count]
 
@@ -64,7 +64,10 @@ class Follower:
         return False
 
     def splice(self, detour: Sequence[int]) -> bool:
-        """Drive these cells first, then on along the route from where the last of them lies on it."""
+        """Put a detour before the rest of the route, which goes on behind the last cell of the detour.
+
+        False if that cell is not ahead on the route; then nothing changes.
+        """
         if not detour or not self._cells:
             return False
         try:
@@ -78,7 +81,8 @@ class Follower:
 
 
 def route_cells(grid: GridSpec, start: int, directions: bytes) -> tuple[int, ...] | None:
-    """The cells of a route from the network, `start` first; None if it leaves the grid or is none."""
+    """The cells of a route as planners send it, `start` first; None if it leaves the grid or has a wrong
+    direction."""
     if not 0 <= start < grid.cells:
         return None
     codes = np.frombuffer(directions, np.uint8)

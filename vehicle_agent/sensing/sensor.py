@@ -1,4 +1,4 @@
-"""What is seen from here, and which marks follow from it."""
+"""What vehicles see of the terrain, and which marks follow from it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from swarm.grid import GridSpec
 from swarm.wire.statements import MarkKind
 
 _TOLERANCE = np.float32(0.01)
-"""A pace that differs by less than this share is the same."""
+"""Paces that differ by less than this share count as equal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """Cells seen and their true pace in s/m, inf where it is lethal. A cell may be seen twice."""
+    """Cells that are seen, flat indices, and their true pace in s/m, inf if lethal. A cell may occur twice."""
 
     cells: NDArray[np.int64]
     paces: NDArray[np.float32]
@@ -26,7 +26,7 @@ class Sight:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """Where what was seen differs from the map: what to mark."""
+    """What to mark: cells, flat indices; a `MarkKind` each; and the pace seen in s/m."""
 
     cells: NDArray[np.int64]
     kinds: NDArray[np.uint8]
@@ -38,14 +38,15 @@ class Findings:
 
 class Sensor(Protocol):
     def look(self, cells: Sequence[int]) -> Sight:
-        """What can be seen from these cells: always at least the cell itself and its eight neighbours."""
+        """What is seen from these cells: at least each cell itself and its eight neighbours."""
         ...
 
 
 class TruthSensor:
     """The simulated sensor: sees the true pace of every cell whose middle lies within a radius.
 
-    truth  float32 (rows, cols); read at each look, so that it may change under way
+    truth    float32 (rows, cols), s/m; read at each look, so that it may change during a run
+    range_m  the radius
     """
 
     def __init__(self, grid: GridSpec, truth: NDArray[np.float32], range_m: float) -> None:
@@ -57,7 +58,6 @@ class TruthSensor:
         near |= np.maximum(abs(south), abs(east)) <= 1
         self._south: NDArray[np.int64] = south[near].astype(np.int64)
         self._east: NDArray[np.int64] = east[near].astype(np.int64)
-        self.reach_cells = reach
 
     def look(self, cells: Sequence[int]) -> Sight:
         row, col = np.divmod(np.asarray(cells, np.int64)[:, None], self._grid.cols)
@@ -68,9 +68,9 @@ class TruthSensor:
 
 
 def compare(sight: Sight, ground: NDArray[np.float32], prior: NDArray[np.float32]) -> Findings:
-    """What to mark: where the ground in our map is not what was seen.
+    """Where the map differs from what was seen.
 
-    ground, prior  float32 (rows, cols)  pace with marks and without, both before inflation
+    ground, prior  float32 (rows, cols), s/m, before inflation; ground is with marks, prior without
     """
     known = ground.reshape(-1)[sight.cells]
     wrong = _differ(sight.paces, known)

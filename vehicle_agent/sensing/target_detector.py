@@ -1,25 +1,35 @@
-"""Which targets an agent's vehicles see, and what they tell of it."""
+"""Which targets an agent's vehicles see, and where targets are that only vehicles see."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
+from shared_map.replication.filter import MarkFilter
+from shared_map.sightings import Sightings, pose_of
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.targets import Sighted, TargetPose
 from vehicle_agent.driving.vehicle import Vehicle
 
 _TELL_NS = NS_PER_S // 2
-"""A target that stays in sight is told of so often."""
+"""Period of the sightings of a target that stays in sight."""
 _RANGE_SHARE = 0.02
-"""The simulated sensor is off by this share of the distance, besides half a cell."""
+"""The uncertainty of a sighting is half a cell and this share of the distance."""
+SIGHTING_LASTS_S = 30.0
+"""A sighting expires after this many seconds: by then a target may be anywhere within some hundred metres."""
 
 
-class Lookout:
-    """The simulated sensor for targets: it knows where they truly are, and tells only of those within its range."""
+class TargetDetector:
+    """The simulated sensor for targets: knows where all are, and reports those within its range.
 
-    def __init__(self, grid: GridSpec, author: str, group: str, range_m: float, lasts_s: float) -> None:
+    range_m  of the sensor
+    lasts_s  a sighting expires after so long
+    """
+
+    def __init__(
+        self, grid: GridSpec, author: str, group: str, range_m: float, lasts_s: float = SIGHTING_LASTS_S
+    ) -> None:
         self._grid = grid
         self._author = author
         self._group = group
@@ -29,14 +39,14 @@ class Lookout:
         self._told_ns: dict[str, int] = {}
         self._seq = 0
 
-    def truth(self, pose: TargetPose) -> None:
-        """Where a target is: the ground that the sensor looks at."""
+    def set_truth(self, pose: TargetPose) -> None:
+        """Where a target truly is. Of each target the newest pose counts."""
         known = self._true.get(pose.target)
         if known is None or (pose.incarnation, pose.seq) > (known.incarnation, known.seq):
             self._true[pose.target] = pose
 
     def look(self, vehicles: Iterable[Vehicle], now_ns: int) -> list[Sighted]:
-        """What there is to tell of targets in sight, each by the vehicle that is nearest."""
+        """The sightings to publish now: of each target in sight one, by the nearest vehicle."""
         due = [id for id in self._true if now_ns - self._told_ns.get(id, -_TELL_NS) >= _TELL_NS]
         if not due:
             return []
@@ -65,3 +75,25 @@ class Lookout:
             y_m=pose.y_m,
             uncertainty_m=0.5 * self._grid.resolution_m + _RANGE_SHARE * distance_m,
         )
+
+
+class UntrackedTargets:
+    """The targets that no tracker reports: each is where the best sighting of it says.
+
+    reading  whose sightings count
+    """
+
+    def __init__(self, targets: Collection[str], reading: MarkFilter) -> None:
+        self.targets = targets
+        self._sightings = Sightings(reading)
+
+    def hear(self, sighted: Sighted, now_ns: int) -> TargetPose | None:
+        """The pose of an untracked target after one more sighting; None if that is no news of one."""
+        if sighted.target not in self.targets or not self._sightings.hear(sighted):
+            return None
+        best = self._sightings.best(now_ns).get(sighted.target)  # None if the sighting came after it expired
+        return None if best is None else pose_of(best)
+
+    def expire(self, now_ns: int) -> None:
+        """Forget expired sightings. A vehicle goes on to where it last knew its target to be."""
+        self._sightings.expire(now_ns)

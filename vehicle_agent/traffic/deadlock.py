@@ -1,23 +1,24 @@
-"""How vehicles get past each other: whom to wait for, when to make way, how to drive around.
+"""Which cells each vehicle requests, and what it does when it is blocked: make way, drive around, or ask.
 
-Right of way alone keeps vehicles apart but lets them block each other for good. Two rules undo that. Whoever stands
-on a cell that somebody wants, with nowhere to go, makes way. Of two that face each other the weaker makes way: it
-steps back or aside, pushing others if it must, until it is out of the other's path, rests, and asks for a new
-route. And nobody wants a cell that a stronger one wants.
+Right of way keeps vehicles apart but lets them block each other for good. Three rules undo that:
+ 1. A vehicle without a next cell makes way for any that requests the cell on which it stands.
+ 2. Of two vehicles that face each other the weaker one makes way: it steps back or aside, pushing others if it
+    must, rests, and asks for a new route.
+ 3. A vehicle requests no cell that a stronger one requests.
 
-How strong a vehicle is follows from its name and the hour, so that all agree without a word; and it is as strong as
-the strongest that waits behind it. So the strongest of a jam always gets through (priority inheritance: Okumura et
-al., "Priority inheritance with backtracking", 2019), and the lots are drawn anew before long.
+The strength of a vehicle is a checksum of its name and the time, so that all agents compute the same without a
+message. It changes every few patiences. A vehicle is as strong as the strongest that waits behind it, so the
+strongest of a jam always gets through: priority inheritance, after PIBT (Okumura et al., IJCAI 2019).
 """
 
 from __future__ import annotations
 
-import heapq
 import math
 import random
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,25 +28,34 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import VehicleState
-from vehicle_agent.driving.vehicle import MadeWay, MakesWay, StillBlocked, Vehicle
-from vehicle_agent.traffic.right_of_way import RightOfWay, Wanter
+from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.traffic.detour import HORIZON_CELLS, Detours
+from vehicle_agent.traffic.right_of_way import Requester, RightOfWay
 
 _LONGEST_QUEUE = 40
-_LOTS_LAST = 15.0
-"""Lots are drawn anew after so many times the patience."""
-_DETOUR_CELLS = 6
-_DETOUR_HORIZON = 40
+"""Bounds the search for the strongest vehicle behind one."""
+_STRENGTH_LASTS = 15.0
+"""Strengths change after so many times the patience."""
 _LOOK_AHEAD_CELLS = 5
 _CROWD_WEIGHT = 0.2
 _POLITE_NS = NS_PER_S * 3 // 10
+"""A vehicle without a next cell stays so long on a requested cell: the request may be withdrawn."""
 
 
 @dataclass(slots=True)
 class _Standing:
-    """How long a vehicle has stood in somebody's way, or somebody in its."""
+    """Since when a vehicle is blocked or in the way, and what it does about it.
+
+    blocked_since_ns    since when it waits for its next cell
+    requested_since_ns  since when another vehicle requests the cell on which it stands
+    detour_due_ns       not to search a detour before
+    aside               the cell to which it makes way; None if it does not
+    aside_since_ns      since when it makes way
+    patience_ns         how long it waits before it does anything; drawn anew after each try
+    """
 
     blocked_since_ns: int | None = None
-    wanted_since_ns: int | None = None
+    requested_since_ns: int | None = None
     detour_due_ns: int = 0
     aside: int | None = None
     aside_since_ns: int = 0
@@ -53,11 +63,11 @@ class _Standing:
 
 
 class Traffic:
-    """Decides for each vehicle which cells to claim next.
+    """Decides for each vehicle which cells to request next.
 
-    pace      float32 (rows, cols) of the map, inf is lethal; read only
-    presence  who is near: parked vehicles are driven around before one stands behind them, and whoever makes way
-              does so to where it is emptier
+    pace      float32 (rows, cols), s/m; inf is lethal; read only
+    presence  where other vehicles are: parked ones are driven around in time, and a vehicle that makes way prefers
+              cells with few others near
     """
 
     def __init__(
@@ -73,18 +83,17 @@ class Traffic:
         self._presence = presence
         self._pace = pace.reshape(-1)
         self._rights = rights
-        self._claim_cells = scenario.vehicles.claim_cells
+        self._reserve_cells = scenario.vehicles.reserve_cells
         self._patience_s = scenario.vehicles.patience_s
         self._cell_scale = grid.resolution_m / scenario.time_scale
         flat_s = self._cell_scale / scenario.cost.flat_speed_m_per_s
-        self._lots_ns = max(1, int(_LOTS_LAST * (self._patience_s + 2 * flat_s) * NS_PER_S))
-        self._neighbours = scenario.planner.neighbours
-        self._corner_cutting = scenario.planner.corner_cutting
+        self._strength_ns = max(1, int(_STRENGTH_LASTS * (self._patience_s + 2 * flat_s) * NS_PER_S))
+        self._detours = Detours(grid, pace, scenario.planner.neighbours, scenario.planner.corner_cutting)
         self._chance = chance
         self._notes: dict[str, _Standing] = {}
 
     def next_cell(self, vehicle: Vehicle, now_ns: int) -> int | None:
-        """Where the vehicle goes as soon as it may; None if it means to stay."""
+        """The cell that the vehicle enters as soon as it may; None if it stays."""
         note = self._notes.get(vehicle.id)
         if note is not None and note.aside is not None:
             return note.aside if note.aside != vehicle.cell else None
@@ -94,65 +103,68 @@ class Traffic:
         return ahead[0] if ahead else None
 
     def closed(self, cell: int) -> bool:
-        return not math.isfinite(self._pace[cell])
+        return self._detours.closed(cell)
 
     def steer(self, vehicle: Vehicle, in_reach: Callable[[int], bool], now_ns: int) -> bool:
-        """Claim what the vehicle needs next. True if somebody is in its way."""
+        """Request what the vehicle needs next. True if another vehicle is in its way.
+
+        in_reach  whether the target is within capture range of a cell
+        """
         note = self._notes.setdefault(vehicle.id, _Standing(patience_ns=self._patience(vehicle)))
         if not vehicle.motion.at_rest:
             note.blocked_since_ns = None
             self._look_ahead(vehicle, note, in_reach, now_ns)
-            self._rights.ask(vehicle.id, self._ahead(vehicle, note, now_ns))
+            self._rights.request(vehicle.id, self._ahead(vehicle, note, now_ns))
             return False
         if note.aside is not None and self._aside_goes_on(vehicle, note, now_ns):
             return False
-        wanters = self._rights.wanters(vehicle.cell, besides=vehicle.id)
-        if not wanters:
-            note.wanted_since_ns = None
-        elif note.wanted_since_ns is None:
-            note.wanted_since_ns = now_ns
+        requesters = self._rights.requesters(vehicle.cell, besides=vehicle.id)
+        if not requesters:
+            note.requested_since_ns = None
+        elif note.requested_since_ns is None:
+            note.requested_since_ns = now_ns
         self._look_ahead(vehicle, note, in_reach, now_ns)
         ahead = self._ahead(vehicle, note, now_ns)
-        self._rights.ask(vehicle.id, ahead)
+        self._rights.request(vehicle.id, ahead)
         next_cell = self.next_cell(vehicle, now_ns)
         if next_cell is None:
             note.blocked_since_ns = None
-            self._stand(vehicle, note, wanters, in_reach, now_ns)
+            self._stand(vehicle, note, requesters, in_reach, now_ns)
             return False
-        if self._rights.holds(vehicle.id)[1:2] == [next_cell]:
+        if self._rights.held(vehicle.id)[1:2] == [next_cell]:
             note.blocked_since_ns = None
             return False
         if note.blocked_since_ns is None:
             note.blocked_since_ns = now_ns
             note.patience_ns = self._patience(vehicle)
-        self._wait(vehicle, note, next_cell, wanters, in_reach, now_ns)
+        self._wait(vehicle, note, next_cell, requesters, in_reach, now_ns)
         return self._in_the_way(vehicle.id, next_cell)
 
-    # --- what to claim --------------------------------------------------------------------------------------
+    # --- what to request ------------------------------------------------------------------------------------
 
     def _ahead(self, vehicle: Vehicle, note: _Standing, now_ns: int) -> list[int]:
-        """The cells to claim: those next on the way, up to the first on which somebody is."""
+        """The cells to request: the next ones of the route, up to the first that another vehicle holds."""
         entering = vehicle.motion.entering
         if note.aside is not None:
             return [note.aside] if note.aside != vehicle.cell else []
         if vehicle.state is VehicleState.ARRIVED or vehicle.resting(now_ns):
             return [] if entering is None else [entering]
-        claims: list[int] = []
-        held = self._rights.holds(vehicle.id)
-        for cell in vehicle.route.ahead(self._claim_cells):
+        cells: list[int] = []
+        held = self._rights.held(vehicle.id)
+        for cell in vehicle.route.ahead(self._reserve_cells):
             if self.closed(cell) or (cell not in held and self._deferred(vehicle, cell, now_ns)):
                 break
-            claims.append(cell)
+            cells.append(cell)
             if self._in_the_way(vehicle.id, cell):
                 break
-        return claims
+        return cells
 
     def _deferred(self, vehicle: Vehicle, cell: int, now_ns: int) -> bool:
-        """Whether a stronger one wants the cell."""
-        rivals = self._rights.wanters(cell, besides=vehicle.id)
+        """Whether a stronger vehicle requests the cell, and is not one that waits behind this one."""
+        rivals = self._rights.requesters(cell, besides=vehicle.id)
         if not rivals:
             return False
-        behind = self._rights.wanters(vehicle.cell, besides=vehicle.id)
+        behind = self._rights.requesters(vehicle.cell, besides=vehicle.id)
         rivals = [rival for rival in rivals if rival not in behind]
         mine = min([self._strength(vehicle.id, now_ns), *self._strengths(vehicle.id, behind, now_ns)])
         return any(strength < mine for strength in self._strengths(vehicle.id, rivals, now_ns))
@@ -162,129 +174,131 @@ class Traffic:
         return holder is not None and holder != vehicle
 
     def _patience(self, vehicle: Vehicle) -> int:
-        """How long to wait, in ns: also as long as somebody ahead may take to get off a cell like this one."""
+        """How long to wait, in ns: at least as long as a vehicle ahead may take to leave a cell like this one."""
         pace = float(self._pace[vehicle.cell])
         crossing_s = 1.5 * pace * self._cell_scale if math.isfinite(pace) else 0.0
-        # Of two that wait for each other one loses patience first.
+        # Random, so that of two vehicles that wait for each other one acts first.
         return int((self._patience_s + crossing_s) * self._chance.uniform(0.8, 1.6) * NS_PER_S)
 
-    # --- who is the stronger --------------------------------------------------------------------------------
+    # --- which is stronger ----------------------------------------------------------------------------------
 
     def _strength(self, vehicle: str, now_ns: int) -> int:
-        """By lot, the same in every process; the lower is the stronger."""
-        return zlib.crc32(f"{now_ns // self._lots_ns}/{vehicle}".encode())
+        """The lower is the stronger. The same in every process, if clocks agree to some seconds."""
+        return zlib.crc32(f"{now_ns // self._strength_ns}/{vehicle}".encode())
 
-    def _strengths(self, vehicle: str, wanters: list[Wanter], now_ns: int) -> list[int]:
-        """Of each of those who want the vehicle's place: its own, or that of the strongest behind it."""
-        return [self._inherited(wanter, {vehicle}, now_ns) for wanter in wanters]
+    def _strengths(self, vehicle: str, requesters: list[Requester], now_ns: int) -> list[int]:
+        """Of each vehicle that requests this one's cell: its strength, or that of the strongest behind it."""
+        return [self._inherited(requester, {vehicle}, now_ns) for requester in requesters]
 
-    def _inherited(self, wanter: Wanter, passed: set[str], now_ns: int) -> int:
-        strength = self._strength(wanter.vehicle, now_ns)
-        passed.add(wanter.vehicle)
-        if wanter.stands_on is not None and len(passed) < _LONGEST_QUEUE:
-            for behind in self._rights.wanters(wanter.stands_on, besides=wanter.vehicle):
+    def _inherited(self, requester: Requester, passed: set[str], now_ns: int) -> int:
+        strength = self._strength(requester.vehicle, now_ns)
+        passed.add(requester.vehicle)
+        if requester.stands_on is not None and len(passed) < _LONGEST_QUEUE:
+            for behind in self._rights.requesters(requester.stands_on, besides=requester.vehicle):
                 if behind.vehicle not in passed:
                     strength = min(strength, self._inherited(behind, passed, now_ns))
         return strength
 
-    def _strongest(self, vehicle: str, wanters: list[Wanter], now_ns: int) -> Wanter:
-        strengths = self._strengths(vehicle, wanters, now_ns)
-        return wanters[strengths.index(min(strengths))]
+    def _strongest(self, vehicle: str, requesters: list[Requester], now_ns: int) -> Requester:
+        strengths = self._strengths(vehicle, requesters, now_ns)
+        return requesters[strengths.index(min(strengths))]
 
     # --- making way -----------------------------------------------------------------------------------------
 
     def _aside_goes_on(self, vehicle: Vehicle, note: _Standing, now_ns: int) -> bool:
-        """Whether it still waits to step aside; done with it, it rests a while."""
+        """Whether the vehicle still waits to step aside. When it has, it rests a while."""
         if vehicle.cell == note.aside:
             note.aside = None
-            note.wanted_since_ns = None
+            note.requested_since_ns = None
             note.patience_ns = self._patience(vehicle)
-            vehicle.handle(MadeWay(now_ns + 2 * note.patience_ns), now_ns)
+            vehicle.made_way(now_ns + 2 * note.patience_ns, now_ns)
             return False
         assert note.aside is not None
         given_up = now_ns - note.aside_since_ns > 4 * note.patience_ns or self.closed(note.aside)
-        if given_up and self._rights.holds(vehicle.id)[1:2] != [note.aside]:
+        if given_up and self._rights.held(vehicle.id)[1:2] != [note.aside]:
             note.aside = None
             note.patience_ns = self._patience(vehicle)
-            vehicle.handle(MadeWay(now_ns), now_ns)
+            vehicle.made_way(now_ns, now_ns)
             return False
-        self._rights.ask(vehicle.id, [note.aside])
+        self._rights.request(vehicle.id, [note.aside])
         return True
 
     def _stand(
         self,
         vehicle: Vehicle,
         note: _Standing,
-        wanters: list[Wanter],
+        requesters: list[Requester],
         in_reach: Callable[[int], bool],
         now_ns: int,
     ) -> None:
-        """It has nowhere to go: make way for whoever has. Whoever has arrived stays in reach as long as it can."""
-        if not wanters or note.wanted_since_ns is None:
+        """Without a next cell: make way for those that have one. A vehicle that has arrived stays in reach of its
+        target as long as it can."""
+        if not requesters or note.requested_since_ns is None:
             return
-        wanter = self._strongest(vehicle.id, wanters, now_ns)
-        wanted_ns = now_ns - note.wanted_since_ns
-        if wanted_ns < (0 if vehicle.resting(now_ns) else _POLITE_NS):
+        requester = self._strongest(vehicle.id, requesters, now_ns)
+        requested_ns = now_ns - note.requested_since_ns
+        if requested_ns < (0 if vehicle.resting(now_ns) else _POLITE_NS):
             return
         stay = vehicle.state is VehicleState.ARRIVED
-        if not self._step_aside(vehicle, note, wanter, in_reach if stay else None, now_ns) and (
-            stay and wanted_ns > 6 * note.patience_ns
+        if not self._step_aside(vehicle, note, requester, in_reach if stay else None, now_ns) and (
+            stay and requested_ns > 6 * note.patience_ns
         ):
-            self._step_aside(vehicle, note, wanter, None, now_ns)
+            self._step_aside(vehicle, note, requester, None, now_ns)
 
     def _wait(
         self,
         vehicle: Vehicle,
         note: _Standing,
         next_cell: int,
-        wanters: list[Wanter],
+        requesters: list[Requester],
         in_reach: Callable[[int], bool],
         now_ns: int,
     ) -> None:
-        """It cannot go on: after a while make way, or drive around, or ask."""
+        """The next cell is not granted: when patience ends make way, or drive around, or ask the planner."""
         assert note.blocked_since_ns is not None
         waited_ns = now_ns - note.blocked_since_ns
         if waited_ns < note.patience_ns:
             return
-        facing = [wanter for wanter in wanters if wanter.stands_on == next_cell]
-        behind = [wanter for wanter in wanters if wanter.stands_on != next_cell]
+        facing = [requester for requester in requesters if requester.stands_on == next_cell]
+        behind = [requester for requester in requesters if requester.stands_on != next_cell]
         mine = min([self._strength(vehicle.id, now_ns), *self._strengths(vehicle.id, behind, now_ns)])
         weaker = facing and min(self._strengths(vehicle.id, facing, now_ns)) < mine
-        if weaker or (wanters and waited_ns > 8 * note.patience_ns):
-            wanter = self._strongest(vehicle.id, facing or wanters, now_ns)
-            if self._step_aside(vehicle, note, wanter, None, now_ns):
+        if weaker or (requesters and waited_ns > 8 * note.patience_ns):
+            requester = self._strongest(vehicle.id, facing or requesters, now_ns)
+            if self._step_aside(vehicle, note, requester, None, now_ns):
                 return
         if now_ns >= note.detour_due_ns:
-            note.detour_due_ns = now_ns + max(waited_ns, note.patience_ns)  # less often the longer it is in vain
+            note.detour_due_ns = now_ns + max(waited_ns, note.patience_ns)  # less often the longer none is found
             if self._detour(vehicle, in_reach):
                 note.blocked_since_ns = None
                 return
         if waited_ns > 10 * note.patience_ns:
             note.blocked_since_ns = now_ns
             note.patience_ns = self._patience(vehicle)
-            vehicle.handle(StillBlocked(), now_ns)
+            vehicle.blocked_for_long(now_ns)
 
     def _step_aside(
         self,
         vehicle: Vehicle,
         note: _Standing,
-        wanter: Wanter,
+        requester: Requester,
         in_reach: Callable[[int], bool] | None,
         now_ns: int,
     ) -> bool:
-        """Head for the neighbour that is best out of the way. An occupied one is wanted, too: so it gets pushed."""
+        """Request the neighbour cell that is best out of the way. The request for an occupied one pushes its
+        holder."""
         here = vehicle.cell
         best: tuple[float, int] | None = None
-        for cell, _ in self._steps(here):
-            if cell == wanter.stands_on or (in_reach is not None and not in_reach(cell)):
+        for cell, _ in self._detours.steps(here):
+            if cell == requester.stands_on or (in_reach is not None and not in_reach(cell)):
                 continue
-            score = self._chance.random() + self._in_path(wanter.stands_on, here, cell)
+            score = self._chance.random() + self._in_path(requester.stands_on, here, cell)
             score += _CROWD_WEIGHT * self._crowd(cell)
             if self._in_the_way(vehicle.id, cell):
                 if in_reach is not None:
                     continue
                 score += 10.0
-            elif self._rights.wanters(cell, besides=vehicle.id):
+            elif self._rights.requesters(cell, besides=vehicle.id):
                 score += 3.0
             if best is None or (score, cell) < best:
                 best = (score, cell)
@@ -293,18 +307,18 @@ class Traffic:
         note.aside = best[1]
         note.aside_since_ns = now_ns
         note.blocked_since_ns = None
-        vehicle.handle(MakesWay(), now_ns)
-        self._rights.ask(vehicle.id, [note.aside])
+        vehicle.make_way()
+        self._rights.request(vehicle.id, [note.aside])
         return True
 
     def _crowd(self, cell: int) -> int:
-        """How many vehicles are within two cells."""
+        """How many vehicles are within two cells of a cell."""
         row, col = divmod(cell, self._grid.cols)
         size_m = self._grid.resolution_m
         return len(self._presence.near((col + 0.5) * size_m, (row + 0.5) * size_m, 2.5 * size_m))
 
     def _in_path(self, pusher: int | None, here: int, cell: int) -> float:
-        """How likely the pusher wants this cell next: 2 straight ahead, 0 to the side."""
+        """How likely the pushing vehicle needs this cell next: 2 straight ahead or back, 0 to the side."""
         if pusher is None:
             return 0.0
         cols = self._grid.cols
@@ -315,26 +329,8 @@ class Traffic:
 
     # --- driving around -------------------------------------------------------------------------------------
 
-    def _steps(self, cell: int) -> list[tuple[int, float]]:
-        """Where one may go from a cell in one step, and how long the step is in cells."""
-        around: list[int | None] = [None] * 8
-        for direction, neighbour in self._grid.neighbours(cell):
-            if not self.closed(neighbour):
-                around[direction] = neighbour
-        steps: list[tuple[int, float]] = []
-        for direction, found in enumerate(around):
-            if found is None:
-                continue
-            if direction % 2 == 0:
-                steps.append((found, 1.0))
-            elif self._neighbours == 8:
-                sides = around[direction - 1] is not None and around[(direction + 1) % 8] is not None
-                if sides or self._corner_cutting:
-                    steps.append((found, math.sqrt(2.0)))
-        return steps
-
     def _look_ahead(self, vehicle: Vehicle, note: _Standing, in_reach: Callable[[int], bool], now_ns: int) -> None:
-        """Drive around whoever is parked on the route, before standing behind it."""
+        """Drive around a vehicle that is parked on the route, before standing behind it."""
         if now_ns < note.detour_due_ns or note.aside is not None or vehicle.state is not VehicleState.FOLLOWING:
             return
         entering = vehicle.motion.entering
@@ -350,46 +346,16 @@ class Traffic:
     def _detour(
         self, vehicle: Vehicle, in_reach: Callable[[int], bool], start: int | None = None, blocked: int = 0
     ) -> bool:
-        """Put a way around who stands ahead into the route, if there is one nearby over free cells.
+        """Put a detour over free cells into the route; False if there is none.
 
-        start    leave the route from this cell on, the one that is entered, instead of from the vehicle's own
-        blocked  which of the cells ahead is taken: come back to the route behind it
+        start    leave the route from this cell, which is being entered, instead of from the vehicle's own
+        blocked  which of the cells ahead is occupied
         """
         here = vehicle.cell if start is None else start
-        route = vehicle.route.ahead(_DETOUR_HORIZON)
-        rest_s: dict[int, float] = {}
-        total_s = 0.0
-        for index in range(len(route) - 1, blocked, -1):
-            rest_s[route[index]] = total_s
-            total_s += float(self._pace[route[index]])
-        reached: dict[int, float] = {here: 0.0}
-        came_from: dict[int, int] = {}
-        frontier = [(0.0, here)]
-        best: tuple[float, int] | None = None
-        while frontier:
-            cost_s, cell = heapq.heappop(frontier)
-            if cost_s > reached[cell] or (best is not None and cost_s >= best[0]):
-                continue
-            if cell != here:
-                whole_s = cost_s if in_reach(cell) else cost_s + rest_s.get(cell, math.inf)
-                if math.isfinite(whole_s) and (best is None or whole_s < best[0]):
-                    best = (whole_s, cell)
-            for neighbour, length in self._steps(cell):
-                if self._grid.distance_cells(here, neighbour) > _DETOUR_CELLS:
-                    continue
-                if self._in_the_way(vehicle.id, neighbour):
-                    continue
-                through_s = cost_s + length * float(self._pace[neighbour])
-                if through_s < reached.get(neighbour, math.inf):
-                    reached[neighbour] = through_s
-                    came_from[neighbour] = cell
-                    heapq.heappush(frontier, (through_s, neighbour))
-        if best is None:
+        occupied = partial(self._in_the_way, vehicle.id)
+        detour = self._detours.find(here, vehicle.route.ahead(HORIZON_CELLS), blocked, in_reach, occupied)
+        if detour is None:
             return False
-        detour = [best[1]]
-        while came_from[detour[-1]] != here:
-            detour.append(came_from[detour[-1]])
         if here != vehicle.cell:
-            detour.append(here)
-        detour.reverse()
+            detour.insert(0, here)
         return vehicle.route.splice(detour) or vehicle.route.begin([vehicle.cell, *detour], vehicle.cell)

@@ -1,18 +1,25 @@
-"""Who may enter which cell now: right of way among agents that hear only each other's newest claims.
+"""Which vehicle may enter which cell: distributed mutual exclusion per cell.
 
-The rule is Ricart and Agrawala's (1981) on messages that each carry their sender's whole state, so that loss,
-repetition and reordering do no harm. A vehicle may enter a cell when every other live agent has echoed the message
-in which the want first stood, and in nobody's newest claims the cell is held, or wanted with a lower
-(ticket, agent, vehicle). With `SharedGround` only those neighbours and witnesses are waited for and heard whom it
-names, and a cell is wanted only in a plot that it calls settled.
+The algorithm is Ricart and Agrawala's (CACM 24(1), 1981) with whole-state messages instead of a request and a
+reply per entry. An agent publishes its reservations: the cells that its vehicles hold, the cells that they
+request, and for every other agent the number of the newest reservations it has seen. Of each agent only the
+newest reservations count, so loss, repetition and reordering cost time and never safety. `Territory` limits the
+other agents to those that may reserve cells in a common plot.
 
-Why no two get the same cell: A goes by a message of B that echoes A's want, B by one of A that echoes B's. Had B
-got the cell before it sent that message, the message would say so. So B got it later, when it knew A's want, and
-found its own the lower; and A got it when it knew B's, and found its own the lower. Both cannot be. Tickets only
-decide who goes first: they are Lamport's clock, so that a want made after hearing of another queues behind it.
+Rule. A vehicle may hold a requested cell when
+ 1. every other live agent has echoed a message that contains the request, and
+ 2. in the newest reservations of every other agent the cell is neither held, nor requested with a lower rank.
+A rank is (ticket, agent, vehicle). A ticket is a Lamport time (CACM 21(7), 1978): a request made after another
+one was heard of ranks behind it.
 
-What a dead agent held or wanted stays forbidden until a newer incarnation of it speaks: each cell that it may
-stand on was wanted in a message that all who lived then had echoed.
+Why two vehicles never hold one cell. Suppose that A and B both come to hold cell c. A relied on a message m of B
+that echoes A's request. If B held c when it sent m, then m says so, and A was refused. So B got c after m, when
+it knew A's request, and found its own rank lower. By symmetry A got c when it knew B's request, and found its own
+rank lower. Ranks are totally ordered, so this is a contradiction.
+
+Crashes. What a dead agent held or requested stays closed until a newer incarnation of it publishes reservations.
+The dead agent stands only on cells that it requested in a message that all agents of its time had echoed, so
+every agent that was alive then knows them.
 """
 
 from __future__ import annotations
@@ -21,19 +28,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from swarm.wire.messages.vehicles import Claims, Want
-from vehicle_agent.traffic.territory import SharedGround
+from swarm.clock import NS_PER_S
+from swarm.wire.messages.vehicles import RequestedCell, Reservations
+from vehicle_agent.traffic.territory import Territory
 
 _CLOCK_LIMIT = 1 << 61
-_NOBODY: Mapping[str, _Other] = MappingProxyType({})
+"""No honest clock gets there. Larger ones are ignored, so that ours stays within what fits the wire."""
+_IDLE_NS = NS_PER_S // 2
+_NO_AGENTS: Mapping[str, _Other] = MappingProxyType({})
 
 Rank = tuple[int, str, str]
-"""(ticket, agent, vehicle): the lower goes first."""
+"""(ticket, agent, vehicle) of a request: the lower goes first."""
 
 
 @dataclass(slots=True)
-class _Wanted:
-    """A want of ours. `seq` is that of the first message in which it stands."""
+class _Request:
+    """A requested cell of ours. `seq` is the number of the first message that contains it."""
 
     cell: int
     ticket: int
@@ -42,45 +52,53 @@ class _Wanted:
 
 @dataclass(slots=True)
 class _Mine:
-    """One of our vehicles: the cells that it holds, its own first, and those that it wants after them."""
+    """One of our vehicles: the cells that it holds, the one on which it stands first, and those it requests
+    next."""
 
-    holds: list[int] = field(default_factory=list)
-    wants: list[_Wanted] = field(default_factory=list)
+    held: list[int] = field(default_factory=list)
+    requests: list[_Request] = field(default_factory=list)
 
 
 class _Other:
-    """Another agent's newest claims, by cell."""
+    """Another agent's newest reservations, by cell.
 
-    def __init__(self, claims: Claims) -> None:
-        self.claims = claims
+    held        cell -> vehicle
+    rank        cell -> lowest rank of the requests for it
+    requesting  cell -> vehicles that request it
+    heard       False if these are spawn cells, of which the agent has said nothing
+    """
+
+    def __init__(self, reservations: Reservations) -> None:
+        self.reservations = reservations
         self.held: dict[int, str] = {}
-        for vehicle, cells in claims.holds.items():
+        for vehicle, cells in reservations.held.items():
             for cell in cells:
                 self.held[cell] = vehicle
-        self.wanted: dict[int, Rank] = {}
-        self.wanting: dict[int, list[str]] = {}
-        for want in claims.wants:
-            self.wanting.setdefault(want.cell, []).append(want.vehicle)
-            rank = (want.ticket, claims.agent, want.vehicle)
-            if want.cell not in self.wanted or rank < self.wanted[want.cell]:
-                self.wanted[want.cell] = rank
-        self.cells = self.held.keys() | self.wanted.keys()
+        self.rank: dict[int, Rank] = {}
+        self.requesting: dict[int, list[str]] = {}
+        for request in reservations.requested:
+            self.requesting.setdefault(request.cell, []).append(request.vehicle)
+            rank = (request.ticket, reservations.agent, request.vehicle)
+            if request.cell not in self.rank or rank < self.rank[request.cell]:
+                self.rank[request.cell] = rank
+        self.cells = self.held.keys() | self.rank.keys()
+        self.heard = reservations.seq > 0
 
 
 @dataclass(frozen=True, slots=True)
-class Wanter:
-    """Who wants a cell: `stands_on` is None of a vehicle that stands nowhere yet."""
+class Requester:
+    """A vehicle that requests a cell. `stands_on` is None for a vehicle that is not placed yet."""
 
     vehicle: str
     stands_on: int | None
 
 
 class RightOfWay:
-    """The claims of one agent's vehicles beside everybody else's.
+    """The reservations of one agent's vehicles beside those of all other agents.
 
-    spawns  agent -> vehicle -> cell where each agent of the run puts its vehicles when it first starts: held for
-            those that have not spoken yet
-    ground  who shares ground with us; None where everybody does
+    spawns     agent -> vehicle -> cell where each agent of the run first places its vehicles: these cells count as
+               held by agents that we have not heard of yet
+    territory  which agents reserve cells in a common plot; None if all do
     """
 
     def __init__(
@@ -88,58 +106,69 @@ class RightOfWay:
         agent: str,
         incarnation: int,
         spawns: Mapping[str, Mapping[str, int]],
-        ground: SharedGround | None = None,
+        territory: Territory | None = None,
     ) -> None:
         self.agent = agent
         self.incarnation = incarnation
         self._seq = 0
+        """Number of our newest message."""
         self._clock = 0
+        """Lamport clock: the largest ticket that we know of."""
         self._mine: dict[str, _Mine] = {}
         self._held_by: dict[int, str] = {}
-        self._wanting: dict[int, list[str]] | None = None
-        self._ground = ground
+        """Cell -> our vehicle that holds it."""
+        self._requesting: dict[int, list[str]] | None = None
+        """Cell -> our vehicles that request it; None after a change, made anew when asked for."""
+        self._territory = territory
         self._others: dict[str, _Other] = {}
-        self._by_cell: dict[int, dict[str, _Other]] = {}  # who of the others holds or wants a cell
+        self._by_cell: dict[int, dict[str, _Other]] = {}
+        """Cell -> the other agents that hold or request it."""
         self._alive: dict[str, int] = {}
         self._changed = True
+        """Whether we hold, request or have heard anything that our newest message does not tell."""
+        self._idle_until_ns = 0
         for other, vehicles in spawns.items():
             if other != agent:
                 holds = {vehicle: [cell] for vehicle, cell in vehicles.items()}
-                claims = Claims(agent=other, incarnation=0, seq=0, clock=0, holds=holds, wants=[], seen={})
-                self._take(other, _Other(claims))
+                unheard = Reservations(
+                    agent=other, incarnation=0, seq=0, clock=0, held=holds, requested=[], seen={}
+                )
+                self._replace(other, _Other(unheard))
 
-    # --- what the others say --------------------------------------------------------------------------------
+    # --- what other agents publish --------------------------------------------------------------------------
 
-    def heard(self, claims: Claims) -> None:
-        """Take in another agent's claims; only the newest of an agent count. Sequence 0 says "not placed yet"."""
-        if claims.agent == self.agent:
-            if claims.incarnation < self.incarnation and claims.clock < _CLOCK_LIMIT:
-                self._clock = max(self._clock, claims.clock)
+    def hear(self, reservations: Reservations) -> None:
+        """Take in an agent's reservations, if they are the newest of that agent. Those with seq 0 tell nothing: the
+        agent has not placed its vehicles."""
+        agent, clock = reservations.agent, reservations.clock
+        if agent == self.agent:
+            if reservations.incarnation < self.incarnation and clock < _CLOCK_LIMIT:
+                self._clock = max(self._clock, clock)
             return
-        if claims.seq == 0:
+        if reservations.seq == 0:
             return
-        known = self._others.get(claims.agent)
-        if known is not None and (claims.incarnation, claims.seq) <= _stamp(known.claims):
+        known = self._others.get(agent)
+        if known is not None and stamp_of(reservations) <= stamp_of(known.reservations):
             return
-        if self._ground is not None and self._ground.is_far(claims.agent):
-            return  # it was a neighbour when it said this
-        self._take(claims.agent, _Other(claims))
-        if claims.clock < _CLOCK_LIMIT:  # an honest one never gets there; ours must stay within what fits the wire
-            self._clock = max(self._clock, claims.clock)
-        self._changed = self._changed or bool(claims.wants)
+        if self._territory is not None and self._territory.is_far(agent):
+            return  # it was a neighbour when it published this
+        self._replace(agent, _Other(reservations))
+        if clock < _CLOCK_LIMIT:
+            self._clock = max(self._clock, clock)
+        self._changed = self._changed or bool(reservations.requested)
 
     def set_alive(self, agents: Mapping[str, int]) -> None:
-        """Which agents live, and in which incarnation. A dead one is not waited for; its claims stand."""
+        """Which agents live: agent -> incarnation. A dead agent is not waited for; its reservations stand."""
         self._alive = {agent: incarnation for agent, incarnation in agents.items() if agent != self.agent}
 
-    def forget_the_far(self) -> None:
-        """Drop the claims of those who live and share no ground with us any more: we hear no newer ones."""
-        if self._ground is not None:
-            for agent in [agent for agent in self._others if self._ground.is_far(agent)]:
-                self._take(agent, None)
+    def forget_far(self) -> None:
+        """Drop the reservations of live agents with no plot in common any more: we hear no newer ones."""
+        if self._territory is not None:
+            for agent in [agent for agent in self._others if self._territory.is_far(agent)]:
+                self._replace(agent, None)
 
-    def _take(self, agent: str, other: _Other | None) -> None:
-        """Put another agent's claims in the place of its earlier ones."""
+    def _replace(self, agent: str, other: _Other | None) -> None:
+        """Put another agent's reservations in the place of its earlier ones."""
         known = self._others.pop(agent, None)
         if known is not None:
             for cell in known.cells:
@@ -152,200 +181,219 @@ class RightOfWay:
             for cell in other.cells:
                 self._by_cell.setdefault(cell, {})[agent] = other
 
-    def words_of(self, agents: Sequence[str]) -> list[Claims]:
-        """The newest claims that we have heard of these agents."""
-        heard = (self._others.get(agent) for agent in agents)
-        return [other.claims for other in heard if other is not None and other.claims.seq]
-
     # --- what our vehicles do -------------------------------------------------------------------------------
 
     def place(self, vehicle: str, cell: int) -> None:
-        """Put a vehicle where nobody else can be: its spawn cell, or where it last stood."""
+        """Put a vehicle on a cell on which no other can be. Raises ValueError if another of ours holds it."""
         if cell in self._held_by:
             raise ValueError(f"{vehicle} and {self._held_by[cell]} are both placed on cell {cell}")
-        self._mine[vehicle] = _Mine(holds=[cell])
+        self._mine[vehicle] = _Mine(held=[cell])
         self._held_by[cell] = vehicle
         self._changed = True
 
-    def ask(self, vehicle: str, ahead: Sequence[int]) -> None:
-        """Want exactly these cells, in this order; what was held or wanted besides is given up at once."""
+    def request(self, vehicle: str, ahead: Sequence[int]) -> None:
+        """Request exactly these cells, in this order. All others that the vehicle held or requested are given up at
+        once, except the one on which it stands."""
         mine = self._mine.setdefault(vehicle, _Mine())
-        ahead = self._settled_part(mine, ahead)
-        base = 1 if mine.holds else 0
+        ahead = self._allowed(mine, ahead)
+        base = 1 if mine.held else 0
         kept = 0
-        while kept < len(ahead) and base + kept < len(mine.holds) and mine.holds[base + kept] == ahead[kept]:
+        while kept < len(ahead) and base + kept < len(mine.held) and mine.held[base + kept] == ahead[kept]:
             kept += 1
-        if base + kept < len(mine.holds) and base:
-            for cell in mine.holds[base + kept :]:
+        if base + kept < len(mine.held) and base:
+            for cell in mine.held[base + kept :]:
                 del self._held_by[cell]
-            del mine.holds[base + kept :]
+            del mine.held[base + kept :]
             self._changed = True
         wanted = ahead[kept:]
-        if [want.cell for want in mine.wants] == list(wanted):
+        if [request.cell for request in mine.requests] == list(wanted):
             return
-        old = {want.cell: want for want in mine.wants}
+        old = {request.cell: request for request in mine.requests}
         if any(cell not in old for cell in wanted):
             self._clock += 1
-        self._wanting = None
-        mine.wants = [old.get(cell) or _Wanted(cell, self._clock, self._seq + 1) for cell in wanted]
+        self._requesting = None
+        mine.requests = [old.get(cell) or _Request(cell, self._clock, self._seq + 1) for cell in wanted]
         self._changed = True
 
-    def _settled_part(self, mine: _Mine, ahead: Sequence[int]) -> Sequence[int]:
-        """The cells up to the first in a plot that not everybody knows to be ours."""
-        if self._ground is not None:
+    def _allowed(self, mine: _Mine, ahead: Sequence[int]) -> Sequence[int]:
+        """The cells before the first one in a plot that some live agent does not know to be ours."""
+        if self._territory is not None:
             for index, cell in enumerate(ahead):
-                if cell not in mine.holds and not self._is_settled(cell):
+                if cell not in mine.held and not self._is_ours(cell):
                     return ahead[:index]
         return ahead
 
-    def _is_settled(self, cell: int) -> bool:
-        ground = self._ground
-        if ground is None:
+    def _is_ours(self, cell: int) -> bool:
+        """Whether every live agent knows that we reserve cells in this plot, and we know where its dead stand."""
+        territory = self._territory
+        if territory is None:
             return True
-        plot = ground.plot_of(cell)
-        if not ground.settled(plot):
+        plot = territory.plot_of(cell)
+        if not territory.agreed(plot):
             return False
-        for agent, incarnation in ground.dead_in(plot):
+        for agent, incarnation in territory.dead_in(plot):
             other = self._others.get(agent)
-            if other is None or other.claims.incarnation < incarnation:
-                return False  # nobody who lives can tell where its vehicles stand
+            if other is None or other.reservations.incarnation < incarnation:
+                return False
         return True
 
     def moved(self, vehicle: str, cell: int) -> None:
-        """The vehicle stands on a cell that it holds: those before it are free."""
+        """The vehicle stands on another cell that it holds: those before it are free."""
         mine = self._mine[vehicle]
-        index = mine.holds.index(cell)
-        for passed in mine.holds[:index]:
+        index = mine.held.index(cell)
+        for passed in mine.held[:index]:
             del self._held_by[passed]
-        del mine.holds[:index]
+        del mine.held[:index]
         self._changed = True
 
     def grant(self) -> bool:
-        """Turn wants into holds wherever the rule allows; True if any was. A vehicle gets its cells in order."""
+        """Let our vehicles hold what the rule allows; True if any cell was granted. Each vehicle gets its cells in
+        the order in which it enters them."""
         echoed = self._echoed()
         firsts: dict[int, Rank] = {}
         for vehicle, mine in self._mine.items():
-            for want in mine.wants:
-                rank = (want.ticket, self.agent, vehicle)
-                if want.cell not in firsts or rank < firsts[want.cell]:
-                    firsts[want.cell] = rank
+            for request in mine.requests:
+                rank = (request.ticket, self.agent, vehicle)
+                if request.cell not in firsts or rank < firsts[request.cell]:
+                    firsts[request.cell] = rank
         any_granted = False
         for vehicle, mine in self._mine.items():
-            while mine.wants:
-                want = mine.wants[0]
-                rank = (want.ticket, self.agent, vehicle)
-                if want.seq > echoed or want.cell in self._held_by or firsts[want.cell] < rank:
+            while mine.requests:
+                request = mine.requests[0]
+                rank = (request.ticket, self.agent, vehicle)
+                if request.seq > echoed or request.cell in self._held_by or firsts[request.cell] < rank:
                     break
-                if not self._is_settled(want.cell) or self._others_forbid(want.cell, rank):
+                if not self._is_ours(request.cell) or self._forbidden(request.cell, rank):
                     break
-                mine.holds.append(want.cell)
-                self._held_by[want.cell] = vehicle
-                del mine.wants[0]
-                self._wanting = None
+                mine.held.append(request.cell)
+                self._held_by[request.cell] = vehicle
+                del mine.requests[0]
+                self._requesting = None
                 any_granted = self._changed = True
         return any_granted
 
-    def speak(self) -> Claims:
-        """Our whole state, under the next sequence number. Publish it: a want counts from here on."""
-        self._seq += 1
-        self._changed = False
-        return Claims(
-            agent=self.agent,
-            incarnation=self.incarnation,
-            seq=self._seq,
-            clock=self._clock,
-            holds={vehicle: list(mine.holds) for vehicle, mine in self._mine.items() if mine.holds},
-            wants=[
-                Want(vehicle=vehicle, cell=want.cell, ticket=want.ticket)
-                for vehicle, mine in self._mine.items()
-                for want in mine.wants
-            ],
-            seen={agent: _stamp(other.claims) for agent, other in self._others.items() if other.claims.seq},
-        )
-
-    # --- what one may ask -----------------------------------------------------------------------------------
-
-    @property
-    def restless(self) -> bool:
-        """Whether somebody waits to hear from us: our state changed, or wants stand open on either side."""
-        return self._changed or any(mine.wants for mine in self._mine.values())
-
-    def holds(self, vehicle: str) -> list[int]:
-        """The cells of a vehicle, the one that it stands on first; empty of one that stands nowhere yet."""
-        mine = self._mine.get(vehicle)
-        return mine.holds if mine else []
-
-    def wants(self, vehicle: str) -> list[int]:
-        mine = self._mine.get(vehicle)
-        return [want.cell for want in mine.wants] if mine else []
-
-    def holder(self, cell: int) -> str | None:
-        """Who holds a cell, as far as we know; of a dead agent also who wanted it."""
-        if cell in self._held_by:
-            return self._held_by[cell]
-        for agent, other in self._by_cell.get(cell, _NOBODY).items():
-            if cell in other.held:
-                return other.held[cell]
-            if cell in other.wanted and self._dead(agent, other):
-                return other.wanted[cell][2]
-        return None
-
-    def wanters(self, cell: int, besides: str) -> list[Wanter]:
-        """Who wants a cell, the vehicle `besides` and the dead not among them."""
-        if self._wanting is None:
-            self._wanting = {}
-            for vehicle, mine in self._mine.items():
-                for want in mine.wants:
-                    self._wanting.setdefault(want.cell, []).append(vehicle)
-        found = []
-        for vehicle in self._wanting.get(cell, ()):
-            if vehicle != besides:
-                holds = self._mine[vehicle].holds
-                found.append(Wanter(vehicle, holds[0] if holds else None))
-        for agent, other in self._by_cell.get(cell, _NOBODY).items():
-            if cell in other.wanting and not self._dead(agent, other):
-                for vehicle in other.wanting[cell]:
-                    stands = other.claims.holds.get(vehicle)
-                    found.append(Wanter(vehicle, stands[0] if stands else None))
-        return found
-
-    def answers(self) -> list[Claims]:
-        """What a starting agent is told: where we are now, and the last words of all who cannot tell it."""
-        last_words = [
-            other.claims for agent, other in self._others.items() if other.claims.seq and self._dead(agent, other)
-        ]
-        changed = self._changed
-        mine = self.speak()
-        self._changed = changed  # the others have not heard it
-        return [*last_words, mine]
-
-    def _dead(self, agent: str, other: _Other) -> bool:
-        return self._alive.get(agent) != other.claims.incarnation
-
     def _echoed(self) -> int:
-        """The newest sequence number of ours that every live agent has seen."""
+        """The number of our newest message that every live agent has seen; -1 if one has seen none."""
         echoed = self._seq
         for agent, incarnation in self._alive.items():
-            if self._ground is not None and agent not in self._ground.echoed_by:
+            if self._territory is not None and agent not in self._territory.echoed_by:
                 continue
             other = self._others.get(agent)
-            if other is None or other.claims.incarnation != incarnation:
+            if other is None or other.reservations.incarnation != incarnation:
                 return -1
-            seen = other.claims.seen.get(self.agent)
+            seen = other.reservations.seen.get(self.agent)
             if seen is None or seen[0] != self.incarnation:
                 return -1
             echoed = min(echoed, seen[1])
         return echoed
 
-    def _others_forbid(self, cell: int, rank: Rank) -> bool:
-        for agent, other in self._by_cell.get(cell, _NOBODY).items():
+    def _forbidden(self, cell: int, rank: Rank) -> bool:
+        """Whether another agent holds the cell, requests it with a lower rank, or requested it and died."""
+        for agent, other in self._by_cell.get(cell, _NO_AGENTS).items():
             if cell in other.held:
                 return True
-            wanted = other.wanted.get(cell)
-            if wanted is not None and (wanted < rank or self._dead(agent, other)):
+            other_rank = other.rank.get(cell)
+            if other_rank is not None and (other_rank < rank or self._is_dead(agent, other)):
                 return True
         return False
 
+    # --- what we publish ------------------------------------------------------------------------------------
 
-def _stamp(claims: Claims) -> tuple[int, int]:
-    return claims.incarnation, claims.seq
+    def message_due(self, now_ns: int) -> bool:
+        """Whether to publish our reservations now: they changed, another agent waits for our echo, a request of
+        ours is open, or nothing was published for half a second."""
+        due = now_ns >= self._idle_until_ns or self._changed or any(mine.requests for mine in self._mine.values())
+        if due:
+            self._idle_until_ns = now_ns + _IDLE_NS
+        return due
+
+    def next_message(self) -> Reservations:
+        """Our reservations under the next number. Publish them: a request counts from here on."""
+        self._seq += 1
+        self._changed = False
+        return Reservations(
+            agent=self.agent,
+            incarnation=self.incarnation,
+            seq=self._seq,
+            clock=self._clock,
+            held={vehicle: list(mine.held) for vehicle, mine in self._mine.items() if mine.held},
+            requested=[
+                RequestedCell(vehicle=vehicle, cell=request.cell, ticket=request.ticket)
+                for vehicle, mine in self._mine.items()
+                for request in mine.requests
+            ],
+            seen={agent: stamp_of(other.reservations) for agent, other in self._others.items() if other.heard},
+        )
+
+    def answers(self) -> list[Reservations]:
+        """What a starting agent is told: the newest reservations of the dead, and ours."""
+        of_the_dead = [
+            other.reservations
+            for agent, other in self._others.items()
+            if other.heard and self._is_dead(agent, other)
+        ]
+        changed = self._changed
+        mine = self.next_message()
+        self._changed = changed  # the other agents have not heard it
+        return [*of_the_dead, mine]
+
+    def unplaced(self) -> Reservations:
+        """What a starting agent is told while our vehicles are not placed: seq 0 replaces no reservations."""
+        return Reservations(
+            agent=self.agent, incarnation=self.incarnation, seq=0, clock=0, held={}, requested=[], seen={}
+        )
+
+    def heard_of(self, agents: Sequence[str]) -> list[Reservations]:
+        """The newest reservations that we have heard of these agents."""
+        others = (self._others.get(agent) for agent in agents)
+        return [other.reservations for other in others if other is not None and other.heard]
+
+    # --- queries --------------------------------------------------------------------------------------------
+
+    def held(self, vehicle: str) -> list[int]:
+        """The cells of a vehicle, the one on which it stands first; empty if it is not placed."""
+        mine = self._mine.get(vehicle)
+        return mine.held if mine else []
+
+    def requested(self, vehicle: str) -> list[int]:
+        """The cells that a vehicle requests, in the order in which it enters them."""
+        mine = self._mine.get(vehicle)
+        return [request.cell for request in mine.requests] if mine else []
+
+    def holder(self, cell: int) -> str | None:
+        """The vehicle that holds a cell, or requested it when its agent died; None if there is none."""
+        if cell in self._held_by:
+            return self._held_by[cell]
+        for agent, other in self._by_cell.get(cell, _NO_AGENTS).items():
+            if cell in other.held:
+                return other.held[cell]
+            if cell in other.rank and self._is_dead(agent, other):
+                return other.rank[cell][2]
+        return None
+
+    def requesters(self, cell: int, besides: str) -> list[Requester]:
+        """The vehicles of live agents that request a cell, without the vehicle `besides`."""
+        if self._requesting is None:
+            self._requesting = {}
+            for vehicle, mine in self._mine.items():
+                for request in mine.requests:
+                    self._requesting.setdefault(request.cell, []).append(vehicle)
+        found = []
+        for vehicle in self._requesting.get(cell, ()):
+            if vehicle != besides:
+                held = self._mine[vehicle].held
+                found.append(Requester(vehicle, held[0] if held else None))
+        for agent, other in self._by_cell.get(cell, _NO_AGENTS).items():
+            if cell in other.requesting and not self._is_dead(agent, other):
+                for vehicle in other.requesting[cell]:
+                    stands = other.reservations.held.get(vehicle)
+                    found.append(Requester(vehicle, stands[0] if stands else None))
+        return found
+
+    def _is_dead(self, agent: str, other: _Other) -> bool:
+        return self._alive.get(agent) != other.reservations.incarnation
+
+
+def stamp_of(reservations: Reservations) -> tuple[int, int]:
+    """Orders the reservations of one agent: the larger is the newer."""
+    return reservations.incarnation, reservations.seq

@@ -1,4 +1,4 @@
-"""Moving targets and vehicles over a field, frame by frame: what each strategy costs, and its gap to the optimum.
+"""Moving targets and vehicles on a field, frame by frame: CPU time and gap of each strategy.
 
 All strategies follow the same moves and are asked from the same cells, in turn within each frame, so that whatever
 else the machine is busy with falls on all of them alike.
@@ -31,16 +31,16 @@ from swarm.wire.routes import OK, RouteBatch
 Cells = NDArray[np.int64]
 
 TREE_BYTES_PER_CELL = 40
-"""Of one target's tree with all that a strategy keeps beside it, and a job's snapshot; measured, rounded up."""
+"""Bytes per cell of one target's tree, of what its strategy keeps beside it, and of a job's snapshot; measured."""
 RUN_IN = 10
-"""Frames before the measured ones, in which the trees of a strategy get out of step with each other."""
+"""Frames before the measured ones, which spread the full growths of a strategy's trees over time."""
 FEWEST = 4
-"""Frames that every strategy is measured for, whatever it takes."""
+"""Frames for which every strategy is measured, however long they take."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What happens.
+    """Targets, vehicles and frames of a chase.
 
     targets     each moves one cell a frame; vehicles are shared out among them
     frames      at most so many are measured
@@ -67,7 +67,7 @@ class Plan:
 
 @dataclasses.dataclass
 class Tally:
-    """What was measured of one strategy.
+    """Measurements of one strategy.
 
     frame_ms   CPU time of each frame: all trees follow their targets, all vehicles' routes are read, and full
                growths are done that a service would leave to its worker
@@ -89,8 +89,8 @@ class Tally:
         self.updates[kind] = self.updates.get(kind, 0) + 1
 
     def judge(self, routes: RouteBatch, optimum: NDArray[np.float32]) -> None:
-        """Hold routes, whole or with what remains after them, against the costs of an exact tree."""
-        # Not from the target's own cell, where nothing could be driven worse, nor whence there is no way.
+        """Compares routes, whole or with the cost that remains after them, with the costs of an exact tree."""
+        # The target's own cell has no gap, and cells without a route have none either.
         counts = (routes.statuses == OK) & (routes.cost_s > 0)
         cost, bound = routes.cost_s[counts], routes.lower_bound_s[counts]
         with np.errstate(divide="ignore"):
@@ -98,7 +98,7 @@ class Tally:
             self.proven.append(np.maximum(cost / bound, 1.0))
 
     def add(self, other: Tally) -> None:
-        """Take in another run of the same strategy."""
+        """Adds another run of the same strategy."""
         self.frame_ms += other.frame_ms
         self.start_ms = max(self.start_ms, other.start_ms)
         self.gaps += other.gaps
@@ -188,7 +188,7 @@ def _race(crowd: _Crowd, racers: Sequence[_Racer], plan: Plan, batches: int, tel
 
 
 class _Crowd:
-    """Where targets and vehicles are, and what the best routes between them cost."""
+    """Places of targets and vehicles, and optimal costs between them."""
 
     def __init__(
         self,
@@ -208,7 +208,7 @@ class _Crowd:
         self._exact = TargetTree(field.grid, exact)
 
     def step(self) -> None:
-        """A frame's moves."""
+        """Moves targets and vehicles by one frame."""
         vehicles = np.concatenate(self.places)
         for n, walker in enumerate(self._walkers):
             to = walker.choose(self._field.ground, vehicles, Budget())
@@ -218,7 +218,7 @@ class _Crowd:
                 self.places[n] = self._driven(n)
 
     def asked(self, n: int) -> tuple[Cells, NDArray[np.float32]]:
-        """Cells from which target n is judged, and what the best routes to it cost."""
+        """Cells from which target n is judged, and the optimal costs to it."""
         cells = self.places[n] if self._plan.speed else self._field.draw(self._plan.probes, self._rng)
         return cells, self._tree_of(n).cost_to_go_at(cells)
 
@@ -245,7 +245,7 @@ class _Racer:
         self._plan = plan
         self._strategy = config.strategy
         self._trees = [TargetTree(field.grid, config) for _ in range(targets)]
-        # What other batches were measured for, this one is, too: a frame's time is the sum over all batches.
+        # All batches run the same frames: a frame's time is the sum over batches.
         self._frames = None if first else len(tally.frame_ms)
         self._spent_ms = 0.0
 
@@ -297,7 +297,7 @@ class _Racer:
         return (time.thread_time_ns() - began_ns) / 1e6
 
     def _follow(self, n: int, cell: int, followed: Any = (), grow: bool = False, count: bool = True) -> None:
-        """The target moved. A full growth that is wished for, or due by `grow`, is done at once and adopted."""
+        """Follows a move of the target. A full growth, asked for or due by `grow`, is adopted at once."""
         tree = self._trees[n]
         began_ns = time.thread_time_ns()
         update = tree.update(self._pace, cell, [], 0)
@@ -309,7 +309,7 @@ class _Racer:
             return
         began_ns = time.thread_time_ns()
         grown = tree.full_job(self._pace, cell, 0)()
-        if grown.skeleton is None:
+        if grown.corridors is None:
             tree.observe_full_ns(time.thread_time_ns() - began_ns)
         tree.adopt(grown, self._pace, cell, [], 0, followed)
         if count:
@@ -321,11 +321,11 @@ def _p50(values: NDArray[np.float64]) -> float:
 
 
 def _p95(values: NDArray[np.float64]) -> float:
-    # One of the values, not between two of them: a proven gap may be infinite, which nothing can be added to.
+    # One of the values, not an interpolation: a proven gap may be infinite.
     return float(np.quantile(values, 0.95, method="inverted_cdf"))
 
 
 def _figure(values: NDArray[np.float64], of: Callable[[NDArray[np.float64]], Any]) -> float | None:
-    """Rounded; None where there is nothing, or nothing finite, to tell."""
+    """Rounded; None where there is no value or an infinite one."""
     found = float(of(values)) if values.size else math.inf
     return round(found, 5) if math.isfinite(found) else None

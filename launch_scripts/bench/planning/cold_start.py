@@ -1,4 +1,4 @@
-"""How long a fresh process takes to its first tree, with numba's cache cold and warm."""
+"""Time of a fresh process to its first tree, with numba's cache cold and warm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A whole tree where uphill is not downhill, beside one on the same ground where it is."""
+"""A full tree with directional costs, beside one with symmetric costs on the same terrain."""
 
 from __future__ import annotations
 

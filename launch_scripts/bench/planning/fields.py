@@ -1,4 +1,4 @@
-"""The paces that planners are measured on: synthetic fields and files."""
+"""Fields of paces for benchmarks: synthetic ones and files."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def _read_npy(path: Path) -> NDArray[np.floating[Any]]:
 
 
 class Field:
-    """A pace and where one can be on it.
+    """A pace and its largest connected area.
 
     pace    (rows, cols) float32, s/m, inf is lethal; cells are taken as a metre wide, which scales all costs alike
     ground  for walks; its `home` is the largest connected passable area, from which roots and vehicles are drawn
@@ -141,6 +141,6 @@ class Field:
         self.ground = Ground(self.grid, pace)
 
     def draw(self, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-        """So many cells of the largest area, none twice where there are enough."""
+        """Random cells of the largest area, without repetition where there are enough."""
         home = self.ground.home
         return rng.choice(home, count, replace=count > len(home))

@@ -1,4 +1,4 @@
-"""How much more than the optimum is driven while a target moves, and how much of it the certificates can tell."""
+"""Gap between driven cost and optimum while a target moves, and the part that certificates prove."""
 
 from __future__ import annotations
 
@@ -32,8 +32,10 @@ def run_gap(
     progress: Progress | None = None,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Several runs of one target from different roots, all their routes taken together. `speed` is that of vehicles
-    in cells a frame: if not given, they stand, and drive a cell a frame after one that evades them."""
+    """Runs one target from several roots and pools all routes.
+
+    speed  of vehicles in cells a frame; None: 1 after a target that evades, else 0
+    """
     stage = Field(make_field(dem, 512, seed))
     warm_up()
     rows: list[dict[str, Any]] = []

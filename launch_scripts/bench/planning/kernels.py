@@ -1,4 +1,4 @@
-"""What a frame is made of: routes, windows, and repairs beside the growth that they stand for."""
+"""The parts of a frame: routes, windows, and repairs beside the growth that they replace."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, number, table, times
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.cost_grid import Ground
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.route_reading import read_routes
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
 CHANGES: dict[str, float] = {"x 0.7": 0.7, "x 1.5": 1.5, "x 3": 3.0, "lethal": np.inf}
-"""What happens to all paces of a patch."""
+"""Changes of all paces of a patch."""
 BATCHES = (1, 10, 100, 1000)
 STEPS = 500
-"""Length of the routes that one route's time is told of."""
+"""Length of the routes by which the time of one route is measured."""
 _HALF = 16
 
 
@@ -35,14 +35,14 @@ class _Bench:
         self.pace = pace
         self.field = Field(pace)
         self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
-        self.ground = Ground(self.grid, PlannerConfig())
+        self.ground = CostGrid(self.grid, PlannerConfig())
         self.ground.load(pace)
         self.tree = CostToGoTree(self.ground)
         self.bounds = LowerBounds(self.ground)
         self.took: dict[str, list[float]] = {}
 
     def time(self, name: str, what: Callable[[], Any]) -> float:
-        """CPU microseconds of this thread, which are kept under a name."""
+        """Records CPU microseconds of this thread under a name."""
         begin = time.thread_time_ns()
         what()
         took_us = (time.thread_time_ns() - begin) / 1e3
@@ -57,19 +57,19 @@ class _Bench:
         self.time("growth", lambda: self.tree.grow(self.root))
 
     def routes(self) -> None:
-        """Reading routes with their certificates, by how many at once; and walking alone."""
+        """Reads routes with their certificates, in batches of several sizes; and walks alone."""
         for many in BATCHES:
             starts = self.draw(many)
             took_us = self.time("", partial(read_routes, self.tree, self.bounds, starts, 0))
             self.took.setdefault(f"route of {many}", []).append(took_us / many)
         padded = self.ground.pad_all(self.draw(100))
         root = self.ground.pad(self.root)
-        walk = partial(self.ground.walk, self.tree.parent, root, padded, 0, self.ground.weight)
+        walk = partial(self.ground.walk, self.tree.parent, root, padded, 0, self.ground.cell_cost)
         steps = int(walk().ends[-1])
         self.took.setdefault("walk", []).append(self.time("", walk) / max(steps, 1) * STEPS)
 
     def window(self) -> None:
-        """A window of 33 x 33 cells around a target that has moved by a cell."""
+        """Grows a window of 33 x 33 cells around a target which moved by one cell."""
         row, col = self.grid.row_col(self.root)
         for row_step, col_step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
             if self.grid.inside(row + row_step, col + col_step):
@@ -79,7 +79,7 @@ class _Bench:
                     self.tree.grow(self.root)
 
     def patch(self, side: int, factor: float, name: str) -> bool:
-        """Change a patch; and back, unmeasured. Whether it was repaired without a growth."""
+        """Changes a patch, and changes it back unmeasured. Returns whether it was repaired without a growth."""
         window = self._somewhere(side)
         part = self.pace[window.row0 : window.row1, window.col0 : window.col1]
         before = part.copy()
@@ -90,7 +90,7 @@ class _Bench:
         return mended
 
     def _somewhere(self, side: int) -> Window:
-        """A patch that leaves the target's cell alone, around a passable cell or at the border."""
+        """A patch without the target's cell, around a passable cell or at the border."""
         while True:
             row, col = self.grid.row_col(int(self.draw(1)[0]))
             row, col = min(row, self.grid.rows - side), min(col, self.grid.cols - side)

@@ -1,4 +1,4 @@
-"""A full tree as ours and other people's libraries grow it, behind one interface.
+"""Full trees of our library and of others, behind one interface.
 
 All pay for the cell that a step enters. The others grow outward from the root, so that they charge the far end
 where we charge the root: their costs are brought over by exactly these two cells, outside the measured time.
@@ -38,23 +38,25 @@ def ours(pace: Pace, edge: Edge) -> Tool:
 
 
 def floor(pace: Pace, edge: Edge) -> Tool:
-    """A plain breadth-first search over the same arrays: nothing that looks at every cell in order is faster."""
+    """A plain breadth-first search over the same arrays: a lower bound for any search that visits every cell."""
     from planner_service.kernels.bucket_queue import breadth_first
 
-    ground = _our_tree(pace, edge).ground
+    ground = _our_tree(pace, edge).cost_grid
     cost = np.empty(ground.size, np.float32)
-    return Tool(lambda root: breadth_first(ground.weight, cost, ground.stride, ground.pad(root)), lambda *_: None)
+    return Tool(
+        lambda root: breadth_first(ground.cell_cost, cost, ground.stride, ground.pad(root)), lambda *_: None
+    )
 
 
 def _our_tree(pace: Pace, edge: Edge) -> Any:
-    from planner_service.tree.cost_grid import Ground
+    from planner_service.tree.cost_grid import CostGrid
     from planner_service.tree.cost_to_go import CostToGoTree
     from swarm.config.scenario import PlannerConfig
     from swarm.grid import GridSpec
 
-    # None of the others knows that a diagonal may not squeeze between two lethal cells.
+    # No other library forbids diagonals past lethal corners.
     config = PlannerConfig(edge=edge, corner_cutting=True)
-    ground = Ground(GridSpec(pace.shape[0], pace.shape[1], 1.0), config)
+    ground = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), config)
     ground.load(pace)
     return CostToGoTree(ground)
 
@@ -62,11 +64,11 @@ def _our_tree(pace: Pace, edge: Edge) -> Any:
 def parental_field(pace: Pace, edge: Edge) -> Tool:
     import dijkstra3d
 
-    # It wants columns together: the same field mirrored is that without a copy.
+    # It needs Fortran order: the transposed field has it without a copy.
     mirrored, cols = pace.T, pace.shape[1]
 
     def costs(found: Any, root: int) -> Costs:
-        # Parents count from 1, columns together; 0 is the root and whatever was not reached.
+        # Parents are Fortran indices from 1 on; 0 is the root and unreached cells.
         return costs_along(pace, found.T.reshape(-1).astype(np.int64) - 1, root)
 
     return Tool(lambda root: dijkstra3d.parental_field(mirrored, divmod(root, cols)[::-1], connectivity=8), costs)
@@ -88,7 +90,7 @@ def dijkstra2d(pace: Pace, edge: Edge) -> Tool:
     passable = np.isfinite(pace)
     low, high = float(pace[passable].min()), float(pace[passable].max())
     straight, diagonal = (1, 1) if edge == "paper" else (5, 7)
-    # It counts in whole numbers of 32 bits: as fine as can be without the longest ways running over.
+    # Costs are 32-bit integers: scaled as finely as the longest path allows.
     unit = max(low / 1000, high * straight * 8 * sum(pace.shape) / 2**31)
     whole = np.where(passable, np.maximum(np.rint(pace / unit), 1), 0).astype(np.int32)
 
@@ -143,7 +145,7 @@ def mcp(pace: Pace, edge: Edge) -> Tool:
     def costs(found: Any, root: int) -> Costs | None:
         if edge == "octile":
             return None  # it charges the mean of both cells
-        # Its start costs, too, so that only the far end is charged too much.
+        # The start is charged too, so that only the far end is charged too much.
         return _from_outward(found, pace, root) - pace.flat[root]
 
     return Tool(
@@ -159,13 +161,13 @@ PEERS: dict[str, tuple[str, Callable[[Pace, Edge], Tool]]] = {
     "scipy.csgraph.dijkstra": ("scipy", csgraph),
     "skimage.graph.MCP": ("scikit-image", mcp),
 }
-"""Name -> the package it comes from, and what prepares it."""
+"""Name -> its package, and the function that prepares it."""
 
 MAKERS = {"ours": ours, "floor": floor, **{name: make for name, (_, make) in PEERS.items()}}
 PAPER_ONLY = {"dijkstra3d.parental_field", "dijkstra3d.distance_field"}
-"""They know no step that is longer than another."""
+"""Libraries in which all steps are equally long."""
 EXTRA = ("dijkstra3d", "tcod")
-"""Packages that only the `bench` extra brings."""
+"""Packages of the `bench` extra."""
 
 
 def missing_packages() -> list[str]:
@@ -173,7 +175,7 @@ def missing_packages() -> list[str]:
 
 
 def present_peers(edge: Edge) -> list[str]:
-    """Names of the peers that are installed and know the edge rule."""
+    """Names of the peers which are installed and support the edge rule."""
     absent = missing_packages()
     return [
         name
@@ -183,7 +185,7 @@ def present_peers(edge: Edge) -> list[str]:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages that are measured, and of what ours is compiled with."""
+    """Versions of the measured packages, and of numba."""
     packages = dict.fromkeys(package for package, _ in PEERS.values())
     absent = missing_packages()
     return {name: version(name) for name in (*packages, "numba", "numpy") if name not in absent}
@@ -211,7 +213,7 @@ def costs_along(pace: Pace, parents: NDArray[np.int64], root: int) -> Costs:
 
 
 def _from_outward(found: Costs, pace: Costs, root: int) -> Costs:
-    """Costs of ways from the root as costs of the same ways to it: the far end is not entered, the root is."""
+    """Costs of the same paths towards the root instead of away from it: the root is entered, the far end is not."""
     passable = np.isfinite(pace)
     costs = np.where(passable, found, np.inf).astype(np.float64)
     costs[passable] += pace.flat[root] - pace[passable]

@@ -1,8 +1,8 @@
-"""The two tables of "Automatic target tracking on multi-resolution terrain" (Wan, Zhang, Murray, Kaufman), anew.
+"""Tables 1 and 2 of the paper, beside what it printed.
 
-What is taken over is their set-up: 512 x 512 cells, 300 frames and more, an edge costs what the cell that it enters
-costs; Table 1 is targets x vehicles, Table 2 strategy by strategy. The figures that the paper printed are not at
-hand, so none stand beside ours.
+Wan, Zhang, Murray, Kaufman: "Automatic target tracking on multi-resolution terrain". Its set-up is taken over:
+512 x 512 cells, 300 frames, an edge costs what the cell that it enters costs. Table 1 is targets x vehicles,
+Table 2 strategy by strategy.
 """
 
 from __future__ import annotations
@@ -23,9 +23,13 @@ PAPERS: Strategy = "variable_range+multi_resolution"
 COMPARED: tuple[Strategy, ...] = ("full", PAPERS, "rotation")
 TABLE_1 = [(targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)]
 TABLE_2: tuple[Strategy, ...] = ("full", "variable_range", "multi_resolution", PAPERS, "rotation", "auto")
-UNKNOWN = (
-    "The paper's own figures are not shown: its tables were not to be had, and times of its day would say little."
+PRINTED_TABLE_1_S = dict(
+    zip(TABLE_1, (0.0102, 0.0103, 0.0104, 0.0470, 0.0480, 0.0490, 0.0802, 0.0848, 0.0882), strict=True)
 )
+"""Seconds a frame as the paper prints them, by (targets, vehicles)."""
+PRINTED_TABLE_2_S: dict[Strategy, float] = {"full": 0.8926, "variable_range": 0.3194, PAPERS: 0.0882}
+"""Seconds a frame with 10 targets and 100 vehicles: the paper's brute force, variable range, and both."""
+PRINTED_ON = "512 x 512 x 64, over 300 frames, 16 R10000 processors (SGI Power Challenge)"
 
 
 def run_paper(
@@ -47,20 +51,35 @@ def run_paper(
 
         tallies = chase(stage, entrants, plan, tell)
         table_1.append(
-            {"targets": targets, "vehicles": vehicles, **{name: tallies[name].row() for name in COMPARED}}
+            {
+                "targets": targets,
+                "vehicles": vehicles,
+                "printed_s": PRINTED_TABLE_1_S[targets, vehicles],
+                **{name: tallies[name].row() for name in COMPARED},
+            }
         )
         if last:
-            table_2 = [{"strategy": name, **tallies[name].row()} for name in TABLE_2]
+            table_2 = [
+                {"strategy": name, "printed_s": PRINTED_TABLE_2_S.get(name), **tallies[name].row()}
+                for name in TABLE_2
+            ]
     return {
         "size": stage.pace.shape[0],
         "shape": list(stage.pace.shape),
         "field": field,
         "frames": frames,
-        "published": None,
+        "printed": {"on": PRINTED_ON, "not_stated": _not_stated()},
         "table_1": table_1,
         "table_2": table_2,
         **machine(),
     }
+
+
+def _not_stated() -> str:
+    return (
+        "The paper does not state all of its motion, its k_min and its block rule: here each target moves a cell "
+        f"a frame, k_min is {PlannerConfig().k_min}, and a block is crossed in row or column."
+    )
 
 
 def tables(report: dict[str, Any]) -> Iterator[Table | str]:
@@ -69,29 +88,39 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
     yield "CPU ms a frame: all trees kept up, all whole routes read. Gap: driven cost over optimum, in % above it."
     first = table(
         "Table 1: targets x vehicles",
-        *("targets", "vehicles", "full\nms", "paper's\nms", "gap %\nmean", "\np95", "\nmax"),
-        *("rotation\nms", "gap %\nmean", "\np95", "\nmax"),
-        tight=True,
+        *("targets", "vehicles", "paper,\nprinted", "full\nms", "paper's\nms", "gap %\nmean", "\nmax"),
+        *("rotation\nms", "gap %\nmean", "\nmax"),
     )
     for n, row in enumerate(report["table_1"]):
-        figures = [number(row["full"]["frame_ms_mean"])]
+        figures = [number(1e3 * row["printed_s"]), number(row["full"]["frame_ms_mean"])]
         for name in COMPARED[1:]:
             found = row[name]
             figures.append(number(found["frame_ms_mean"]))
-            figures += [percent(found[key]) for key in ("gap_mean", "gap_p95", "gap_max")]
+            figures += [percent(found[key]) for key in ("gap_mean", "gap_max")]
         first.add_row(str(row["targets"]), str(row["vehicles"]), *figures, end_section=n % 3 == 2)
     yield first
     second = table(
         "Table 2: strategies, 10 targets, 100 vehicles",
-        *("<strategy", "ms\nmean", "\nmedian", "\np95", "faster\nthan full", "gap %\nmean", "\np95", "\nmax"),
+        *(
+            "<strategy",
+            "paper,\nprinted",
+            "ms\nmean",
+            "\np95",
+            "faster\nthan full",
+            "gap %\nmean",
+            "\np95",
+            "\nmax",
+        ),
     )
     full_ms = report["table_2"][0]["frame_ms_mean"]
     for row in report["table_2"]:
+        printed_s = row["printed_s"]
         second.add_row(
             LABELS[row["strategy"]],
-            *(number(row[key]) for key in ("frame_ms_mean", "frame_ms_p50", "frame_ms_p95")),
+            number(None if printed_s is None else 1e3 * printed_s),
+            *(number(row[key]) for key in ("frame_ms_mean", "frame_ms_p95")),
             times(full_ms / row["frame_ms_mean"]),
             *(percent(row[key]) for key in ("gap_mean", "gap_p95", "gap_max")),
         )
     yield second
-    yield UNKNOWN
+    yield f"Printed: ms a frame in the paper, {report['printed']['on']}. {report['printed']['not_stated']}"

@@ -1,4 +1,4 @@
-"""A full tree, ours and other people's: time, memory, and whether the results agree."""
+"""Full trees of our library and of others: time, memory, agreement."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def run(
 
 
 def _difference(ours: Costs, theirs: Costs) -> float:
-    """Largest difference relative to the larger of the two: 1 where only one of them finds a way."""
+    """Largest difference, relative to the larger cost; 1 where only one finds a path."""
     mine, other = np.isfinite(ours), np.isfinite(theirs)
     if (mine != other).any():
         return 1.0
@@ -102,7 +102,7 @@ def _difference(ours: Costs, theirs: Costs) -> float:
 
 
 def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    """The report for people."""
+    """The report as tables."""
     high, wide = report["shape"]
     memory = report["memory_mb"] or {}
     yield (

@@ -1,4 +1,4 @@
-"""How time and gap grow with the map, the targets and the vehicles."""
+"""Time and gap by size of the map, number of targets and of vehicles."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def run_scale(
     picture: Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """A row per point and strategy. A strategy gets at most so many `seconds` of CPU at each point."""
+    """Measures a row per point and strategy, with at most `seconds` of CPU time each."""
     warm_up()
     rows: list[dict[str, Any]] = []
     entrants = {name: PlannerConfig(strategy=name) for name in strategies}

@@ -1,1 +1,1 @@
-"""Benchmarks of what travels: marks, queries, positions and partitions, beside raw Zenoh."""
+"""Benchmarks of the wire: marks, queries, positions and partitions, beside raw Zenoh."""

@@ -1,19 +1,15 @@
-"""What a keeper holds after many lives of an agent, with and without folding, on the memory bus.
-
-python -m launch_scripts.bench.wire.compaction --lives 200 --json
-"""
+"""Size of a keeper's store after many lives of an agent, with and without compaction."""
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from shared_map.keeper.compaction import fold
+from launch_scripts.bench.machine import machine
+from launch_scripts.bench.tables import Progress
+from shared_map.keeper.compaction import compact
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.replica import MapReplica
 from swarm.clock import NS_PER_S
@@ -25,9 +21,11 @@ CELLS = 24
 SPREAD = 40
 
 
-def after_lives(lives: int, folds: bool, seed: int = 1) -> dict[str, float]:
-    """Each life says something about places that it drives by, most of them where the lives before it were, and
-    dies. The keeper folds after each, as if everybody had been dead for long enough."""
+def after_lives(lives: int, compacts: bool, seed: int = 1) -> dict[str, float]:
+    """Sizes of a keeper's store after many lives of one agent, which mark mostly the same places.
+
+    compacts  the keeper compacts after each life, as if all earlier authors had been dead for long enough
+    """
     grid = GridSpec(SIDE_CELLS, SIDE_CELLS, 10.0)
     chance = np.random.default_rng(seed)
     keeper = MapReplica(grid)
@@ -39,23 +37,23 @@ def after_lives(lives: int, folds: bool, seed: int = 1) -> dict[str, float]:
             cells = np.unique(starts[:, None] + np.arange(CELLS))
             kinds = chance.integers(3, size=len(cells), dtype=np.uint8)
             author.write(cells, kinds, chance.uniform(0.5, 5.0, size=len(cells)), (life + 1) * NS_PER_S)
-            said = [each for tile in author.tiles for each in author.sets(tile)]
-            keeper.merge_many(said)
+            said = [each for tile in author.held.tiles for each in author.held.of_tile(tile)]
+            keeper.merge(said)
             store.save(said)
-            if folds:
-                gone = set(keeper.ledger.authors)
+            if compacts:
+                gone = set(keeper.held.ledger.authors)
                 tiles = {each.tile for each in said}
-                new = [each for t in tiles for each in fold(keeper.sets(t), {}, gone, -(1 << 62))]
+                new = [each for t in tiles for each in compact(keeper.held.of_tile(t), {}, gone, -(1 << 62))]
                 store.save(new)
-                keeper.merge_many(new)
-        store.forget_folded(1)  # as when the time to keep it is over
-        marked = sum(len(keeper.winners(tile).cells) for tile in keeper.tiles)
+                keeper.merge(new)
+        store.forget_set_aside(1)  # as when the time to keep it is over
+        marked = sum(len(keeper.winners(tile).cells) for tile in keeper.held.tiles)
         sets = list(store.load())
-    digest_bytes = sum(len(rows) for rows in keeper.digest().values())
+    digest_bytes = sum(len(rows) for rows in keeper.held.ledger.held().values())
     return {
         "lives": lives,
         "cells_marked": marked,
-        "authors": len(keeper.ledger.authors),
+        "authors": len(keeper.held.ledger.authors),
         "sets": len(sets),
         "marks": sum(len(each.kinds) for each in sets),
         "payload_kib": round(sum(15 * len(each.kinds) + 40 for each in sets) / 1024),
@@ -63,19 +61,11 @@ def after_lives(lives: int, folds: bool, seed: int = 1) -> dict[str, float]:
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--lives", type=int, default=200)
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-    chosen = parser.parse_args(arguments)
-    found = {label: after_lives(chosen.lives, folds) for label, folds in (("without", False), ("with", True))}
-    if chosen.json:
-        print(json.dumps(found))
-    else:
-        for label, figures in found.items():
-            print(f"{label} folding: " + ", ".join(f"{value:,} {key}" for key, value in figures.items()))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def run(lives: int, seed: int = 1, progress: Progress | None = None) -> dict[str, Any]:
+    """One row without compaction and one with it, of the same lives."""
+    rows = []
+    for done, compacts in enumerate((False, True), 1):
+        rows.append({"compaction": "with" if compacts else "without", **after_lives(lives, compacts, seed)})
+        if progress is not None:
+            progress(done, 2)
+    return {"rows": rows, **machine()}

@@ -1,4 +1,4 @@
-"""Marks over the wire beside raw Zenoh: how soon one is applied elsewhere, how many a second, and a late join."""
+"""Marks on the wire beside raw Zenoh: latency, throughput, and a late join."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from launch_scripts.bench.wire.remote import (
 )
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import NS_PER_S
@@ -40,8 +40,8 @@ _LONGEST_S = 20
 
 
 def latency(far: Far, marks: int) -> dict[str, float]:
-    """Microseconds from the put of a mark until it is in another process's cost map, and from a raw put of the
-    same bytes under a key of the same form until a thread there has it. In turn, the order changing."""
+    """Microseconds from the put of a mark until another process's cost map has it, beside a raw put of the same
+    bytes until a thread there has them. Both take turns in changing order."""
     peer = far.start(map_peer)
     with open_bus(far.network) as bus:
         replica = MapReplica(GRID, author=_AUTHOR, publish_hz=1e6)
@@ -86,8 +86,8 @@ def latency(far: Far, marks: int) -> dict[str, float]:
 
 
 def flood(far: Far, sets: int, rounds: int) -> dict[str, float]:
-    """Sets of some 200 bytes, put as fast as they go, in rounds in turn: received raw through a FIFO, and applied
-    to a replica and its cost map. A second counts from the first put until the last arrival."""
+    """Sets of some 200 bytes per second, put as fast as possible: raw into a FIFO, ours into a replica and its
+    cost map, in turn. Time counts from the first put to the last arrival."""
     tiles = GRID.tiles
     peer = far.start(map_peer)
     per_s: dict[str, list[float]] = {"ours": [], "raw": []}
@@ -127,8 +127,8 @@ def flood(far: Far, sets: int, rounds: int) -> dict[str, float]:
 
 
 def late_join(far: Far, sets: int, marks: int, joins: int) -> dict[str, float]:
-    """Milliseconds until a newcomer, each time with a new session, has all sets of a keeper in its cost map; until
-    a raw get has as many values; and, for the limit, until a raw get has the same bytes in a few large replies."""
+    """Milliseconds until a newcomer with a new session has all sets of a keeper in its cost map; beside a raw get
+    of as many values; and beside the limit, a raw get of the same bytes in a few large replies."""
     far.start(map_holder, sets, marks)
     times: dict[str, list[float]] = {"sets": [], "bulk": [], "ours": []}
     cpu: dict[str, list[float]] = {"sets": [], "bulk": [], "ours": []}
@@ -144,17 +144,17 @@ def late_join(far: Far, sets: int, marks: int, joins: int) -> dict[str, float]:
         with open_bus(far.network) as bus:
             inbox = Inbox()
             replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
-            feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench")
+            sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench")
             began_ns, used_ns = time.monotonic_ns(), time.process_time_ns()
-            feed.start(began_ns)
-            while not feed.joined and time.monotonic_ns() - began_ns < _LONGEST_S * NS_PER_S:
+            sync.start(began_ns)
+            while not sync.joined and time.monotonic_ns() - began_ns < _LONGEST_S * NS_PER_S:
                 event = inbox.take(0.1)
                 if event is not None:
-                    feed.handle(event, time.monotonic_ns())
+                    sync.handle(event, time.monotonic_ns())
             times["ours"].append((time.monotonic_ns() - began_ns) / 1e6)
             cpu["ours"].append((time.process_time_ns() - used_ns) / 1e6)
-            if len(replica.tiles) != sets:
-                raise SwarmError(f"a late join had {len(replica.tiles)} of {sets} sets")
+            if len(replica.held.tiles) != sets:
+                raise SwarmError(f"a late join had {len(replica.held.tiles)} of {sets} sets")
     far.end()
     figures = {
         "sets": sets,
@@ -175,7 +175,7 @@ def _raw_get(bus: ZenohBus, key: str, sets: int) -> int:
 
 
 def _settle(bus: ZenohBus, peer: Any) -> None:
-    """Until puts reach the peer, and what runs for the first time has run."""
+    """Waits until puts reach the peer and first calls are over."""
     deadline_s = time.monotonic() + _LONGEST_S
     n = 0
     while asked(peer, "counts")[0] < 20 or asked(peer, "counts")[1] < 20:
@@ -192,7 +192,7 @@ def _settle(bus: ZenohBus, peer: Any) -> None:
 
 
 def _until_still(peer: Any, sets: int, which: int) -> None:
-    """Until all have arrived, or no more come."""
+    """Waits until all have arrived, or no more come."""
     before, since_s = 0, time.monotonic()
     while (count := asked(peer, "counts")[which]) < sets:
         if count > before:

@@ -15,14 +15,15 @@ from rich.table import Table
 
 from launch_scripts.bench.machine import machine
 from launch_scripts.bench.tables import Progress, number, table
+from launch_scripts.bench.wire import codec as wire_codec
 from launch_scripts.bench.wire import marks as wire_marks
 from launch_scripts.bench.wire import queries as wire_asks
 from launch_scripts.bench.wire import remote as wire_far
 from launch_scripts.bench.wire.remote import Far
 
-PARTS = ("latency", "flood", "join", "route", "positions", "replica")
+PARTS = ("latency", "flood", "join", "route", "positions", "replica", "codec")
 WANTED = {"latency p50": 1.5, "latency p99": 2.0, "flood": 0.3, "late join": 1.5, "digest_ms": 50, "memory": 40}
-"""What the project set out to reach: ratios to raw Zenoh, milliseconds, bytes a mark."""
+"""Goals of the project: ratios to raw Zenoh, milliseconds, bytes per mark."""
 
 
 def run(
@@ -36,7 +37,7 @@ def run(
     seconds: float = 5.0,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Measure. Returns what was measured, by part, and `rows` that sum it up."""
+    """Measures all parts. Returns the figures of each, and `rows` which sum them up."""
     measure: dict[str, Callable[[Far], dict[str, Any]]] = {
         "latency": lambda far: wire_marks.latency(far, marks),
         "flood": lambda far: wire_marks.flood(far, sets, rounds),
@@ -44,6 +45,7 @@ def run(
         "route": lambda far: wire_asks.route_queries(far, queries),
         "positions": lambda far: wire_asks.positions(far, 40, 25, seconds),
         "replica": _replica,
+        "codec": lambda far: wire_codec.run(),
     }
     report: dict[str, Any] = machine()
     with Far() as far:
@@ -56,7 +58,7 @@ def run(
 
 
 def tables(report: dict[str, Any]) -> Iterator[Table | str]:
-    """The rows as one table, and what has to be known to read it."""
+    """The rows as one table, and notes on how to read it."""
     found = table("The wire beside raw Zenoh", "<", "ours", "raw", "ours / raw", "wanted")
     for row in report["rows"]:
         ratio, wanted = row["ratio"], row["wanted"]
@@ -69,9 +71,12 @@ def tables(report: dict[str, Any]) -> Iterator[Table | str]:
         )
     yield found
     yield (
-        "Raw is Zenoh with a FIFO and a thread that does nothing with what it receives. For figures per second more"
-        " is better, for all others less. --json gives medians, tails and what was lost."
+        "Raw is Zenoh with a FIFO and a thread that does nothing with what it receives; of the codec it is msgspec"
+        " alone. For figures per second more is better, for all others less. --json gives medians, tails and what"
+        " was lost."
     )
+    if "codec" in report:
+        yield from wire_codec.tables(report["codec"])
 
 
 def _replica(far: Far) -> dict[str, Any]:
@@ -121,6 +126,10 @@ _ROWS: dict[str, Callable[[dict[str, Any]], list[dict[str, Any]]]] = {
     "replica": lambda of: [
         _row("memory of 1 M marks", "B a mark", of["bytes_per_mark"], wanted=WANTED["memory"]),
         _row("digest of 1 M marks", "ms", of["digest_ms"], wanted=WANTED["digest_ms"]),
+    ],
+    "codec": lambda of: [
+        _row(f"{way} the messages of a run", "us", of[f"ours_{way}_us"], of[f"raw_{way}_us"], of[f"ratio_{way}"])
+        for way in ("encode", "decode")
     ],
 }
 

@@ -1,17 +1,14 @@
 """How soon all replicas are equal after a partition heals: two routers in network namespaces, over mutual TLS.
 
-python -m launch_scripts.bench.wire.partition --rounds 20 --seconds 30 --json
-
-Needs root and `ip` (iproute2). Two namespaces stand for two machines, a pair of veth for the cable between them. On
-each side run, as processes of their own, a router, a keeper with its store on disk, two authors that say something
-about eight cells every 50 ms, and a listener; the sides meet over tls/ with certificates made for the purpose. A
-round takes the cable down, lets both sides write, stops writing, puts the cable up, and measures until every
-replica of both sides tells the same digest and none has changed for a second.
+Two namespaces stand for two machines, a pair of veth for the cable between them. On each side run, as processes of
+their own, a router, a keeper with its store on disk, two authors that say something about eight cells every 50 ms,
+and a listener; the sides meet over tls/ with certificates made for the purpose. A round takes the cable down, lets
+both sides write, stops writing, puts the cable up, and measures until every replica of both sides tells the same
+digest and none has changed for a second.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import os
@@ -22,159 +19,24 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from launch_scripts.bench.machine import machine
+from launch_scripts.bench.tables import Progress
+from launch_scripts.bench.wire import partition_side
+from launch_scripts.bench.wire.partition_side import ADDRESSES, SIDES
 from launch_scripts.deploy.certificates import issue
-from launch_scripts.launcher.router import RouterService
-from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
-from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
-from shared_map.terrain.terrain import Terrain, terrain_of_pace
-from swarm.bus.bus import Bus, Event, Post
-from swarm.bus.zenoh_bus import open_bus
-from swarm.clock import MonotonicClock
-from swarm.config.scenario import NetworkConfig, Scenario, TlsConfig
 from swarm.errors import SwarmError
-from swarm.runtime.inbox import Inbox
-from swarm.runtime.membership import Member
-from swarm.runtime.process import Process
-from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
-from swarm.wire.statements import MarkKind
 
-SIDES = ("east", "west")
-ADDRESSES = {"east": "10.213.77.1", "west": "10.213.77.2"}
-LOCAL = "tcp/127.0.0.1:7447"
-PORT = 7448
-SIDE_CELLS = 512
-TICK_HZ = 50.0
-WRITE_NS = 50_000_000
 SETTLED_S = 1.0
 GIVE_UP_S = 30.0
 _SETTLE_START_S = 60.0
-
-
-# --- one process of one side --------------------------------------------------------------------------------
-
-
-class MapService:
-    """A replica that takes part in the map; one with an author writes while it is told to."""
-
-    def __init__(self, setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post) -> None:
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
-        self.counters = self._member.counters
-        author = setup.author if setup.role == "agent" else None
-        self.replica = MapReplica(terrain.grid, author=author)
-        self._feed = MapFeed(self.replica, bus, post, setup.scenario.map, setup.role)
-        self._chance = np.random.default_rng(setup.incarnation % (1 << 32))
-        self._at = self._chance.integers(SIDE_CELLS, size=2)
-        self._write_due_ns = 0
-        self.writing = False
-
-    def start(self, now_ns: int) -> None:
-        self._member.join()
-        self._feed.start(now_ns)
-
-    def handle(self, event: Event, now_ns: int) -> None:
-        if not self._member.handle(event):
-            self._feed.handle(event, now_ns)
-
-    def tick(self, now_ns: int) -> None:
-        if self.writing and now_ns >= self._write_due_ns:
-            self._write_due_ns = now_ns + WRITE_NS
-            self._scribble(now_ns)
-        self._feed.tick(now_ns)
-        self._member.tick(now_ns)
-
-    def stop(self, now_ns: int) -> None:
-        self._member.publish_stats(now_ns)
-
-    def _scribble(self, now_ns: int) -> None:
-        """Eight marks in a row, a few cells from the last, as by a vehicle on its way."""
-        self._at = (self._at + self._chance.integers(-8, 9, size=2)) % (SIDE_CELLS - 8)
-        start = self.replica.grid.cell(*self._at.tolist())
-        kind = self._chance.choice([MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR])
-        self._feed.publish(self.replica.write(np.arange(start, start + 8), kind, 2.0, now_ns))
-
-
-def run_child(side: str, role: str, id: str, folder: Path) -> None:
-    """One process: tells its digest in a line whenever it changes, does what standard input says."""
-    names = {name: str(folder / f"{side}.{kind}") for name, kind in (("certificate", "pem"), ("key", "key"))}
-    tls = TlsConfig(ca=str(folder / "ca.pem"), **names)
-    other = SIDES[1 - SIDES.index(side)]
-    here, there = (f"tls/{ADDRESSES[each]}:{PORT}" for each in (side, other))
-    peers = (there,) if side == SIDES[0] else ()
-    network = NetworkConfig(listen=(LOCAL, here), connect=(LOCAL,), peers=peers, tls=tls)
-    started_ns = time.time_ns()
-    setup = RoleSetup(Scenario(network=network), "partition", role, f"{side}-{id}", started_ns, started_ns)
-    terrain = terrain_of_pace(np.ones((SIDE_CELLS, SIDE_CELLS), np.float32))
-    inbox = Inbox()
-    with contextlib.ExitStack() as stack:
-        bus = stack.enter_context(open_bus(network, mode="router" if role == "router" else "client"))
-        service: RouterService | KeeperService | MapService
-        if role == "router":
-            service = RouterService(setup.info(terrain.grid, terrain.digest), bus, inbox.post)
-        elif role == "keeper":
-            store = stack.enter_context(KeeperStore(folder / f"{side}.sqlite"))
-            service = KeeperService(setup, terrain, bus, inbox.post, store)
-        else:
-            service = MapService(setup, terrain, bus, inbox.post)
-        process = Process(_Telling(service), inbox, MonotonicClock(), TICK_HZ)
-        threading.Thread(target=_obey, args=(service, process), daemon=True).start()
-        process.run()
-
-
-class _Telling:
-    """A service that prints [monotonic seconds, digest] when its replica has changed, looking each tick."""
-
-    def __init__(self, service: RouterService | KeeperService | MapService) -> None:
-        self._service = service
-        self._replica = None if isinstance(service, RouterService) else service.replica
-        self._merged = -1
-
-    @property
-    def counters(self) -> Counters:
-        return self._service.counters
-
-    def start(self, now_ns: int) -> None:
-        self._service.start(now_ns)
-        _say([time.monotonic(), ""])
-
-    def handle(self, event: Event, now_ns: int) -> None:
-        self._service.handle(event, now_ns)
-
-    def tick(self, now_ns: int) -> None:
-        self._service.tick(now_ns)
-        merged = 0 if self._replica is None else self._replica.counts["sets_merged"]
-        if self._replica is not None and merged != self._merged:
-            self._merged = merged
-            _say([time.monotonic(), self._replica.fingerprint()])
-
-    def stop(self, now_ns: int) -> None:
-        self._service.stop(now_ns)
-
-
-def _obey(service: object, process: Process) -> None:
-    for line in sys.stdin:
-        match line.strip():
-            case "write" if isinstance(service, MapService):
-                service.writing = True
-            case "hush" if isinstance(service, MapService):
-                service.writing = False
-    process.stop()  # our parent is gone or done
-
-
-def _say(words: list[object]) -> None:
-    sys.stdout.write(json.dumps(words) + "\n")
-    sys.stdout.flush()
-
-
-# --- both sides ---------------------------------------------------------------------------------------------
 
 
 @dataclass(slots=True)
@@ -184,11 +46,11 @@ class _Child:
     author: bool
     replica: bool
     newest: tuple[float, str] = (0.0, "")
-    """When the digest became so, and the digest."""
+    """Time of the last change of its digest, and the digest."""
 
 
 class TwoSides:
-    """Two namespaces, their cable and their processes."""
+    """Two network namespaces, the cable between them, and their processes."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -239,7 +101,7 @@ class TwoSides:
         _ip("-n", self._spaces[side], "link", "set", self._ends[side], "up" if up else "down")
 
     def say(self, word: str) -> None:
-        """Tell all authors."""
+        """Sends a word to all authors."""
         for child in self.children:
             if child.author and child.process.stdin is not None:
                 child.process.stdin.write(word + "\n")
@@ -258,8 +120,7 @@ class TwoSides:
                 log = (self._folder / f"{child.name}.log").read_text()[-2000:]
                 raise SwarmError(f"{child.name} ended by itself with {child.process.returncode}: {log}")
 
-    def wait_until(self, true: object, within_s: float) -> None:
-        assert callable(true)
+    def wait_until(self, true: Callable[[], object], within_s: float) -> None:
         until_s = time.monotonic() + within_s
         while not true():
             if time.monotonic() > until_s:
@@ -267,7 +128,7 @@ class TwoSides:
             self.listen(0.05)
 
     def equal_since(self) -> float | None:
-        """When the last replica came to the digest that all of them have; None while they differ."""
+        """Time at which the last replica reached the common digest; None while they differ."""
         newest = [child.newest for child in self.children if child.replica]
         if len({digest for _, digest in newest}) > 1 or not newest[0][1]:
             return None
@@ -282,9 +143,8 @@ class TwoSides:
 
     def _start(self, side: str, role: str, id: str) -> None:
         name = f"{side}-{role}-{id}"
-        here = [sys.executable, "-m", "launch_scripts.bench.wire.partition"]
+        here = [sys.executable, "-m", partition_side.__name__, side, role, id, str(self._folder)]
         command = ["ip", "netns", "exec", self._spaces[side], *here]
-        command += ["--child", side, role, id, str(self._folder)]
         with (self._folder / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
@@ -300,7 +160,7 @@ class TwoSides:
 
 
 def rounds(count: int, seconds: float, folder: Path) -> Iterator[dict[str, float]]:
-    """Of each round: how long until all were equal after the cable was up, how many digests there were before."""
+    """For each round: seconds from the cable's return until all are equal, and the number of digests before it."""
     with TwoSides(folder) as sides:
         sides.say("write")
         sides.listen(1.0)
@@ -315,14 +175,14 @@ def rounds(count: int, seconds: float, folder: Path) -> Iterator[dict[str, float
             sides.listen(0.3)  # the last sets reach their own side
             healed_s = time.monotonic()
             sides.cable(up=True)
-            sides.wait_until(lambda since_s=healed_s: sides.settled(since_s), GIVE_UP_S)
+            sides.wait_until(partial(sides.settled, healed_s), GIVE_UP_S)
             since_s = sides.equal_since()
             assert since_s is not None
             yield {"equal_after_s": round(max(since_s - healed_s, 0.0), 3), "digests_apart": apart}
 
 
 def why_not() -> str | None:
-    """Why this machine cannot play two; None if it can."""
+    """Why this machine cannot run two namespaces; None if it can."""
     if shutil.which("ip") is None:
         return "there is no command ip (iproute2)"
     space = f"swarm-try-{os.getpid()}"
@@ -342,37 +202,17 @@ def _ip(*arguments: str) -> None:
         raise SwarmError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=30.0, help="how long each partition lasts")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-    parser.add_argument("--child", nargs=4, metavar=("SIDE", "ROLE", "ID", "FOLDER"), help=argparse.SUPPRESS)
-    chosen = parser.parse_args(arguments)
-    if chosen.child:
-        side, role, id, folder = chosen.child
-        run_child(side, role, id, Path(folder))
-        return 0
+def run(count: int, seconds: float, progress: Progress | None = None) -> dict[str, Any]:
+    """Quantiles over all rounds. Raises SwarmError where two namespaces cannot run."""
     reason = why_not()
     if reason is not None:
-        print(f"partition: {reason}", file=sys.stderr)
-        return 1
+        raise SwarmError(f"this machine cannot run two network namespaces: {reason}")
     found: list[float] = []
     with tempfile.TemporaryDirectory() as name:
-        try:
-            for number, figures in enumerate(rounds(chosen.rounds, chosen.seconds, Path(name)), 1):
-                found.append(figures["equal_after_s"])
-                print(f"round {number}: all equal {found[-1]:.2f} s after the cable was up", file=sys.stderr)
-        except SwarmError as error:
-            print(f"partition: {error}", file=sys.stderr)
-            return 1
+        for figures in rounds(count, seconds, Path(name)):
+            found.append(figures["equal_after_s"])
+            if progress is not None:
+                progress(len(found), count)
     p50, p99 = (round(float(np.percentile(found, q)), 3) for q in (50, 99))
-    figures = {"rounds": len(found), "partition_s": chosen.seconds, "p50_s": p50, "p99_s": p99, "max_s": max(found)}
-    print(
-        json.dumps(figures) if chosen.json else f"equal after {p50} s (p50), {p99} s (p99), {max(found)} s (worst)"
-    )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    measured = {"p50_s": p50, "p99_s": p99, "max_s": max(found)}
+    return {"rounds": len(found), "partition_s": seconds, **measured, "equal_after_s": found, **machine()}

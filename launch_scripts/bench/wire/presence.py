@@ -1,16 +1,15 @@
-"""What presence costs an agent each tick, by how many vehicles there are.
-
-python -m launch_scripts.bench.wire.presence
-"""
+"""CPU time of presence per tick of an agent, by the number of vehicles."""
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
+from launch_scripts.bench.machine import machine
+from launch_scripts.bench.tables import Progress
 from shared_map.presence import Presence
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
@@ -54,11 +53,11 @@ def cpu_ms(work: Callable[[], object], rounds: int) -> float:
         began_ns = time.thread_time_ns()
         work()
         took.append(time.thread_time_ns() - began_ns)
-    return sorted(took)[rounds // 2] / 1e6
+    return round(sorted(took)[rounds // 2] / 1e6, 3)
 
 
 def measure(count: int, rounds: int = 50) -> dict[str, float]:
-    """CPU milliseconds of the parts of a tick in which everybody was heard anew."""
+    """CPU milliseconds of the parts of a tick in which all agents have reported."""
     grid = GridSpec(1024, 1024, 20.0)
     said = fleets(grid, count, seed=1)
     payloads = [encode(fleet) for fleet in said]
@@ -79,7 +78,7 @@ def measure(count: int, rounds: int = 50) -> dict[str, float]:
             presence.near(east, south, 100.0)
 
     def hear_one() -> None:
-        """After which the next to ask has to look at everybody."""
+        """Hears one report, after which the next query builds the index anew."""
         nonlocal seq
         seq += 1
         presence.hear(_again(mine, seq), seq)
@@ -103,17 +102,15 @@ def measure(count: int, rounds: int = 50) -> dict[str, float]:
 
 
 def _again(fleet: Fleet, seq: int) -> Fleet:
-    """As the network brings it the next time."""
+    """A copy with another sequence number, as the network delivers it."""
     return Fleet(**{name: getattr(fleet, name) for name in fleet.__struct_fields__ if name != "seq"}, seq=seq)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--vehicles", type=int, nargs="+", default=[1000, 5000])
-    for count in parser.parse_args().vehicles:
-        took = measure(count)
-        print(count, "vehicles:", ", ".join(f"{name} {value:.2f}" for name, value in took.items()))
-
-
-if __name__ == "__main__":
-    main()
+def run(vehicles: Sequence[int], rounds: int, progress: Progress | None = None) -> dict[str, Any]:
+    """A row per number of vehicles."""
+    rows = []
+    for done, count in enumerate(vehicles, 1):
+        rows.append({"vehicles": count, **measure(count, rounds)})
+        if progress is not None:
+            progress(done, len(vehicles))
+    return {"rows": rows, **machine()}

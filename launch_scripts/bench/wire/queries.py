@@ -1,4 +1,4 @@
-"""Queries and positions over the wire beside raw Zenoh."""
+"""Queries and positions on the wire beside raw Zenoh."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ _TARGET = "t0"
 _HZ = 10.0
 _LONGEST_S = 60.0
 _SESSIONS = 10
-"""Agents in one sending process: forty interpreters would measure how two cores are shared among them."""
+"""Agents per sending process: forty interpreters would measure how they share two cores."""
 
 
 # --- path queries -------------------------------------------------------------------------------------------
 
 
 def planner_peer(network: NetworkConfig, pipe: Connection) -> None:
-    """A planner of a level 512 x 512 terrain, and a raw queryable that answers with bytes that it is given."""
+    """A planner on level terrain of 512 x 512 cells, and a raw queryable which answers with given bytes."""
     from planner_service.service import PlannerService
     from planner_service.warm_up import warm_up
 
@@ -69,8 +69,7 @@ def planner_peer(network: NetworkConfig, pipe: Connection) -> None:
 
 
 def route_queries(far: Far, queries: int) -> dict[str, float]:
-    """Microseconds from asking a planner for a route until the parsed reply is there, and from a raw get until the
-    same bytes are, in turn."""
+    """Microseconds from a route request to the parsed reply, beside a raw get of the same bytes, in turn."""
     peer = far.start(planner_peer)
     ours_us, raw_us = [], []
     random = np.random.default_rng(2)
@@ -137,7 +136,7 @@ def _route(bus: ZenohBus, inbox: Inbox, request: RouteRequest) -> RouteReply | N
 
 
 def fleet_sender(network: NetworkConfig, pipe: Connection, first: int, vehicles: int) -> None:
-    """Agents, each with its own session, that tell where their vehicles are ten times a second when asked to."""
+    """Agents, each with its own session, which publish positions ten times a second while told to."""
     buses = [open_bus(network) for _ in range(_SESSIONS)]
     pipe.send("ready")
     seq = 0
@@ -182,7 +181,7 @@ def _fleet(author: str, region: int, seq: int, vehicles: int) -> Fleet:
 
 
 class _Watcher:
-    """Keeps the newest positions of each agent and region, as whoever needs its neighbours does."""
+    """Keeps the newest positions of each agent and region, as an agent does."""
 
     def __init__(self, bus: ZenohBus, inbox: Inbox) -> None:
         self.counters = Counters()
@@ -207,7 +206,7 @@ class _Watcher:
 
 
 def watcher_peer(network: NetworkConfig, pipe: Connection) -> None:
-    """Hears positions, ours parsed and by the newest, raw through a FIFO; tells its counts and its CPU time."""
+    """Receives positions, ours parsed and newest only, raw ones through a FIFO; reports counts and CPU time."""
     raw_received: list[int] = []
     with open_bus(network) as bus:
         inbox = Inbox()
@@ -224,7 +223,7 @@ def watcher_peer(network: NetworkConfig, pipe: Connection) -> None:
 
 
 def positions(far: Far, agents: int, vehicles: int, seconds: float) -> dict[str, float]:
-    """What it costs a process to know where all vehicles are: ours, and raw Zenoh that only receives the bytes."""
+    """CPU time for all positions in one process: ours, and raw Zenoh which only receives the bytes."""
     watcher = far.start(watcher_peer)
     senders = [far.start(fleet_sender, first, vehicles) for first in range(0, agents, _SESSIONS)]
     figures: dict[str, Any] = {"vehicles": agents * vehicles, "bytes": len(encode(_fleet("a0.1", 0, 1, vehicles)))}

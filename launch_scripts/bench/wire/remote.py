@@ -20,7 +20,7 @@ from shared_map.cost_map import CostMap
 from shared_map.replication.mark_sets import packed
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
@@ -37,7 +37,7 @@ from swarm.wire.statements import MarkKind
 
 NAMESPACE = "bench"
 RAW = "raw/bench"
-"""Keys of the raw measurements: as long and as many as ours, where none of us listens."""
+"""Keys of the raw measurements: as long and as many as ours, without subscribers of ours."""
 GRID = GridSpec(2048, 2048, 10.0)
 _READY_S = 60.0
 _END_S = 5.0
@@ -52,12 +52,12 @@ def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
 
 
 def map_key(tile: int, author: str) -> str:
-    """What follows the namespace in the key of a set."""
+    """Key of a set, below the namespace."""
     return f"marks/{GRID.region_of_tile(tile)}/{tile}/{author}"
 
 
 class Far:
-    """Processes beside this one, on one router. Left, they are ended, however the measurement went."""
+    """Processes beside this one, on one router. They end with the context."""
 
     def __init__(self) -> None:
         with socket.socket() as probe:
@@ -76,7 +76,7 @@ class Far:
             self.end()
 
     def start(self, run: Callable[..., None], *given: Any) -> Connection:
-        """Run `run(network, pipe, *given)` in a process; returns once it has said "ready"."""
+        """Runs `run(network, pipe, *given)` in a process; returns once it has sent "ready"."""
         here, there = self._spawning.Pipe()
         process = self._spawning.Process(target=run, args=(self.network, there, *given), daemon=True)
         process.start()
@@ -86,7 +86,7 @@ class Far:
         return here
 
     def end(self) -> None:
-        """End the process that was started last."""
+        """Ends the process which was started last."""
         process, pipe = self._running.pop()
         with contextlib.suppress(OSError):  # it may have ended already
             pipe.send("end")
@@ -97,7 +97,7 @@ class Far:
 
 
 def asked(far: Connection, *question: Any, within_s: float = 60.0) -> Any:
-    """What a process answers to a question."""
+    """Asks a process over its pipe and returns its answer."""
     far.send(question)
     if not far.poll(within_s):
         raise SwarmError(f"no answer to {question[0]} within {within_s:.0f} s")
@@ -111,7 +111,7 @@ def _router(network: NetworkConfig, pipe: Connection) -> None:
 
 
 def read_on_thread(entity: Any, arrive: Callable[[Any], None]) -> Any:
-    """Raw Zenoh at its fastest from Python: a FIFO and a thread. Returns the entity, which must be kept."""
+    """Raw Zenoh at its fastest from Python: a FIFO and a thread. The caller keeps the returned entity."""
     channel = entity.handler
 
     def run() -> None:
@@ -126,7 +126,7 @@ def read_on_thread(entity: Any, arrive: Callable[[Any], None]) -> Any:
 
 
 def run_service(service: Any, inbox: Inbox, pipe: Connection, answer: Callable[..., Any]) -> None:
-    """Run a service as its role does, until "end"; questions are answered on a thread beside it."""
+    """Runs a service as its role does until "end"; a thread beside it answers questions."""
     process = Process(service, inbox, MonotonicClock(), 10.0)
 
     def questions() -> None:
@@ -139,29 +139,29 @@ def run_service(service: Any, inbox: Inbox, pipe: Connection, answer: Callable[.
 
 
 class _MapPeer:
-    """A process that does nothing but take part in the map."""
+    """A service which is nothing but a replica."""
 
-    def __init__(self, feed: MapFeed, pipe: Connection) -> None:
+    def __init__(self, sync: MapSync, pipe: Connection) -> None:
         self.counters = Counters()
-        self._feed = feed
+        self._sync = sync
         self._pipe = pipe
 
     def start(self, now_ns: int) -> None:
-        self._feed.start(now_ns)
+        self._sync.start(now_ns)
         self._pipe.send("ready")
 
     def handle(self, event: Event, now_ns: int) -> None:
-        self._feed.handle(event, now_ns)
+        self._sync.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        self._feed.tick(now_ns)
+        self._sync.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
         pass
 
 
 def map_peer(network: NetworkConfig, pipe: Connection) -> None:
-    """Applies the sets that it hears to a cost map, and notes when; receives raw samples beside that."""
+    """Applies sets to a cost map and notes the times; receives raw samples beside them."""
     applied: list[tuple[int, int, int]] = []  # (tile, seq, when)
     raw_ns: list[int] = []
     cpu_ns: dict[str, int] = {}
@@ -189,26 +189,26 @@ def map_peer(network: NetworkConfig, pipe: Connection) -> None:
     with open_bus(network) as bus:
         inbox = Inbox()
         replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
-        feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
+        sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
         raw = bus.session.declare_subscriber(f"{RAW}/**", zenoh.handlers.FifoChannel(1 << 16))
         kept = read_on_thread(raw, received)
-        run_service(_MapPeer(feed, pipe), inbox, pipe, answer)
+        run_service(_MapPeer(sync, pipe), inbox, pipe, answer)
         del kept
 
 
 def map_holder(network: NetworkConfig, pipe: Connection, sets: int, marks: int) -> None:
-    """Holds sets and answers for them as a keeper does; and the same bytes to raw queries, by set and in bulk."""
+    """Holds sets and answers as a keeper does; answers raw queries with the same bytes, by set and in bulk."""
     held = [some_set(tile, 0, marks) for tile in range(sets)]
     with open_bus(network) as bus:
         inbox = Inbox()
         replica = MapReplica(GRID)
-        replica.merge_many(held)
-        feed = MapFeed(replica, bus, inbox.post, MapConfig(), "bench", name="holder.1", serves_all=True)
+        replica.merge(held)
+        sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench", name="holder.1", serves_all=True)
         kept = [
             _serve_raw(bus, f"{RAW}/sets", [encode(each) for each in held]),
             _serve_raw(bus, f"{RAW}/bulk", [encode(each) for each in packed(held)]),
         ]
-        run_service(_MapPeer(feed, pipe), inbox, pipe, lambda *_: None)
+        run_service(_MapPeer(sync, pipe), inbox, pipe, lambda *_: None)
         del kept
 
 
@@ -222,29 +222,29 @@ def _serve_raw(bus: ZenohBus, key: str, payloads: list[bytes]) -> Any:
 
 
 def replica_cost(network: NetworkConfig, pipe: Connection) -> None:
-    """Tells the memory and times of a replica of a 4096 x 4096 map with a million marks."""
+    """Measures memory and times of a replica of a 4096 x 4096 map with a million marks."""
     grid = GridSpec(4096, 4096, 1.0)
     replica = MapReplica(grid)
-    replica.merge_many([some_set(tile, 0, 61) for tile in range(16)])
-    replica.digest()
+    replica.merge([some_set(tile, 0, 61) for tile in range(16)])
+    replica.held.ledger.held()
     before = resident_bytes()
     cpu_s = time.process_time()
     for tile in range(grid.tiles):
-        replica.merge(some_set(tile, 1, 61, f"a{tile % 8}.1"))
+        replica.merge([some_set(tile, 1, 61, f"a{tile % 8}.1")])
     one_by_one_s = time.process_time() - cpu_s
     held = resident_bytes() - before
     marks = grid.tiles * 61
     began_s = time.perf_counter()
-    digest = replica.digest()
+    digest = replica.held.ledger.held()
     first_ms = (time.perf_counter() - began_s) * 1e3
-    replica.merge(some_set(7, 2, 61, "a7.1"))
+    replica.merge([some_set(7, 2, 61, "a7.1")])
     began_s = time.perf_counter()
-    replica.digest()
+    replica.held.ledger.held()
     again_ms = (time.perf_counter() - began_s) * 1e3
     again = [some_set(tile, 3, 61, f"a{tile % 8}.1") for tile in range(grid.tiles)]
     cpu_s = time.process_time()
     for first in range(0, len(again), 1024):
-        replica.merge_many(again[first : first + 1024])
+        replica.merge(again[first : first + 1024])
     together_s = time.process_time() - cpu_s
     pipe.send("ready")
     pipe.recv()

@@ -8,20 +8,11 @@ import msgspec
 
 from swarm.grid import GridSpec
 from swarm.wire.fields import GridSide, Metres, Natural, check_column, check_id
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
 
 
 class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
-    """What a keeper has of the run's terrain, for those who lack its files.
+    """What a keeper has of the run's terrain, for machines without its files.
 
     digests  layer -> 8 bytes per region (256 x 256 cells): BLAKE2b of its bytes, in order of region
     notes    sentences about where the terrain came from
@@ -58,7 +49,7 @@ class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map
 
 class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
     """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
-    row, then the next, as like bytes beside each other pack better."""
+    row, then the next. Similar bytes side by side compress better."""
 
     layer: str
     region: Natural

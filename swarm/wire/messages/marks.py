@@ -4,28 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm.wire.fields import Natural, check_column, check_id
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
+from swarm.wire.fields import Natural, check_column, check_id, column
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
 from swarm.wire.statements import check_lengths, check_statements, faulty_sets
 
-FOLDS = 1 << 16
+SEQ_STEP = 1 << 16
 """An author's own numbers are multiples of this."""
 
 
 class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks")):
     """All that one author says about one tile. Replaces the author's set with a lower (epoch, seq).
 
-    An author counts `seq` in steps of 65536. The numbers between are for keepers, which fold what the dead have
-    left behind: drop from it what others overrule. Such a set without statements is a burial: readers forget the
+    An author counts `seq` in steps of 65536. The numbers between are for keepers, which compact the sets of dead
+    authors: drop from them what others overrule. Such a set without statements is a tombstone: readers forget the
     tile of that author.
 
     cells      uint16  index inside the tile, row-major over 32 x 32, strictly increasing

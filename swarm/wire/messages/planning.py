@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm.wire.fields import Cell, Natural, check_id
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
+from swarm.wire.fields import Cell, Natural, check_id, column
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
+from swarm.wire.routes import Route, Routes
 
 
 class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-request")):
     """Asks for routes from cells to the planner's target. A person may give `row` and `col` instead of `cells`.
 
-    vehicles   ids in the order of `cells`; those named are pushed newer routes until they ask elsewhere
-    max_cells  at most so many steps of each route; 0 is the whole route
-    force      the route ran out: the planner's range is forced to cover these cells
+    vehicles   ids in the order of `cells`; newer routes are pushed to these until they ask another planner
+    max_cells  most steps of each route; 0 is the whole route
+    force      a route ran out: the planner extends its window to these cells
     """
 
     cells: list[Cell] = []
@@ -42,8 +34,12 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
 
 
 class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
-    """A planner's answer. `map_version` counts the changes of its replica, `tree_age_ms` is since the last
-    exact growth, `incarnation` is the planner's."""
+    """A planner's answer.
+
+    incarnation  of the planner
+    map_version  number of changes of its replica
+    tree_age_ms  time since the last full growth
+    """
 
     target: str
     incarnation: Natural
@@ -97,8 +93,11 @@ class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
 
 
 class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-status")):
-    """How a planner is doing. `window` is [row0, col0, row1, col1] of the part grown last; the gaps are driven
-    cost over optimum, measured at the last exact growth over the vehicles that follow (None before)."""
+    """State of a planner.
+
+    window  [row0, col0, row1, col1] of the part grown last
+    gap_*   driven cost over optimum of the vehicles that follow, at the last full growth; None before the first
+    """
 
     target: str
     incarnation: Natural

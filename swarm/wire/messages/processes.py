@@ -3,21 +3,12 @@
 from __future__ import annotations
 
 from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET, Cell, Natural, check_finite, check_id
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
 
 
 class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
-    """What a process answers when asked which run it belongs to. `terrain` is a digest of grid, prior pace and
-    cost rules: processes with different ones must not share a map."""
+    """The run that a process belongs to. `terrain` is a digest of grid, prior pace and cost rules: processes with
+    different ones must not share a map."""
 
     run_id: str
     role: str
@@ -32,7 +23,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
-    """Everything a process has counted since its incarnation began. Histograms as in `swarm.runtime.stats`."""
+    """What a process has counted since its incarnation began. Histograms are as in `swarm.runtime.stats`."""
 
     role: str
     id: str
@@ -53,7 +44,7 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
 
 
 class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):
-    """Something worth telling a person: a capture, a restart, a closure found. `cell` says where, if anywhere."""
+    """An event for people: a capture, a restart, a closed road found. `cell` is its place, if it has one."""
 
     role: str
     id: str

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from swarm.wire.fields import Cell, Metres, Natural, check_id
-from swarm.wire.fields import column as column
-from swarm.wire.fields import pack_column as pack_column
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.routes import Route as Route
-from swarm.wire.routes import Routes as Routes
-from swarm.wire.routes import RouteStatus as RouteStatus
-from swarm.wire.statements import FOREVER as FOREVER
-from swarm.wire.statements import STAMP_LIMIT_NS as STAMP_LIMIT_NS
-from swarm.wire.statements import TILE_AREA as TILE_AREA
-from swarm.wire.statements import MarkKind as MarkKind
 
 
 class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
-    """Where a target is. `seq` grows within an incarnation of whoever tracks it; `jumps` counts the times it
-    was put somewhere else, as after a capture."""
+    """Where a target is.
+
+    seq       grows within an incarnation of the process that tracks it
+    captures  how often it was captured
+    jumps     how often it was put somewhere else, as after a capture
+    """
 
     target: str
     incarnation: Natural
@@ -34,8 +29,8 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
 
 
 class Sighted(Message, frozen=True, kw_only=True, tag=schema_of("sighted")):
-    """A target-sighted mark: where a vehicle of this author saw a target, within `uncertainty_m` of the place. It
-    says nothing about the ground, ends by itself, and the author's next about this target replaces it."""
+    """A sighting: a vehicle of this author saw a target within `uncertainty_m` of the place. It expires at
+    `until_ns`, and the author's next sighting of the target replaces it."""
 
     author: str
     group: str

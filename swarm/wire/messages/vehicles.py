@@ -83,8 +83,11 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
                 raise ValueError(f"{name} must be finite")
 
 
-class Want(msgspec.Struct, frozen=True, kw_only=True):
-    """A cell that a vehicle wants to enter. The lower (ticket, agent, vehicle) goes first."""
+class RequestedCell(msgspec.Struct, frozen=True, kw_only=True):
+    """A cell that a vehicle requests. Of rival requests the lowest (ticket, agent, vehicle) goes first.
+
+    ticket  Lamport time of the request
+    """
 
     vehicle: str
     cell: Cell
@@ -94,36 +97,38 @@ class Want(msgspec.Struct, frozen=True, kw_only=True):
         check_id("vehicle", self.vehicle)
 
 
-class Claims(Message, frozen=True, kw_only=True, tag=schema_of("claims")):
-    """Which cells an agent's vehicles hold and want, and which claims of others it has seen (right of way).
+class Reservations(Message, frozen=True, kw_only=True, tag=schema_of("reservations")):
+    """The cells that an agent's vehicles hold and request, and the newest reservations that it has seen of others.
 
-    holds  vehicle -> the cells it occupies or may enter now, its own position first
-    seen   agent -> [incarnation, seq] of the newest claims heard from it
+    seq        grows with each message within an incarnation; 0 while the agent has not placed its vehicles
+    clock      the sender's Lamport clock
+    held       vehicle -> the cells that it occupies or may enter, the one on which it stands first
+    requested  in the order in which each vehicle enters them
+    seen       agent -> [incarnation, seq] of the newest reservations heard of it
     """
 
     agent: str
     incarnation: Natural
     seq: Natural
     clock: Natural
-    holds: dict[str, list[Cell]]
-    wants: list[Want]
+    held: dict[str, list[Cell]]
+    requested: list[RequestedCell]
     seen: dict[str, tuple[Natural, Natural]]
 
     def __post_init__(self) -> None:
         check_id("agent", self.agent)
-        for vehicle in self.holds:
+        for vehicle in self.held:
             check_id("vehicle", vehicle)
-        if any(not cells for cells in self.holds.values()):
+        if any(not cells for cells in self.held.values()):
             raise ValueError("a vehicle holds at least the cell that it stands on")
 
 
-class Grounds(Message, frozen=True, kw_only=True, tag=schema_of("grounds")):
-    """The plots in which an agent's vehicles may claim cells: in a question to all agents, and in each answer.
+class TerritoryRequest(Message, frozen=True, kw_only=True, tag=schema_of("territory-request")):
+    """Tells all agents in which plots the sender may reserve cells, and asks each for its own.
 
-    seq     grows with each change within an incarnation; 0 while the agent has not put its vehicles anywhere
-    plots   squares of 64 x 64 cells, counted row by row as regions are
-    silent  asked: dead agents whose last words are wanted
-    words   answered: the newest claims that were heard of those
+    seq     grows with each change within an incarnation; 0 while the agent has not placed its vehicles
+    plots   squares of 64 x 64 cells, numbered row by row as regions are
+    silent  dead agents whose newest reservations the sender needs
     """
 
     agent: str
@@ -131,12 +136,28 @@ class Grounds(Message, frozen=True, kw_only=True, tag=schema_of("grounds")):
     seq: Natural
     plots: list[Natural]
     silent: list[str] = []
-    words: list[Claims] = []
 
     def __post_init__(self) -> None:
         check_id("agent", self.agent)
         for agent in self.silent:
             check_id("silent", agent)
+
+
+class TerritoryReply(Message, frozen=True, kw_only=True, tag=schema_of("territory")):
+    """The plots in which an agent may reserve cells: its answer to a `TerritoryRequest`.
+
+    seq, plots    as in the request
+    reservations  the newest that it has heard of the agents named as silent
+    """
+
+    agent: str
+    incarnation: Natural
+    seq: Natural
+    plots: list[Natural]
+    reservations: list[Reservations] = []
+
+    def __post_init__(self) -> None:
+        check_id("agent", self.agent)
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):

@@ -19,6 +19,7 @@ from launch_scripts.bench.planning.chase import FEWEST, Plan, Tally, chase
 from launch_scripts.bench.planning.cold_start import tables
 from launch_scripts.bench.planning.fields import FIELDS, Field, make_field
 from launch_scripts.bench.planning.scale import points_of
+from launch_scripts.bench.wire import partition
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
 from swarm.wire.routes import NO_TARGET, OK, RouteBatch
@@ -241,7 +242,16 @@ def test_the_paper_s_tables_have_its_rows() -> None:
         (targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)
     ]
     assert {row["strategy"] for row in report["table_2"]} == set(STRATEGIES)
-    assert report["published"] is None
+    assert [row["printed_s"] for row in report["table_1"]] == [
+        *(0.0102, 0.0103, 0.0104, 0.0470, 0.0480, 0.0490, 0.0802, 0.0848, 0.0882),
+    ]
+    assert {row["strategy"]: row["printed_s"] for row in report["table_2"] if row["printed_s"]} == {
+        "full": 0.8926,
+        "variable_range": 0.3194,
+        "variable_range+multi_resolution": 0.0882,
+    }
+    assert "16 R10000 processors" in report["printed"]["on"]
+    assert "does not state all of its motion, its k_min and its block rule" in report["printed"]["not_stated"]
     exact = next(row for row in report["table_2"] if row["strategy"] == "full")
     assert exact["gap_max"] < 1 + 1e-5
     assert exact["updates"] == {"full": 60}
@@ -304,6 +314,29 @@ def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
     assert_fits(console.export_text())
 
 
+# --- the map and its fleets --------------------------------------------------------------------------------------
+
+
+def test_folding_leaves_the_marked_cells_and_drops_what_was_said_twice() -> None:
+    without, folded = bench("compaction", "--lives", "8")["rows"]
+    assert (without["compaction"], folded["compaction"]) == ("without", "with")
+    assert folded["cells_marked"] == without["cells_marked"] == folded["marks"] < without["marks"]
+    assert_fits(words_of("compaction", "--lives", "2"))
+
+
+def test_presence_has_a_row_per_number_of_vehicles() -> None:
+    report = bench("presence", "--vehicles", "25,50", "--rounds", "3")
+    assert [row["vehicles"] for row in report["rows"]] == [25, 50]
+    assert all(value >= 0 for row in report["rows"] for value in row.values())
+    assert_fits(words_of("presence", "--vehicles", "25", "--rounds", "1"))
+
+
+def test_a_machine_that_cannot_play_two_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partition, "why_not", lambda: "there is no command ip (iproute2)")
+    with pytest.raises(SwarmError, match=r"this machine cannot run two network namespaces: there is no command ip"):
+        CliRunner().invoke(app, ["partition", "--rounds", "1"], catch_exceptions=False)
+
+
 # --- what a user may do wrong ------------------------------------------------------------------------------------
 
 
@@ -313,12 +346,13 @@ def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
         (("peers", "--field", "moon"), "field 'moon' is neither of terrain, uniform, maze nor a file"),
         (("peers", "--edge", "4"), "--edge is '4', expected paper or octile"),
         (("gap", "--dem", "no/such.tif"), "field 'no/such.tif' is neither of"),
-        (("gap", "--walk", "fly"), "--walk 'fly' is not one of random, waypoints, evade"),
-        (("gap", "--strategies", "best"), "strategy 'best' is not one of auto, full"),
+        (("gap", "--walk", "fly"), "--walk: 'fly' is not one of random, waypoints, evade"),
+        (("gap", "--strategies", "best"), "--strategies: 'best' is not one of auto, full"),
         (("gap", "--strategies", ","), "--strategies is ','"),
         (("gap", "--dem", "maze", "--vehicles", "999999"), "--vehicles is 999999; the field has"),
         (("gap", "--picture", "no/such/gap.png"), "--picture is no/such/gap.png: there is no folder"),
         (("scale", "--picture", "scale.pdf"), "expected a name that ends in .png"),
+        (("presence", "--vehicles", "24"), "--vehicles is '24', expected numbers of at least 25"),
         (("scale", "--sizes", "0"), "--sizes is '0', expected numbers of at least 16"),
         (("scale", "--targets", "many"), "--targets is 'many', expected numbers of at least 1"),
         (("scale", "--field", "a.tif"), "--field is 'a.tif', expected terrain, uniform, maze"),

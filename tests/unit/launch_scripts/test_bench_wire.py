@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from launch_scripts.bench.cli import app
+from launch_scripts.bench.wire import codec
 
 pytestmark = pytest.mark.network
 
@@ -33,3 +34,16 @@ def test_a_part_that_there_is_not_is_named() -> None:
     ran = CliRunner().invoke(app, ["wire", "--parts", "latency,speed"])
     assert ran.exit_code != 0
     assert "'speed' is not one of latency, flood" in str(ran.exception)
+
+
+def test_the_codec_is_measured_beside_msgspec_alone_and_hostile_payloads_take_bounded_memory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(codec, "_SECONDS", 2)
+    report = codec.run()
+    assert {row["message"] for row in report["types"]} >= {"MarkSet", "TargetPose", "RouteReply", "Stats"}
+    assert sum(row["share"] for row in report["types"]) == pytest.approx(1, abs=0.01)
+    assert report["ratio_encode"] > 0
+    assert report["ratio_decode"] > 0
+    assert max(row["ours_mib"] for row in report["hostile"]) < 100
+    assert len(list(codec.tables(report))) == 2

@@ -178,9 +178,11 @@ def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
         options.check_ports(scenario, ("router", "agent"))
 
 
-def test_two_runs_of_one_second_get_two_folders(tmp_path: Path) -> None:
+def test_a_run_has_one_folder_whenever_it_is_started_again(tmp_path: Path) -> None:
     assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000"
-    assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000-2"
+    assert options.make_run_dir(tmp_path, "20260101-000000").name == "20260101-000000", "a run keeps its folder"
+    with pytest.raises(ConfigError, match=r"'\.\./x' is not 1 to 64 of letters"):
+        options.make_run_dir(tmp_path, "../x")
     with pytest.raises(StoreError, match=r"No such file|Permission|Read-only"):
         options.make_run_dir(Path("/proc/nowhere"), "x")
 

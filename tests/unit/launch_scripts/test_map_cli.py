@@ -1,3 +1,5 @@
+"""`swarm map`: what is exported comes back as it was, and the bands of a GeoTIFF show the winners."""
+
 from __future__ import annotations
 
 import json
@@ -14,7 +16,7 @@ from launch_scripts.commands.map import app
 from shared_map.keeper.export import from_json, to_bands, to_json
 from shared_map.keeper.store import KeeperStore
 from swarm.errors import StoreError
-from swarm.wire.messages.marks import FOLDS, MarkSet
+from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.statements import MarkKind
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
@@ -41,7 +43,7 @@ def test_a_map_comes_out_of_json_as_it_went_in(sets: list[MarkSet]) -> None:
         return set_of(
             each.author,
             each.tile,
-            each.seq // FOLDS,
+            each.seq // SEQ_STEP,
             {
                 cell: (kind, pace if kind == PACE else 0.0, stamp)
                 for cell, kind, pace, stamp in zip(

@@ -25,7 +25,7 @@ from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little
 from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.scene import Ground
-from launch_scripts.monitor.sinks import Outlets, new_recording_path
+from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
@@ -88,7 +88,7 @@ def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
         cell=0, x_m=0.0, y_m=0.0, uncertainty_m=30.0,
     )  # fmt: skip
     rig.play([(NS_PER_S // 2, seen)])
-    rig.until(3 * NS_PER_S)
+    rig.run(3)
     rig.close()
     assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 2
 
@@ -98,7 +98,7 @@ def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
 ) -> None:
     assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
     rig = Rig(scenario, terrain, tmp_path / "late.rrd")
-    rig.scheduler.run_until(20 * NS_PER_S)
+    rig.run(20)
     rig.play((now_ns + 20 * NS_PER_S, told) for now_ns, told in fake_run(terrain, hidden_truth(terrain), scenario))
     rig.close()
     assert rows_by_entity(tmp_path / "late.rrd")["/world/vehicles"] >= 12
@@ -119,7 +119,7 @@ def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
         agent="a0",
         vehicle="v",
     )
-    rig.until(NS_PER_S)
+    rig.run(1)
     assert rig.service.counters.counts["routes_unreadable"] == 1
     rig.close()
 
@@ -128,7 +128,7 @@ def test_where_to_watch_is_told_once(scenario: Scenario, terrain: Terrain) -> No
     rig = Rig(scenario, terrain, None, live_url="http://127.0.0.1:1/")
     heard: list[Event] = []
     rig.speaker.subscribe(NOTE, heard.append)
-    rig.until(3 * NS_PER_S)
+    rig.run(3)
     rig.close()
     notes = [event.message for event in heard]  # type: ignore[union-attr]
     assert [(note.kind, note.text) for note in notes if isinstance(note, Note)] == [
@@ -145,7 +145,7 @@ def test_a_monitor_speaks_of_nothing_but_itself(scenario: Scenario, terrain: Ter
     assert rig.said == {"run", "stats"}
 
 
-# --- outlets: sockets and files ---------------------------------------------------------------------------------
+# --- sinks: sockets and files ---------------------------------------------------------------------------------
 
 
 def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> bool:
@@ -203,25 +203,25 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
     home.mkdir()
     monkeypatch.setenv("HOME", str(home))
     before = children(os.getpid())
-    outlets = Outlets("r", tmp_path / "run.rrd", LIVE, make_blueprint(Ground(terrain)))
-    assert outlets.live_url is not None
+    sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(Ground(terrain)))
+    assert sinks.live_url is not None
     try:
-        with urllib.request.urlopen(outlets.live_url, timeout=30) as reply:
+        with urllib.request.urlopen(sinks.live_url, timeout=30) as reply:
             assert "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A" in reply.url, "led to the stream"
             assert b"re_viewer.js" in reply.read()
             policy = reply.headers["Content-Security-Policy"]
         assert policy.endswith("connect-src 'self' http://127.0.0.1:*")
-        with urllib.request.urlopen(f"{outlets.live_url}re_viewer_bg.wasm", timeout=30) as reply:
+        with urllib.request.urlopen(f"{sinks.live_url}re_viewer_bg.wasm", timeout=30) as reply:
             assert reply.headers["Content-Type"] == "application/wasm"
             assert reply.read(4) == b"\0asm"
         with pytest.raises(urllib.error.HTTPError, match="404"):
-            urllib.request.urlopen(f"{outlets.live_url}etc/passwd", timeout=30)
+            urllib.request.urlopen(f"{sinks.live_url}etc/passwd", timeout=30)
         assert eventually(lambda: listeners(os.getpid()) == {"0100007F"})
         assert children(os.getpid()) == before, "the viewer program is gone again"
         assert list(home.rglob("*")) == [], "nothing is written to the home folder"
     finally:
         began_s = time.monotonic()
-        outlets.close()
+        sinks.close()
     assert time.monotonic() - began_s < 4
 
 
@@ -230,17 +230,17 @@ def test_a_killed_monitor_leaves_a_readable_file(tmp_path: Path) -> None:
     script = f"""
 import time, numpy, pathlib
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.sinks import Outlets
+from launch_scripts.monitor.sinks import Sinks
 from launch_scripts.monitor.scene import Ground
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 import rerun as rr
 ground = Ground(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
-outlets = Outlets("r", pathlib.Path({str(path)!r}), MonitorConfig(live=False), make_blueprint(ground))
+sinks = Sinks("r", pathlib.Path({str(path)!r}), MonitorConfig(live=False), make_blueprint(ground))
 for n in range(100):
-    outlets.rec.set_time("tick", sequence=n)
-    outlets.rec.log("a", rr.Scalars(n))
-outlets.rec.flush(timeout_sec=5)
+    sinks.rec.set_time("tick", sequence=n)
+    sinks.rec.log("a", rr.Scalars(n))
+sinks.rec.flush(timeout_sec=5)
 print("written", flush=True)
 time.sleep(60)
 """
@@ -278,25 +278,25 @@ def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytes
         with pytest.raises(
             BusError, match=rf"live view on port {port}: Address already in use; .*monitor\.web_port"
         ):
-            Outlets("r", None, config, make_blueprint(Ground(terrain)))
+            Sinks("r", None, config, make_blueprint(Ground(terrain)))
 
 
 @pytest.mark.network
 def test_logging_does_not_wait_for_a_viewer_that_reads_nothing(terrain: Terrain) -> None:
     import rerun as rr
 
-    outlets = Outlets("r", None, LIVE, make_blueprint(Ground(terrain)))
+    sinks = Sinks("r", None, LIVE, make_blueprint(Ground(terrain)))
     try:
-        assert outlets.live_url is not None
-        port = stream_port(outlets.live_url)
+        assert sinks.live_url is not None
+        port = stream_port(sinks.live_url)
         with socket.create_connection(("127.0.0.1", port)) as stalled:
             stalled.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n")
             worst_s = 0.0
             for n in range(100):
                 began_s = time.perf_counter()
-                outlets.rec.set_time("tick", sequence=n)
-                outlets.rec.log("a", rr.Points3D(np.zeros((2000, 3), np.float32)))
+                sinks.rec.set_time("tick", sequence=n)
+                sinks.rec.log("a", rr.Points3D(np.zeros((2000, 3), np.float32)))
                 worst_s = max(worst_s, time.perf_counter() - began_s)
         assert worst_s < 2.0
     finally:
-        outlets.close()
+        sinks.close()

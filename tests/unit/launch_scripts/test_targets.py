@@ -1,17 +1,15 @@
+"""Targets: where they start, how they move, when they are captured, and what the service tells of it."""
+
 from __future__ import annotations
 
-import math
-import random
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.memory_world import MemoryWorld
+from support.swarm_model import SwarmModel
+from support.target_reports import RES, flat, fleet
 
-from launch_scripts.world.referee import Collision, LethalEntry, Referee
 from launch_scripts.world.targets import (
     LISTEN_NS,
     PATIENCE_NS,
@@ -21,281 +19,18 @@ from launch_scripts.world.targets import (
     TargetsService,
     TargetWorld,
 )
-from launch_scripts.world.walks import Budget, Ground, Walk, Walker, far_place, slowness_of
+from launch_scripts.world.walks import Walk
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import CostConfig, Scenario, TargetConfig, VehicleConfig
-from swarm.errors import ConfigError, TerrainError
-from swarm.grid import GridSpec
-from swarm.runtime.role import RoleSetup
-from swarm.wire.fields import pack_column
+from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
+from swarm.errors import ConfigError
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.topics import FLEET, NOTE, POSE, STATS
 
-FLAT = 0.1
-RES = 10.0
 TICK = NS_PER_S // 10
-NOBODY = np.empty(0, np.int64)
-
-
-def flat(rows: int = 40, cols: int = 50) -> NDArray[np.float32]:
-    return np.full((rows, cols), FLAT, np.float32)
-
-
-def ground(pace: NDArray[np.float32]) -> Ground:
-    rows, cols = pace.shape
-    return Ground(GridSpec(rows, cols, RES), pace)
-
-
-def rough(seed: int, rows: int = 30, cols: int = 34, lethal: float = 0.3) -> NDArray[np.float32]:
-    rng = np.random.default_rng(seed)
-    pace = rng.uniform(0.05, 0.5, (rows, cols)).astype(np.float32)
-    pace[rng.random((rows, cols)) < lethal] = np.inf
-    pace[rows // 2] = 0.1
-    return pace
-
-
-def walker(where: Ground, cell: int, walk: Walk, slowness: float = 1.0, seed: int = 1) -> Walker:
-    return Walker("t", walk, slowness, random.Random(seed), cell)
-
-
-# --- walking ------------------------------------------------------------------------------------------------
-
-
-def test_the_largest_part_is_what_legal_steps_connect() -> None:
-    pace = flat(4, 6)
-    pace[:, 3] = np.inf
-    pace[0, 2] = pace[1, 3] = np.inf
-    pace[1, 3] = np.inf
-    assert ground(pace).home.tolist() == [0, 1, 6, 7, 8, 12, 13, 14, 18, 19, 20]
-
-
-def test_nobody_squeezes_past_the_corner_of_a_lethal_cell() -> None:
-    pace = flat(2, 2)
-    pace[0, 1] = np.inf
-    assert ground(pace).step(0, 3) is None
-    assert ground(pace).step(0, 4) == 2
-    pace[1, 0] = np.inf
-    assert len(ground(pace).home) == 1
-
-
-def test_a_terrain_without_a_passable_cell_is_refused() -> None:
-    with pytest.raises(TerrainError, match="every cell of the terrain is lethal"):
-        ground(np.full((3, 3), np.inf, np.float32))
-
-
-@settings(deadline=None, max_examples=25)
-@given(st.integers(0, 10_000), st.sampled_from(["random", "waypoints", "evade"]))
-def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
-    where = ground(rough(seed))
-    one = walker(where, where.random_home(random.Random(seed)), walk, seed=seed)
-    vehicles = where.home[:3]
-    for _ in range(80):
-        before, heading_to = one.cell, one.towards
-        one.advance(where, 3.0, vehicles, Budget())
-        if one.towards is not None:
-            assert one.towards in [to for _, to in where.steps(one.cell)]
-        assert not where.lethal(one.cell)
-        if one.cell != before and heading_to is not None:
-            assert heading_to in [to for _, to in where.steps(before)]
-
-
-@settings(deadline=None, max_examples=20)
-@given(st.integers(0, 10_000))
-def test_a_way_is_the_cheapest_there_is(seed: int) -> None:
-    where = ground(rough(seed, 12, 14))
-    start = where.random_home(random.Random(seed))
-    way = where.way(start, random.Random(seed))
-    cost, at = 0.0, start
-    for cell in way:
-        assert cell in [to for _, to in where.steps(at)]
-        cost += where.length_m(at, cell) * float(where.pace_s_per_m.flat[cell])
-        at = cell
-    assert cost == pytest.approx(naive_cost(where, start, at))
-
-
-def naive_cost(where: Ground, start: int, end: int) -> float:
-    """Bellman-Ford: slow and obviously right."""
-    cost = {start: 0.0}
-    changed = True
-    while changed:
-        changed = False
-        for cell, so_far in list(cost.items()):
-            for _, to in where.steps(cell):
-                there = so_far + where.length_m(cell, to) * float(where.pace_s_per_m.flat[to])
-                if there < cost.get(to, math.inf) - 1e-12:
-                    cost[to] = there
-                    changed = True
-    return cost[end]
-
-
-def test_a_walled_in_target_stays_where_it_is() -> None:
-    pace = flat(5, 5)
-    pace[1:4, 1:4] = np.inf
-    pace[2, 2] = FLAT
-    where = ground(pace)
-    walks: tuple[Walk, ...] = ("random", "waypoints", "evade")
-    for walk in walks:
-        one = walker(where, 12, walk)
-        one.advance(where, 100.0, NOBODY, Budget())
-        assert one.cell == 12
-
-
-@pytest.mark.parametrize(
-    ("speed", "pace", "metres"),
-    [
-        (4.0, 0.1, 40.0),
-        (4.0, 0.4, 10.0),
-        (4.0, 0.05, 80.0),
-        (10.0, 0.1, 100.0),
-        (50.0, 0.1, 100.0),
-        (0.0, 0.1, 0.0),
-    ],
-)
-def test_ten_seconds_of_driving(speed: float, pace: float, metres: float) -> None:
-    """At 10 m/s on level ground: a target's own speed there, as much slower on slow ground, never outrunning it."""
-    where = ground(np.full((1, 40), pace, np.float32))
-    config = TargetConfig(speed_m_per_s=speed)
-    one = walker(where, 0, "waypoints", slowness_of(config, CostConfig(flat_speed_m_per_s=10.0)))
-    one.way = list(range(39, 0, -1))
-    for _ in range(100):
-        one.advance(where, 0.1, NOBODY, Budget())
-    x_m, _ = one.position_m(where)
-    assert x_m - 5.0 == pytest.approx(metres, abs=1e-4)
-
-
-def test_an_evader_gets_away_from_the_vehicles_near_it() -> None:
-    where = ground(flat())
-    grid = where.grid
-    one = walker(where, grid.cell(20, 25), "evade")
-    vehicles = np.array([grid.cell(20, 22), grid.cell(18, 23)])
-    one.advance(where, 8.0, vehicles, Budget())
-    assert min(grid.distance_cells(one.cell, cell) for cell in vehicles.tolist()) >= 7
-
-
-def test_ways_are_computed_one_a_tick() -> None:
-    where = ground(flat())
-    walkers = [walker(where, 100 * n, "waypoints") for n in range(4)]
-    for ticked in range(1, 5):
-        budget = Budget()
-        for one in walkers:
-            one.advance(where, 0.1, NOBODY, budget)
-        assert sum(1 for one in walkers if one.way) == ticked
-
-
-def test_a_jump_leads_far_away_and_clear_of_vehicles() -> None:
-    where = ground(flat())
-    grid = where.grid
-    vehicles = np.array([grid.cell(row, 40) for row in range(40)])
-    for seed in range(50):
-        place = far_place(where, grid.cell(20, 10), vehicles, 3, random.Random(seed))
-        row, col = grid.row_col(place)
-        assert math.hypot(row - 20, col - 10) >= math.hypot(40, 50) / 4
-        assert abs(col - 40) > 3
-
-
-# --- the referee --------------------------------------------------------------------------------------------
-
-
-def fleet(
-    stamp_ms: float,
-    *vehicles: tuple[str, int],
-    author: str = "a0.1",
-    seq: int | None = None,
-    target: str | None = "t",
-    state: VehicleState = VehicleState.FOLLOWING,
-    at_m: tuple[float, float] = (0.0, 0.0),
-) -> Fleet:
-    """A report; by default they come every 100 ms, and the sequence number says so."""
-    count = len(vehicles)
-    return Fleet(
-        author=author,
-        group="all",
-        region=0,
-        seq=int(stamp_ms // 100) if seq is None else seq,
-        stamp_ns=int(stamp_ms * 1e6),
-        ids=[id for id, _ in vehicles],
-        target_ids=[] if target is None else [target],
-        cells=pack_column([cell for _, cell in vehicles], "<u4"),
-        east_m=pack_column([at_m[0]] * count, "<f4"),
-        south_m=pack_column([at_m[1]] * count, "<f4"),
-        heading_rad=pack_column([0.0] * count, "<f4"),
-        states=bytes([state] * count),
-        targets=bytes([NO_TARGET if target is None else 0] * count),
-    )
-
-
-def judged(*reports: Fleet, passable: NDArray[np.bool_] | None = None) -> list[Collision | LethalEntry]:
-    referee = Referee(np.ones(100, np.bool_) if passable is None else passable)
-    return [broken for report in reports for broken in referee.hear(report)]
-
-
-def b(stamp_ms: float, cell: int) -> Fleet:
-    return fleet(stamp_ms, ("b", cell), author="a1.1")
-
-
-def a(stamp_ms: float, cell: int, **fields: Any) -> Fleet:
-    return fleet(stamp_ms, ("a", cell), **fields)
-
-
-def test_two_vehicles_on_one_cell_at_one_time_collide() -> None:
-    (collision,) = judged(a(100, 5), b(150, 5), a(200, 6), b(250, 5))
-    assert collision == Collision("a", "b", 5, 200_000_000)
-
-
-def test_an_encounter_counts_once_and_the_next_one_again() -> None:
-    together = [report for n in range(1, 20) for report in (a(100 * n, 5), b(100 * n + 50, 5))]
-    apart = [report for n in range(20, 50) for report in (a(100 * n, 5), b(100 * n + 50, 6))]
-    again = [report for n in range(50, 60) for report in (a(100 * n, 5), b(100 * n + 50, 5))]
-    assert len(judged(*together)) == 1
-    assert len(judged(*together, *apart)) == 1
-    assert len(judged(*together, *apart, *again)) == 2
-
-
-def test_entering_a_cell_that_another_has_just_left_is_no_collision() -> None:
-    assert judged(a(100, 5), a(200, 6), b(150, 4), b(200, 5), a(300, 7), b(300, 5)) == []
-    assert judged(a(100, 5), b(150, 4), a(200, 6), b(201, 5), a(300, 7), b(301, 5)) == []
-
-
-def test_the_order_in_which_two_agents_are_heard_does_not_matter() -> None:
-    reports_a = [a(100, 5), a(200, 5), a(300, 6)]
-    reports_b = [b(150, 4), b(250, 5), b(350, 5)]
-    for order in ([*reports_a, *reports_b], [*reports_b, *reports_a]):
-        assert [(c.first, c.second, c.cell) for c in judged(*order) if isinstance(c, Collision)] == [("a", "b", 5)]
-
-
-def test_a_lost_report_is_not_held_against_anybody() -> None:
-    """The report of 200 ms, that `a` has left cell 5, is lost: that it stood there when `b` came is not known."""
-    assert judged(a(100, 5), b(150, 4), b(250, 5), a(300, 7), b(350, 5)) == []
-
-
-def test_who_is_seen_standing_still_stood_there_meanwhile() -> None:
-    assert len(judged(a(100, 5), b(150, 4), b(250, 5), a(900, 5), b(950, 5))) == 1
-
-
-@settings(deadline=None)
-@given(st.lists(st.tuples(st.sampled_from("ab"), st.integers(0, 3)), max_size=30), st.randoms())
-def test_repeated_and_late_reports_change_nothing(moves: list[tuple[str, int]], chance: random.Random) -> None:
-    reports = [(a if id == "a" else b)(100.0 * n, cell) for n, (id, cell) in enumerate(moves)]
-    repeated: list[Fleet] = []
-    for n, report in enumerate(reports):
-        repeated += [report, *(reports[chance.randrange(n + 1)] for _ in range(2))]
-    assert judged(*reports) == judged(*repeated)
-
-
-def test_coming_onto_lethal_ground_counts_once_per_entry() -> None:
-    passable = np.ones(100, np.bool_)
-    passable[7] = False
-    reports = [a(100 * n, cell) for n, cell in enumerate([6, 7, 7, 7, 6, 7], start=1)]
-    entries = judged(*reports, passable=passable)
-    assert entries == [LethalEntry("a", 7, 200_000_000), LethalEntry("a", 7, 600_000_000)]
-
-
-def test_a_cell_outside_the_grid_is_nobodys_business() -> None:
-    assert judged(a(100, 2**32 - 1), a(200, 100)) == []
 
 
 # --- the world ----------------------------------------------------------------------------------------------
@@ -357,7 +92,8 @@ def test_a_target_moves_smoothly_at_its_speed_times_the_time_scale(walk: Walk) -
     for _ in range(100):
         pose = world.poses()["t"]
         places.append((pose.x_m, pose.y_m))
-        assert world.grid.distance_cells(world.grid.cell_at_m(pose.x_m, pose.y_m), pose.cell) <= 1
+        x_m, y_m = world.grid.centre_m(pose.cell)
+        assert max(abs(pose.x_m - x_m), abs(pose.y_m - y_m)) < 1.5 * world.grid.resolution_m
     strides = np.hypot(*np.diff(np.array(places), axis=0).T)
     assert strides.max() <= 1.2 + 1e-6
     assert np.median(strides) == pytest.approx(1.2)
@@ -498,33 +234,19 @@ def test_a_start_nobody_can_stand_on_is_refused(start: tuple[int, int], sentence
 # --- on the bus ---------------------------------------------------------------------------------------------
 
 
-class Driven:
-    """The service on a memory bus, ticked ten times a second."""
-
-    def __init__(self, world: MemoryWorld, pace: NDArray[np.float32], plan: Scenario, incarnation: int = 1) -> None:
-        self.world = world
-        self.bus = world.bus(f"targets{incarnation}")
-        setup = RoleSetup(plan, "r1", "targets", "0", incarnation, 0)
-        self.service = TargetsService(setup, terrain_of_pace(pace, RES), pace, self.bus, self._post)
-        self.service.start(self._now())
-        self._tick()
-
-    def _now(self) -> int:
-        return self.world.scheduler.clock.now_ns()
-
-    def _post(self, event: Event) -> None:
-        self.service.handle(event, self._now())
-
-    def _tick(self) -> None:
-        if not self.bus.closed:
-            self.service.tick(self._now())
-            self.world.scheduler.after(TICK, self._tick)
+def targets_on(pace: NDArray[np.float32], plan: Scenario) -> tuple[SwarmModel, Ear]:
+    """A swarm of nothing but targets, and what it says."""
+    model = SwarmModel(terrain=terrain_of_pace(pace, RES), scenario=plan)
+    ear = Ear(model)
+    setup = model.setup("targets", "0")
+    model.start("targets", lambda bus, post: TargetsService(setup, model.terrain, pace, bus, post), phase_ns=0)
+    return model, ear
 
 
 class Ear:
     """Hears everything that is published on some topics."""
 
-    def __init__(self, world: MemoryWorld) -> None:
+    def __init__(self, world: SwarmModel) -> None:
         self.bus = world.bus("ear")
         self.heard: list[Any] = []
         for topic in (POSE, NOTE, STATS):
@@ -539,27 +261,25 @@ class Ear:
 
 
 def test_the_service_tells_poses_captures_and_broken_laws() -> None:
-    world = MemoryWorld()
     pace = flat()
     pace[0, 0] = np.inf
-    ear = Ear(world)
-    Driven(world, pace, scenario(still()))
-    world.run_ms(2000)
+    world, ear = targets_on(pace, scenario(still()))
+    world.run(2)
     assert len(ear.of(TargetPose)) == pytest.approx(10, abs=1)
     cell = 20 * 50 + 25
     for n in range(4):
         for author, ids in (("a0.1", ["v", "x"]), ("a1.1", ["w"])):
             at = {"v": cell, "x": 0 if n else 1, "w": cell}
             report = fleet(
-                world.scheduler.clock.now_ns() / 1e6,
+                world.now_ns / 1e6,
                 *((id, at[id]) for id in ids),
                 author=author,
                 seq=n,
                 at_m=(255.0, 205.0),
             )
             ear.bus.publish(FLEET, report, region=0, author=author)
-        world.run_ms(100)
-    world.run_ms(1500)
+        world.run(0.1)
+    world.run(1.5)
     assert [note.kind for note in ear.of(Note)] == ["capture", "lethal-entry", "collision"]
     assert ear.of(Note)[0].cell == cell
     counts = ear.of(Stats)[-1].counts
@@ -568,9 +288,7 @@ def test_the_service_tells_poses_captures_and_broken_laws() -> None:
 
 
 def test_counts_are_declared_before_anything_happens() -> None:
-    world = MemoryWorld()
-    ear = Ear(world)
-    Driven(world, flat(), scenario(still()))
-    world.run_ms(10)
+    world, ear = targets_on(flat(), scenario(still()))
+    world.run(0.01)
     counts = ear.of(Stats)[0].counts
     assert [counts[name] for name in ("captures", "collisions", "lethal_entries", "poses")] == [0, 0, 0, 0]

@@ -8,7 +8,7 @@ from swarm.wire.topics import TOPICS
 
 def test_the_page_is_current():
     assert wire_doc.PATH.read_text(encoding="utf-8") == wire_doc.document(), (
-        "run `python -m launch_scripts.reference.wire_page`"
+        "run `python -m launch_scripts.reference`"
     )
 
 

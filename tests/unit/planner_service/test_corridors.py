@@ -1,4 +1,4 @@
-"""Rungs, rings and their skeleton: what is grown near the target, and what far from it."""
+"""WindowSchedule, rings and their corridors: what is grown near the target, and what far from it."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from laws.test_tree_under_every_strategy import Play
 from support import slow_twins as naive
+from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
 from planner_service import target_tree
 from planner_service.strategy import AutoStage
-from planner_service.tree import corridors as skeletons
-from planner_service.tree.corridors import Skeleton, find_skeleton
-from planner_service.tree.cost_grid import Ground
+from planner_service.tree import corridors as corridor_graphs
+from planner_service.tree.corridors import CorridorGraph, find_corridors
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.windows import AHEAD, Rungs
+from planner_service.tree.windows import AHEAD, WindowSchedule
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
@@ -37,9 +37,9 @@ def thin_walls(rng: np.random.Generator, side: int, doors: float) -> np.ndarray:
 
 @pytest.fixture
 def small_rings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rings and a skeleton as they are on a large map, in the sizes of a small one."""
-    monkeypatch.setattr(skeletons, "LEAST", 3)
-    monkeypatch.setattr(skeletons, "AROUND", 2)
+    """Rings and a corridors as they are on a large map, in the sizes of a small one."""
+    monkeypatch.setattr(corridor_graphs, "LEAST", 3)
+    monkeypatch.setattr(corridor_graphs, "AROUND", 2)
     monkeypatch.setattr("planner_service.tree.cost_to_go.INNER", 6)
     monkeypatch.setattr(target_tree, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
     monkeypatch.setattr(target_tree, "WIDE_SHARE", 64)
@@ -75,11 +75,11 @@ def test_far_from_the_target_rings_hold_where_windows_alone_drift() -> None:
     pace = random_pace(rng, 60, 60, 30.0, 0.05)
     pace[30] = 1.0
     gaps = {}
-    for has_skeleton in (False, True):
+    for has_corridors in (False, True):
         play = Play(pace.copy(), PlannerConfig(strategy="multi_resolution", k_min=0))
         play.target = 30 * 60 + 2
         play.tree.update(play.pace, play.target, [], 0)
-        if has_skeleton:
+        if has_corridors:
             play.happen(Job("begin"))
             play.happen(Job("end"))
         for _ in range(50):
@@ -87,7 +87,7 @@ def test_far_from_the_target_rings_hold_where_windows_alone_drift() -> None:
         routes = play.tree.routes(np.arange(3600))
         optimum = naive.cost_to_go(pace, play.target, **play.rules).reshape(-1)
         some = np.isfinite(optimum) & (optimum > 0)
-        gaps[has_skeleton] = float((routes.cost_s[some] / optimum[some]).mean())
+        gaps[has_corridors] = float((routes.cost_s[some] / optimum[some]).mean())
     assert gaps[True] < 1.03
     assert gaps[False] > 1.1
 
@@ -97,43 +97,43 @@ def test_a_skeleton_is_where_the_traffic_is() -> None:
     pace = np.full((64, 64), 1.0, np.float32)
     pace[:, 32] = np.inf
     pace[20, 32] = 1.0
-    ground = Ground(GridSpec(64, 64, 1.0), PlannerConfig())
+    ground = CostGrid(GridSpec(64, 64, 1.0), PlannerConfig())
     ground.load(pace)
-    level = find_skeleton(ground).level.reshape(66, 66)[1:-1, 1:-1]
+    level = find_corridors(ground).level.reshape(66, 66)[1:-1, 1:-1]
     assert level[20, 32] == level.max()
     assert (level[pace == np.inf] == 0).all()
 
 
 def test_marks_let_all_cells_around_them_take_part_until_too_many_do() -> None:
-    ground = Ground(GridSpec(128, 128, 1.0), PlannerConfig())
+    ground = CostGrid(GridSpec(128, 128, 1.0), PlannerConfig())
     pace = np.ones((128, 128), np.float32)
     ground.load(pace)
-    skeleton = Skeleton(np.zeros(ground.size, np.uint8))
+    corridors = CorridorGraph(np.zeros(ground.size, np.uint8))
     pace[60, 60] = np.inf
-    assert skeleton.learn(ground, ground.apply(pace, [Window(60, 60, 61, 61)]))
-    level = skeleton.level.reshape(130, 130)
-    assert (level[54:69, 54:69] == skeletons.EVERYWHERE).all()
-    assert skeleton.worn == 24 * 24
+    assert corridors.learn(ground, ground.apply(pace, [Window(60, 60, 61, 61)]))
+    level = corridors.level.reshape(130, 130)
+    assert (level[54:69, 54:69] == corridor_graphs.EVERYWHERE).all()
+    assert corridors.stale_cells == 24 * 24
     pace[:] = 2.0
-    assert not skeleton.learn(ground, ground.apply(pace, [Window(0, 0, 128, 128)]))
+    assert not corridors.learn(ground, ground.apply(pace, [Window(0, 0, 128, 128)]))
 
 
 @given(st.integers(0, 2**31), st.integers(1, 60))
 @settings(max_examples=60, deadline=None)
 def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_wide(seed: int, steps: int) -> None:
     grid = GridSpec(256, 256, 1.0)
-    rungs = Rungs(grid, 8)
+    schedule = WindowSchedule(grid, 8)
     rng = np.random.default_rng(seed)
     cell = grid.cell(128, 128)
-    rungs.grown(cell, 256)
+    schedule.note_grown(cell, 256)
     since = {8 << rung: cell for rung in range(5)}
     for _ in range(steps):
         row, col = grid.row_col(cell)
         cell = grid.cell(
             int(np.clip(row + rng.integers(-3, 4), 0, 255)), int(np.clip(col + rng.integers(-3, 4), 0, 255))
         )
-        half = rungs.half(cell, 128)
-        rungs.grown(cell, half)
+        half = schedule.half(cell, 128)
+        schedule.note_grown(cell, half)
         for wide in since:
             if wide <= half:
                 since[wide] = cell
@@ -187,7 +187,7 @@ def test_what_is_asked_for_costs_what_is_driven_however_far_the_target_went() ->
     """Windows raise the costs beyond them move by move; a cut route says what going on along the parents costs."""
     pace = random_pace(np.random.default_rng(2), 80, 80, 5.0, 0.1)
     grid = GridSpec(80, 80, 1.0)
-    ground = Ground(grid, PlannerConfig())
+    ground = CostGrid(grid, PlannerConfig())
     ground.load(pace)
     tree = CostToGoTree(ground)
     target = int(np.flatnonzero(np.isfinite(pace[40]))[20]) + 40 * 80
@@ -196,9 +196,9 @@ def test_what_is_asked_for_costs_what_is_driven_however_far_the_target_went() ->
         step = 1 if turn % 2 else -1
         if np.isfinite(pace[40, tree.root % 80 + step]):
             tree.move(tree.root + step, grid.around(tree.root, 8))
-    starts = np.flatnonzero((ground.weight < np.inf) & (tree.cost < np.inf))
+    starts = np.flatnonzero((ground.cell_cost < np.inf) & (tree.cost < np.inf))
     before = tree.cost[starts] + tree.offset
-    driven = ground.walk(tree.parent, ground.pad(tree.root), starts, 0, ground.weight).driven
+    driven = ground.walk(tree.parent, ground.pad(tree.root), starts, 0, ground.cell_cost).driven
     tree.tighten(starts)
     after = tree.cost[starts] + tree.offset
     assert before.max() > driven[before.argmax()] * 1.05

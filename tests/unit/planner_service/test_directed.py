@@ -21,7 +21,8 @@ from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
-from vehicle_agent.agent import Agent, AskCosts, AskRoutes, LocalMap
+from vehicle_agent.agent import Agent, AskRoutes, LocalMap
+from vehicle_agent.assignment import AskCosts
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.traffic.resumption import Resumption
@@ -294,7 +295,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
     spawns = spawn_cells(scenario, grid, level, level)
     ground = LocalMap(grid, level, level, level, level, climb)
     agent = Agent(plan_agents(scenario)[0], scenario, ground, TruthSensor(grid, level, 20.0), spawns, 1)
-    agent.placed_by(Resumption("a0"))
+    agent.place(Resumption("a0", spawns, grid.cells).placement({}))
     agent.set_planners({"t": 1}, 0)
     x_m, y_m = grid.centre_m(target)
     agent.hear_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=target, x_m=x_m, y_m=y_m), 0)
@@ -311,7 +312,7 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
         if set_out_s is not None and motion.at_rest and motion.cell == target:
             return tick * 0.05 - set_out_s, tree.routes([start])[0].cost_s
         asks = agent.decide(now_ns)
-        agent.rights.speak()
+        agent.rights.next_message()
         for asked in asks:
             if isinstance(asked, AskCosts):
                 agent.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))

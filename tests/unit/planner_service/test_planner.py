@@ -1,3 +1,5 @@
+"""The planner without a bus or a worker: what it grows and when, what it serves, pushes and tells."""
+
 from __future__ import annotations
 
 import math

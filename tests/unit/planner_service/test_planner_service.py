@@ -1,3 +1,5 @@
+"""A planner on a bus: its routes keep the laws while target, map and followers change, and after restarts."""
+
 from __future__ import annotations
 
 import math
@@ -9,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from support.memory_world import MemoryWorld
 from support.slow_twins import cost_to_go
+from support.swarm_model import SwarmModel
 
 from launch_scripts.world.targets import TargetsService
 from planner_service.planner import MOST_ROUTES, Planner
@@ -18,17 +20,13 @@ from planner_service.service import PlannerService
 from planner_service.target_tree import TargetTree
 from planner_service.warm_up import warm_up
 from shared_map.cost_map import CostMap
-from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
-from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import MapConfig, PlannerConfig, Scenario, Strategy, TargetConfig
+from swarm.config.scenario import PlannerConfig, Scenario, Strategy, TargetConfig
 from swarm.grid import GridSpec, walk
-from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import MAX_PAYLOAD_BYTES, encode
 from swarm.wire.fields import column, pack_column
@@ -78,40 +76,10 @@ def driven_s(pace: NDArray[np.float32], route: Route) -> float:
     return sum(float(pace.flat[cell]) * m for cell, m in zip(cells[1:], metres, strict=True))
 
 
-class Node:
-    """A service on a memory bus, ticked ten times a second until it is killed."""
-
-    def __init__(self, world: MemoryWorld, name: str) -> None:
-        self.world = world
-        self.bus = world.bus(name)
-        self.service: Any = None
-
-    def now(self) -> int:
-        return self.world.scheduler.clock.now_ns()
-
-    def post(self, event: Event) -> None:
-        if not self.bus.closed:
-            self.service.handle(event, self.now())
-
-    def run(self, service: Any) -> Node:
-        self.service = service
-        service.start(self.now())
-        self._tick()
-        return self
-
-    def _tick(self) -> None:
-        if not self.bus.closed:
-            self.service.tick(self.now())
-            self.world.scheduler.after(TICK, self._tick)
-
-    def kill(self) -> None:
-        self.bus.close()
-
-
 class Ear:
     """Somebody who asks, and hears everything."""
 
-    def __init__(self, world: MemoryWorld) -> None:
+    def __init__(self, world: SwarmModel) -> None:
         self.world = world
         self.bus = world.bus("ear")
         self.heard: list[Message] = []
@@ -134,7 +102,7 @@ class Ear:
     def ask(self, topic: Topic, request: Message, **fields: Any) -> list[Any]:
         self.replies = []
         self.bus.ask(topic, request, self._post, tag="q", **fields)
-        self.world.run_ms(10)
+        self.world.run(0.01)
         return self.replies
 
     def routes(self, *cells: int, target: str = "t", **fields: Any) -> RouteReply:
@@ -149,38 +117,32 @@ class Ear:
         return [stats for stats in self.of(Stats) if stats.role == role][-1]  # type: ignore[no-any-return]
 
 
-class Swarm:
+class Swarm(SwarmModel):
     """A terrain, planners, a tracker of targets, and an agent that marks."""
 
     def __init__(
         self, pace: NDArray[np.float32] | None = None, strategy: Strategy = "auto", targets: int = 1
     ) -> None:
         self.pace = flat() if pace is None else pace
-        self.terrain = terrain_of_pace(self.pace, RES)
-        self.scenario = Scenario(
+        scenario = Scenario(
             targets=(TargetConfig(count=targets),), planner=PlannerConfig(strategy=strategy, k_min=1, full_every=3)
         )
-        self.world = MemoryWorld()
-        self.ear = Ear(self.world)
+        super().__init__(terrain=terrain_of_pace(self.pace, RES), scenario=scenario)
+        self.ear = Ear(self)
         self.planners = {id: self.planner(id) for id in self.scenario.target_ids}
         self.cells: dict[str, int] = {}
         self._seq = 0
         self._track()
-        self.author = MapReplica(self.terrain.grid, author="a0.1")
-        node = Node(self.world, "agent")
-        self.feed = MapFeed(self.author, node.bus, node.post, MapConfig(), "agent")
-        node.run(_FeedService(self.feed))
+        self.author = self.writer("a0.1")
 
-    def planner(self, target: str, incarnation: int = 1) -> Node:
-        node = Node(self.world, f"planner-{target}-{incarnation}")
-        setup = RoleSetup(self.scenario, "r1", "planner", target, incarnation, 0)
-        worker = InlineWorker(self.world.scheduler)
-        return node.run(PlannerService(setup, self.terrain, node.bus, node.post, worker))
-
-    def keeper(self) -> None:
-        node = Node(self.world, "keeper")
-        setup = RoleSetup(self.scenario, "r1", "keeper", "0", 1, 0)
-        node.run(KeeperService(setup, self.terrain, node.bus, node.post, KeeperStore(":memory:")))
+    def planner(self, target: str, incarnation: int = 1) -> PlannerService:
+        setup = self.setup("planner", target, incarnation)
+        worker = InlineWorker(self.scheduler)
+        return self.start(
+            f"planner-{target}-{incarnation}",
+            lambda bus, post: PlannerService(setup, self.terrain, bus, post, worker),
+            phase_ns=0,
+        )
 
     def _track(self) -> None:
         """Ten poses a second of every target that has been put somewhere."""
@@ -188,11 +150,10 @@ class Swarm:
         for id, cell in self.cells.items():
             pose = TargetPose(target=id, incarnation=1, seq=self._seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
             self.ear.bus.publish(POSE, pose, target=id)
-        self.world.scheduler.after(TICK, self._track)
+        self.scheduler.after(TICK, self._track)
 
     def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:
-        now_ns = self.world.scheduler.clock.now_ns()
-        self.feed.publish(self.author.write(list(cells), kind, pace, now_ns))
+        self.author.sync.publish(self.author.replica.write(list(cells), kind, pace, self.now_ns))
 
     def report(self, *vehicles: tuple[str, int], target: str = "t", seq: int = 1) -> None:
         count = len(vehicles)
@@ -201,7 +162,7 @@ class Swarm:
             group="all",
             region=0,
             seq=seq,
-            stamp_ns=self.world.scheduler.clock.now_ns(),
+            stamp_ns=self.now_ns,
             ids=[id for id, _ in vehicles],
             target_ids=[target],
             cells=pack_column([cell for _, cell in vehicles], "<u4"),
@@ -214,11 +175,6 @@ class Swarm:
         self.ear.bus.publish(FLEET, fleet, region=0, author="a0.1")
 
 
-class _FeedService:
-    def __init__(self, feed: MapFeed) -> None:
-        self.start, self.handle, self.tick = feed.start, feed.handle, feed.tick
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
     warm_up()
@@ -226,7 +182,7 @@ def _compiled() -> None:
 
 def test_before_any_pose_a_route_is_no_target() -> None:
     swarm = Swarm()
-    swarm.world.run_ms(500)
+    swarm.run(0.5)
     reply = swarm.ear.routes(7)
     assert (reply.target_cell, list(reply.routes)) == (None, [Route(status=RouteStatus.NO_TARGET, start=7)])
 
@@ -236,7 +192,7 @@ def test_half_a_second_after_the_first_pose_routes_are_the_best_there_are() -> N
     target = GRID.cell(20, 30)
     swarm = Swarm(pace)
     swarm.cells["t"] = target
-    swarm.world.run_ms(500)
+    swarm.run(0.5)
     starts = np.flatnonzero(np.isfinite(pace.ravel()))[::17].tolist()
     reply = swarm.ear.routes(*starts)
     best = optimum_s(pace, target)
@@ -265,7 +221,7 @@ def test_under_every_strategy_routes_keep_the_laws_while_target_and_map_change(s
         if GRID.distance_cells(closed, target) > 3:
             swarm.mark(closed)
             pace.flat[closed] = np.inf
-        swarm.world.run_ms(320)
+        swarm.run(0.32)
         reply = swarm.ear.routes(*starts, force=step % 5 == 0)
         assert reply.target_cell == target
         best = optimum_s(pace, target)
@@ -277,7 +233,7 @@ def test_under_every_strategy_routes_keep_the_laws_while_target_and_map_change(s
                 assert len(set(cells)) == len(cells)
                 assert route.cost_s == pytest.approx(driven_s(pace, route), rel=1e-5)
                 assert route.lower_bound_s <= best[route.start] * (1 + 1e-6)
-    swarm.world.run_ms(600)
+    swarm.run(0.6)
     status = swarm.ear.of(PlannerStatus)[-1]
     assert (status.strategy, status.target_cell) == (strategy, target)
 
@@ -285,7 +241,7 @@ def test_under_every_strategy_routes_keep_the_laws_while_target_and_map_change(s
 def test_one_wildcard_question_brings_the_costs_of_all_planners() -> None:
     swarm = Swarm(targets=3)
     swarm.cells = {"t0": GRID.cell(0, 0), "t1": GRID.cell(0, 10), "t2": GRID.cell(30, 0)}
-    swarm.world.run_ms(500)
+    swarm.run(0.5)
     replies = swarm.ear.ask(COST, CostRequest(cells=[GRID.cell(0, 20), GRID.cells + 5]))
     costs = {reply.target: column(reply.cost_to_go_s, "<f4").tolist() for reply in replies}
     assert sorted(costs) == ["t0", "t1", "t2"]
@@ -297,7 +253,7 @@ def test_one_wildcard_question_brings_the_costs_of_all_planners() -> None:
 def test_a_person_asks_by_row_and_col_and_outside_is_a_status() -> None:
     swarm = Swarm()
     swarm.cells["t"] = GRID.cell(10, 10)
-    swarm.world.run_ms(300)
+    swarm.run(0.3)
     inside = swarm.ear.routes(row=10, col=13).routes
     assert [(route.start, list(route.directions)) for route in inside] == [(GRID.cell(10, 13), [6, 6, 6])]
     assert [route.status for route in swarm.ear.routes(row=10, col=COLS).routes] == [RouteStatus.OUTSIDE]
@@ -309,10 +265,10 @@ def test_a_target_on_lethal_ground_or_outside_has_no_routes_until_it_is_back() -
     swarm = Swarm(pace)
     for cell in (GRID.cell(5, 5), GRID.cells + 3):
         swarm.cells["t"] = GRID.cell(10, 10)
-        swarm.world.run_ms(300)
+        swarm.run(0.3)
         assert swarm.ear.routes(0).routes[0].status is RouteStatus.OK
         swarm.cells["t"] = cell
-        swarm.world.run_ms(300)
+        swarm.run(0.3)
         reply = swarm.ear.routes(0)
         assert (reply.target_cell, reply.routes[0].status) == (None, RouteStatus.NO_TARGET)
 
@@ -323,23 +279,23 @@ def test_a_mark_reaches_the_tree_and_the_followers_whose_route_it_cuts() -> None
     pace[20, 25] = pace[2, 25] = 0.1
     swarm = Swarm(pace)
     swarm.cells["t"] = GRID.cell(20, 40)
-    swarm.world.run_ms(500)
+    swarm.run(0.5)
     start = GRID.cell(20, 5)
     before = swarm.ear.routes(start, GRID.cell(20, 45), vehicles=["cut", "clear"])
     gate = GRID.cell(20, 25)
     assert gate in walk(GRID, start, before.routes[0].directions)
     for n in range(12):
         swarm.report(("cut", start), ("clear", GRID.cell(20, 45)), seq=n)
-        swarm.world.run_ms(100)
+        swarm.run(0.1)
     swarm.ear.heard = []
     swarm.mark(gate)
-    swarm.world.run_ms(200)
+    swarm.run(0.2)
     (pushed,) = swarm.ear.of(PushedRoute)
     assert (pushed.vehicle, pushed.target) == ("cut", "t")
     around = walk(GRID, pushed.route.start, pushed.route.directions)
     assert gate not in around
     assert GRID.cell(2, 25) in around
-    swarm.world.run_ms(1000)
+    swarm.run(1)
     stats = swarm.ear.last_stats()
     assert stats.counts["marks_merged"] == 1
     assert sum(stats.histograms["mark_to_tree_ms"].values()) == 1
@@ -348,12 +304,12 @@ def test_a_mark_reaches_the_tree_and_the_followers_whose_route_it_cuts() -> None
 def test_followers_of_a_moving_target_are_pushed_routes_to_where_it_is_now() -> None:
     swarm = Swarm()
     swarm.cells["t"] = GRID.cell(20, 20)
-    swarm.world.run_ms(300)
+    swarm.run(0.3)
     swarm.ear.routes(GRID.cell(0, 0), vehicles=["v"])
     for n in range(40):
         swarm.cells["t"] += 1 if n % 2 else COLS if n % 4 == 0 else 0
         swarm.report(("v", GRID.cell(0, 0)), seq=n)
-        swarm.world.run_ms(100)
+        swarm.run(0.1)
     pushes = swarm.ear.of(PushedRoute)
     assert 3 <= len(pushes) <= 5
     for pushed in pushes:
@@ -362,15 +318,15 @@ def test_followers_of_a_moving_target_are_pushed_routes_to_where_it_is_now() -> 
 
 def test_a_planner_killed_under_way_serves_again_within_three_seconds_with_all_marks() -> None:
     swarm = Swarm()
-    swarm.keeper()
+    swarm.keeper("keeper", KeeperStore(":memory:"))
     swarm.cells["t"] = GRID.cell(20, 40)
     swarm.mark(*(GRID.cell(row, 25) for row in range(ROWS - 1)))
-    swarm.world.run_ms(1500)
-    swarm.planners["t"].kill()
-    swarm.world.run_ms(300)
+    swarm.run(1.5)
+    swarm.kill("planner-t-1")
+    swarm.run(0.3)
     assert swarm.ear.ask(ROUTE, RouteRequest(cells=[0]), target="t") == []
     swarm.planner("t", incarnation=2)
-    swarm.world.run_ms(400)
+    swarm.run(0.4)
     reply = swarm.ear.routes(GRID.cell(20, 10))
     assert reply.incarnation == 2
     assert GRID.cell(ROWS - 1, 25) in walk(GRID, reply.routes[0].start, reply.routes[0].directions)
@@ -379,20 +335,23 @@ def test_a_planner_killed_under_way_serves_again_within_three_seconds_with_all_m
 def test_a_driver_killed_under_way_goes_on_where_the_planners_saw_its_targets() -> None:
     swarm = Swarm(targets=3)
 
-    def drive(incarnation: int) -> Node:
-        node = Node(swarm.world, f"targets{incarnation}")
-        setup = RoleSetup(swarm.scenario, "r1", "targets", "0", incarnation, 0)
-        return node.run(TargetsService(setup, swarm.terrain, swarm.pace, node.bus, node.post))
+    def drive(incarnation: int) -> None:
+        setup = swarm.setup("targets", "0", incarnation)
+        swarm.start(
+            f"targets{incarnation}",
+            lambda bus, post: TargetsService(setup, swarm.terrain, swarm.pace, bus, post),
+            phase_ns=0,
+        )
 
-    first = drive(1)
-    swarm.world.run_ms(4000)
-    first.kill()
-    swarm.world.run_ms(200)
+    drive(1)
+    swarm.run(4)
+    swarm.kill("targets1")
+    swarm.run(0.2)
     poses: list[TargetPose] = []
     swarm.ear.bus.subscribe(POSE, lambda event: poses.append(event.message))  # type: ignore[union-attr,arg-type]
     before = {reply.target: reply.target_cell for reply in swarm.ear.ask(COST, CostRequest())}
     drive(2)
-    swarm.world.run_ms(300)
+    swarm.run(0.3)
     after = {pose.target: pose.cell for pose in reversed(poses)}
     assert len(before) == len(after) == 3
     assert all(GRID.distance_cells(before[id], after[id]) <= 1 for id in before)
@@ -401,11 +360,11 @@ def test_a_driver_killed_under_way_goes_on_where_the_planners_saw_its_targets() 
 def test_after_a_restart_followers_are_found_by_their_reports() -> None:
     swarm = Swarm()
     swarm.cells["t"] = GRID.cell(20, 40)
-    swarm.planners["t"].kill()
+    swarm.kill("planner-t-1")
     swarm.planner("t", incarnation=2)
     for n in range(5):
         swarm.report(("v", 3), seq=n)
-        swarm.world.run_ms(100)
+        swarm.run(0.1)
         swarm.cells["t"] += 1
     (pushed, *_) = swarm.ear.of(PushedRoute)
     assert (pushed.vehicle, pushed.incarnation, pushed.route.start) == ("v", 2, 3)
@@ -418,7 +377,7 @@ def test_gaps_are_measured_over_those_who_follow() -> None:
     for n in range(60):
         swarm.cells["t"] = GRID.cell(20, 20 + (n // 3) % 10)
         swarm.report(*((f"v{i}", home) for i, home in enumerate(homes)), seq=n)
-        swarm.world.run_ms(100)
+        swarm.run(0.1)
         if chance.random() < 0.1:
             swarm.ear.routes(homes[0], vehicles=["v0"])
     status = swarm.ear.of(PlannerStatus)[-1]
@@ -434,7 +393,7 @@ def test_with_rotation_full_growths_come_from_the_worker_and_measure_the_windows
     for n in range(60):
         swarm.cells["t"] = GRID.cell(20, 10 + n // 2)
         swarm.report(("v", GRID.cell(20, 0)), seq=n)
-        swarm.world.run_ms(100)
+        swarm.run(0.1)
     stats = swarm.ear.last_stats()
     assert stats.counts["growths"] > 5
     assert stats.counts["window_growths"] > 15
@@ -445,7 +404,7 @@ def test_with_rotation_full_growths_come_from_the_worker_and_measure_the_windows
 def test_a_request_for_more_routes_than_a_message_holds_is_refused_in_words() -> None:
     swarm = Swarm()
     swarm.cells["t"] = GRID.cell(20, 40)
-    swarm.world.run_ms(300)
+    swarm.run(0.3)
     assert swarm.ear.ask(ROUTE, RouteRequest(cells=[0] * (MOST_ROUTES + 1)), target="t") == []
     assert swarm.ear.ended[-1].failure == "20001 routes at once, at most 20000: ask in parts"
 
@@ -494,7 +453,7 @@ def test_a_route_held_while_the_target_moves_on_is_measured_too() -> None:
 
 def test_declared_counts_are_told_before_anything_happens() -> None:
     swarm = Swarm()
-    swarm.world.run_ms(100)
+    swarm.run(0.1)
     counts = swarm.ear.last_stats().counts
     for name in ("routes_served", "growths", "window_growths", "pushes", "marks_merged"):
         assert counts[name] == 0
@@ -505,13 +464,13 @@ def test_declared_counts_are_told_before_anything_happens() -> None:
 def test_garbage_on_the_wire_changes_nothing(payload: bytes, topic: Topic) -> None:
     swarm = Swarm()
     swarm.cells["t"] = GRID.cell(10, 10)
-    swarm.world.run_ms(300)
+    swarm.run(0.3)
     before = swarm.ear.routes(0).routes
     fields = {"target": "t"} if topic is POSE else {"region": "0", "author": "x"}
     swarm.ear.bus.publish_bytes(topic, payload, fields)
-    swarm.world.run_ms(100)
+    swarm.run(0.1)
     assert swarm.ear.routes(0).routes == before
-    assert swarm.planners["t"].bus.counts["payloads_dropped"] == 1
+    assert swarm.buses["planner-t-1"].counts["payloads_dropped"] == 1
 
 
 def test_the_same_events_give_the_same_messages_byte_for_byte() -> None:
@@ -522,7 +481,7 @@ def test_the_same_events_give_the_same_messages_byte_for_byte() -> None:
             swarm.report(("v", GRID.cell(20, 0)), ("w", GRID.cell(20, 49)), seq=n)
             swarm.mark(n * 31)
             swarm.ear.routes(n, n + 1, force=n % 3 == 0, vehicles=["x", "y"])
-            swarm.world.run_ms(100)
-        return swarm.world.deliveries
+            swarm.run(0.1)
+        return swarm.deliveries
 
     assert run() == run()

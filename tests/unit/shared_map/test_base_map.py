@@ -1,3 +1,5 @@
+"""The base map: pieces in any order make the same terrain, and no false piece is taken."""
+
 from __future__ import annotations
 
 import zlib
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.map_strategies import MapSwarm
+from support.swarm_model import SwarmModel
 
 from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, describe, pack
 from shared_map.keeper.base_map_transfer import BaseMapServer, Fetching, fetch_base_map
@@ -144,7 +146,7 @@ class Network:
     namespace = "swarm"
 
     def __init__(self, *servers: BaseMapServer) -> None:
-        self.swarm = MapSwarm()
+        self.swarm = SwarmModel()
         for number, server in enumerate(servers):
             server.start(self.swarm.network.bus(f"server{number}"))
         self.bus = self.swarm.network.bus("asker")
@@ -229,7 +231,7 @@ def test_a_keeper_refuses_what_is_no_piece_of_its_map(request_: BaseMapRequest, 
 
 
 def test_every_keeper_answers_for_its_terrain() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     for id in ("k1", "k2"):
         swarm.keeper(id, KeeperStore(":memory:"))
     events: list[Event] = []

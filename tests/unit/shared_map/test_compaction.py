@@ -1,3 +1,5 @@
+"""Compaction changes no winner, in any order and with keepers that know different things."""
+
 from __future__ import annotations
 
 import random
@@ -6,33 +8,24 @@ from collections.abc import Sequence
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_strategies import (
-    AUTHORS,
-    GRID,
-    Composite,
-    LossyLinks,
-    MapSwarm,
-    held_winners,
-    mark_sets,
-    naive_winners,
-    set_of,
-)
+from support.map_strategies import AUTHORS, GRID, Composite, held_winners, mark_sets, naive_winners, set_of
+from support.swarm_model import LossyLinks, SwarmModel
 
-from shared_map.keeper.compaction import FoldPlan, fold, united, without
+from shared_map.keeper.compaction import CompactionPlan, compact, united, without
 from shared_map.keeper.store import KeeperStore
-from shared_map.replication.marks import base_seq, is_burial, mark_set, next_seq, statements
+from shared_map.replication.marks import base_seq, is_tombstone, mark_set, next_seq, statements
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.tombstones import REMEMBERED_NS, Graves
+from shared_map.replication.tombstones import REMEMBERED_NS, Tombstones
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import MapConfig
-from swarm.wire.messages.marks import FOLDS, MarkSet
+from swarm.config.scenario import MapConfig, Scenario
+from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.statements import MarkKind
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 
 
-def folding_of(of: MarkSet, times: int = 1) -> tuple[int, int]:
+def compacted_of(of: MarkSet, times: int = 1) -> tuple[int, int]:
     return of.epoch, of.seq + times
 
 
@@ -43,90 +36,90 @@ def cells_of(of: MarkSet) -> list[int]:
 def test_of_two_dead_authors_only_the_newest_statement_about_a_cell_is_left() -> None:
     old = set_of("a", 0, 3, {1: (LETHAL, 0, 10), 2: (LETHAL, 0, 10)})
     new = set_of("b", 0, 1, {1: (CLEAR, 0, 20)})
-    (folded,) = fold([old, new], {}, {"a", "b"}, 0)
-    assert cells_of(folded) == [2]
-    assert (folded.epoch, folded.seq) == folding_of(old)
+    (compacted,) = compact([old, new], {}, {"a", "b"}, 0)
+    assert cells_of(compacted) == [2]
+    assert (compacted.epoch, compacted.seq) == compacted_of(old)
 
 
 def test_on_a_tie_the_statement_of_the_larger_author_is_left() -> None:
     one, other = (set_of(author, 0, 1, {1: (LETHAL, 0, 10)}) for author in "ab")
-    (folded,) = fold([one, other], {}, {"a", "b"}, 0)
-    assert folded.author == "a"
-    assert is_burial(folded)
+    (compacted,) = compact([one, other], {}, {"a", "b"}, 0)
+    assert compacted.author == "a"
+    assert is_tombstone(compacted)
 
 
 def test_what_a_living_author_or_another_group_overrules_stays() -> None:
     dead = set_of("a", 0, 1, {1: (LETHAL, 0, 10)})
-    assert fold([dead, set_of("b", 0, 1, {1: (CLEAR, 0, 20)})], {}, {"a"}, 0) == []
-    assert fold([dead, set_of("b", 0, 1, {1: (CLEAR, 0, 20)}, group="red")], {}, {"a", "b"}, 0) == []
+    assert compact([dead, set_of("b", 0, 1, {1: (CLEAR, 0, 20)})], {}, {"a"}, 0) == []
+    assert compact([dead, set_of("b", 0, 1, {1: (CLEAR, 0, 20)}, group="red")], {}, {"a", "b"}, 0) == []
 
 
 def test_a_statement_that_ends_by_itself_overrules_nothing_and_goes_when_it_has_ended() -> None:
     lasting = set_of("a", 0, 1, {1: (LETHAL, 0, 10)})
     said = statements(set_of("b", 0, 1, {1: (CLEAR, 0, 20)}))
-    ending = mark_set("b", "all", 0, 1, FOLDS, said._replace(untils_ns=np.array([500], np.int64)))
-    assert fold([lasting, ending], {}, {"a", "b"}, 499) == []
-    (folded,) = fold([lasting, ending], {}, {"a", "b"}, 500)
-    assert folded.author == "b"
-    assert is_burial(folded)
+    ending = mark_set("b", "all", 0, 1, SEQ_STEP, said._replace(untils_ns=np.array([500], np.int64)))
+    assert compact([lasting, ending], {}, {"a", "b"}, 499) == []
+    (compacted,) = compact([lasting, ending], {}, {"a", "b"}, 500)
+    assert compacted.author == "b"
+    assert is_tombstone(compacted)
 
 
 def test_what_was_dropped_comes_back_when_what_overruled_it_is_taken_back() -> None:
     old, new = set_of("a", 0, 1, {1: (LETHAL, 0, 10)}), set_of("b", 0, 1, {1: (CLEAR, 0, 20)})
-    (burial,) = fold([old, new], {}, {"a", "b"}, 0)
-    dropped = {"a": without(old, burial)}
-    (again,) = fold([set_of("b", 0, 2, {2: (CLEAR, 0, 20)})], dropped, {"a", "b"}, 0)
+    (tombstone,) = compact([old, new], {}, {"a", "b"}, 0)
+    dropped = {"a": without(old, tombstone)}
+    (again,) = compact([set_of("b", 0, 2, {2: (CLEAR, 0, 20)})], dropped, {"a", "b"}, 0)
     assert again.author == "a"
     assert cells_of(again) == [1]
-    assert (again.epoch, again.seq) > (burial.epoch, burial.seq)
+    assert (again.epoch, again.seq) > (tombstone.epoch, tombstone.seq)
 
 
-def test_an_old_set_of_a_buried_author_is_buried_again() -> None:
+def test_an_old_set_of_a_deleted_author_is_deleted_again() -> None:
     older, newer = set_of("a", 0, 1, {1: (LETHAL, 0, 10)}), set_of("a", 0, 2, {})
-    (burial,) = fold([newer], {}, {"a"}, 0)
-    (again,) = fold([older], {"a": without(newer, burial)}, {"a"}, 0)
-    assert is_burial(again)
-    assert again.seq > burial.seq > newer.seq > older.seq
+    (tombstone,) = compact([newer], {}, {"a"}, 0)
+    (again,) = compact([older], {"a": without(newer, tombstone)}, {"a"}, 0)
+    assert is_tombstone(again)
+    assert again.seq > tombstone.seq > newer.seq > older.seq
 
 
-def test_an_authors_next_set_stands_above_all_foldings_of_the_last() -> None:
-    assert next_seq(0) == FOLDS
-    assert next_seq(FOLDS + 7) == 2 * FOLDS
-    assert base_seq(FOLDS + 7) == FOLDS
+def test_an_authors_next_set_stands_above_all_compacted_sets_of_the_last() -> None:
+    assert next_seq(0) == SEQ_STEP
+    assert next_seq(SEQ_STEP + 7) == 2 * SEQ_STEP
+    assert base_seq(SEQ_STEP + 7) == SEQ_STEP
     last = set_of("a", 0, 1, {})
-    no_number_left = mark_set("a", "all", 0, 1, 2 * FOLDS - 1, statements(last))
-    assert fold([no_number_left], {}, {"a"}, 0) == []
+    no_number_left = mark_set("a", "all", 0, 1, 2 * SEQ_STEP - 1, statements(last))
+    assert compact([no_number_left], {}, {"a"}, 0) == []
 
 
 @given(st.lists(mark_sets(), max_size=12), st.sets(st.sampled_from(AUTHORS)))
-def test_folding_changes_no_winner_and_a_second_one_nothing(sets: list[MarkSet], gone: set[str]) -> None:
+def test_compaction_changes_no_winner_and_a_second_one_nothing(sets: list[MarkSet], gone: set[str]) -> None:
     replica = MapReplica(GRID)
-    replica.merge_many(sets)
+    replica.merge(sets)
     before = held_winners(replica)
-    marks = replica.room.marks
-    for tile in replica.tiles:
-        replica.merge_many(fold(replica.sets(tile), {}, gone, 0))
+    marks = replica.held.capacity.marks
+    for tile in replica.held.tiles:
+        replica.merge(compact(replica.held.of_tile(tile), {}, gone, 0))
     assert held_winners(replica) == before
-    assert replica.room.marks <= marks
-    assert all(fold(replica.sets(tile), {}, gone, 0) == [] for tile in replica.tiles)
+    assert replica.held.capacity.marks <= marks
+    assert all(compact(replica.held.of_tile(tile), {}, gone, 0) == [] for tile in replica.held.tiles)
     if gone == set(AUTHORS):
-        assert replica.room.marks == len(before)  # one statement a cell
+        assert replica.held.capacity.marks == len(before)  # one statement a cell
 
 
 @given(st.lists(mark_sets(), max_size=8), st.integers(0, 1000))
-def test_burials_in_any_order_leave_equal_replicas(sets: list[MarkSet], seed: int) -> None:
+def test_tombstones_in_any_order_leave_equal_replicas(sets: list[MarkSet], seed: int) -> None:
     chance = random.Random(seed)
     source = MapReplica(GRID)
-    source.merge_many(sets)
-    foldings = [each for tile in source.tiles for each in fold(source.sets(tile), {}, set(AUTHORS), 0)]
+    source.merge(sets)
+    left = [each for tile in source.held.tiles for each in compact(source.held.of_tile(tile), {}, set(AUTHORS), 0)]
     prints = set()
     for _ in range(3):
         replica = MapReplica(GRID, sink := Composite())
-        deliveries = [*sets, *sets, *foldings, *foldings]
+        deliveries = [*sets, *sets, *left, *left]
         chance.shuffle(deliveries)
         for at in range(0, len(deliveries), 5):
-            replica.merge_many(deliveries[at : at + 5])
-        prints.add(replica.fingerprint())
+            replica.merge(deliveries[at : at + 5])
+        prints.add(replica.held.fingerprint())
         winners = held_winners(replica)
         assert {key: (int(sink.kinds[_flat(*key)]), float(sink.paces[_flat(*key)])) for key in winners} == winners
     assert len(prints) == 1
@@ -148,27 +141,29 @@ class Disk:
         self.replica = MapReplica(GRID)
 
     def hear(self, sets: Sequence[MarkSet]) -> None:
-        self.store.save(self.replica.merge_many(sets).sets)
+        self.store.save(self.replica.merge(sets).sets)
 
-    def fold(self, gone: set[str], killed: bool) -> list[MarkSet]:
-        """Fold all tiles; a keeper that is killed between its disk and the network tells nobody."""
+    def compact(self, gone: set[str], killed: bool) -> list[MarkSet]:
+        """Compact all tiles; a keeper that is killed between its disk and the network tells nobody."""
         tiles = range(GRID.tiles)
-        folded = [
-            each for tile in tiles for each in fold(self.replica.sets(tile), self.store.folded(tile), gone, 0)
+        compacted = [
+            each
+            for tile in tiles
+            for each in compact(self.replica.held.of_tile(tile), self.store.set_aside(tile), gone, 0)
         ]
-        self.store.save(folded)
+        self.store.save(compacted)
         if not killed:
-            self.replica.merge_many(folded)
-            return folded
+            self.replica.merge(compacted)
+            return compacted
         self.replica = MapReplica(GRID)
-        self.replica.merge_many(list(self.store.load()))
+        self.replica.merge(list(self.store.load()))
         return []
 
 
 @settings(max_examples=200)
 @given(st.lists(mark_sets(), min_size=2, max_size=14), st.integers(0, 10_000))
-def test_two_keepers_that_fold_with_different_knowledge_lose_no_winner(sets: list[MarkSet], seed: int) -> None:
-    """Each set reaches both keepers in the end, in any order, between foldings of whom each takes for dead then."""
+def test_two_keepers_that_compact_with_different_knowledge_lose_no_winner(sets: list[MarkSet], seed: int) -> None:
+    """Each set reaches both keepers in the end, in any order, between compactions of whom each takes for dead."""
     # No author puts two different sets under one number.
     sets = list({(each.tile, each.author, each.epoch, each.seq): each for each in sets}.values())
     chance = random.Random(seed)
@@ -183,42 +178,42 @@ def test_two_keepers_that_fold_with_different_knowledge_lose_no_winner(sets: lis
                 keepers[n].hear([source.pop(chance.randrange(len(source)))])
         if chance.random() < 0.5:
             gone = {author for author in AUTHORS if chance.random() < 0.6}
-            wires[1 - n].extend(keepers[n].fold(gone, killed=chance.random() < 0.3))
-    for _ in range(8):  # what digests do: each gets what it misses of the other, and folds
+            wires[1 - n].extend(keepers[n].compact(gone, killed=chance.random() < 0.3))
+    for _ in range(8):  # what digests do: each gets what it misses of the other, and compacts
         for n, keeper in enumerate(keepers):
             other = keepers[1 - n]
-            missing = keeper.replica.compare(other.replica.digest())
+            missing = keeper.replica.missing(other.replica.held.ledger.held())
             wanted = {(author, tile) for author, tiles in missing for tile in tiles}
-            held = [each for tile in other.replica.tiles for each in other.replica.sets(tile)]
+            held = [each for tile in other.replica.held.tiles for each in other.replica.held.of_tile(tile)]
             keeper.hear([each for each in held if (each.author, each.tile) in wanted])
-            other.hear(keeper.fold(set(AUTHORS), killed=False))
-    assert keepers[0].replica.fingerprint() == keepers[1].replica.fingerprint()
+            other.hear(keeper.compact(set(AUTHORS), killed=False))
+    assert keepers[0].replica.held.fingerprint() == keepers[1].replica.held.fingerprint()
     for keeper in keepers:
         assert held_winners(keeper.replica) == naive_winners(sets)
         stored = {(each.tile, each.author, each.seq) for each in keeper.store.load()}
-        held = [each for tile in keeper.replica.tiles for each in keeper.replica.sets(tile)]
+        held = [each for tile in keeper.replica.held.tiles for each in keeper.replica.held.of_tile(tile)]
         assert stored == {(each.tile, each.author, each.seq) for each in held}
 
 
 # --- the parts ----------------------------------------------------------------------------------------------
 
 
-def test_a_store_sets_aside_what_a_folding_drops_until_its_author_says_something_newer() -> None:
+def test_a_store_sets_aside_what_a_compaction_drops_until_its_author_says_something_newer() -> None:
     store = KeeperStore(":memory:")
     own = set_of("a", 0, 1, {1: (LETHAL, 0, 10), 2: (LETHAL, 0, 10)})
     store.save([own])
     first = mark_set("a", "all", 0, 1, own.seq + 1, statements(set_of("a", 0, 1, {2: (LETHAL, 0, 10)})))
     store.save([first], now_ns=100)
     assert list(store.load()) == [first]
-    assert cells_of(store.folded(0)["a"]) == [1]
-    burial = mark_set("a", "all", 0, 1, own.seq + 2, statements(set_of("a", 0, 1, {})))
-    store.save([burial], now_ns=200)
+    assert cells_of(store.set_aside(0)["a"]) == [1]
+    tombstone = mark_set("a", "all", 0, 1, own.seq + 2, statements(set_of("a", 0, 1, {})))
+    store.save([tombstone], now_ns=200)
     assert list(store.load()) == []
-    assert cells_of(store.folded(0)["a"]) == [1, 2]
-    store.forget_folded(200)
-    assert list(store.folded(0)) == ["a"]
+    assert cells_of(store.set_aside(0)["a"]) == [1, 2]
+    store.forget_set_aside(200)
+    assert list(store.set_aside(0)) == ["a"]
     store.save([set_of("a", 0, 2, {3: (LETHAL, 0, 30)})])
-    assert store.folded(0) == {}
+    assert store.set_aside(0) == {}
 
 
 def test_united_and_without_are_inverse() -> None:
@@ -232,33 +227,33 @@ def test_united_and_without_are_inverse() -> None:
     )  # fmt: skip
 
 
-def test_graves_open_for_what_is_newer_and_are_forgotten_in_time() -> None:
-    graves = Graves()
-    burial = mark_set("a", "all", 0, 1, FOLDS + 1, statements(set_of("a", 0, 1, {})))
-    graves.dig(burial, 0)
-    assert graves.holds(set_of("a", 0, 1, {1: (LETHAL, 0, 1)}))
-    assert graves.holds(burial)
-    assert not graves.holds(set_of("a", 1, 1, {}))
-    assert not graves.holds(set_of("a", 0, 2, {}))
-    assert len(graves) == 0
-    graves.dig(burial, 0)
-    graves.forget(REMEMBERED_NS)
-    assert len(graves) == 1
-    graves.forget(REMEMBERED_NS + 1)
-    assert len(graves) == 0
+def test_tombstones_give_way_to_what_is_newer_and_are_forgotten_in_time() -> None:
+    tombstones = Tombstones()
+    tombstone = mark_set("a", "all", 0, 1, SEQ_STEP + 1, statements(set_of("a", 0, 1, {})))
+    tombstones.add(tombstone, 0)
+    assert tombstones.covers(set_of("a", 0, 1, {1: (LETHAL, 0, 1)}))
+    assert tombstones.covers(tombstone)
+    assert not tombstones.covers(set_of("a", 1, 1, {}))
+    assert not tombstones.covers(set_of("a", 0, 2, {}))
+    assert len(tombstones) == 0
+    tombstones.add(tombstone, 0)
+    tombstones.expire(REMEMBERED_NS)
+    assert len(tombstones) == 1
+    tombstones.expire(REMEMBERED_NS + 1)
+    assert len(tombstones) == 0
 
 
 def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> None:
     replica = MapReplica(GRID)
-    replica.merge_many([set_of("a", 0, 1, {1: (LETHAL, 0, 1)}), set_of("b", 3, 1, {1: (LETHAL, 0, 1)})])
-    plan = FoldPlan(10, started_ns=100)
-    plan.update(replica.ledger, 105)
+    replica.merge([set_of("a", 0, 1, {1: (LETHAL, 0, 1)}), set_of("b", 3, 1, {1: (LETHAL, 0, 1)})])
+    plan = CompactionPlan(10, started_ns=100)
+    plan.update(replica.held.ledger, 105)
     plan.heard("a", 108)
-    plan.update(replica.ledger, 110)
+    plan.update(replica.held.ledger, 110)
     assert plan.take_due(9, 110) == {}
-    plan.update(replica.ledger, 111)
+    plan.update(replica.held.ledger, 111)
     assert plan.take_due(9, 111) == {3: True}  # we do not know what happened before we began
-    plan.update(replica.ledger, 119)
+    plan.update(replica.held.ledger, 119)
     assert plan.take_due(9, 119) == {0: False}
     assert plan.take_due(9, 119) == {}
     plan.accepted(set_of("b", 3, 2, {}))
@@ -269,14 +264,12 @@ def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> 
 # --- services -----------------------------------------------------------------------------------------------
 
 
-def folding_swarm() -> MapSwarm:
-    swarm = MapSwarm()
-    swarm.config = MapConfig(fold_after_s=5)
-    return swarm
+def compacting_swarm() -> SwarmModel:
+    return SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5)))
 
 
 def test_agents_that_come_and_go_leave_as_much_as_one_behind() -> None:
-    swarm = folding_swarm()
+    swarm = compacting_swarm()
     stores = [KeeperStore(":memory:") for _ in range(2)]
     keepers = [swarm.keeper(f"k{n}", store) for n, store in enumerate(stores)]
     listener = swarm.listener("p")
@@ -286,7 +279,7 @@ def test_agents_that_come_and_go_leave_as_much_as_one_behind() -> None:
         name = f"a1.{incarnation + 1}"
         author = swarm.writer(name)
         swarm.run(1)
-        author.feed.publish(author.replica.write(cells, [LETHAL, CLEAR][incarnation % 2], 0.0, swarm.now_ns))
+        author.sync.publish(author.replica.write(cells, [LETHAL, CLEAR][incarnation % 2], 0.0, swarm.now_ns))
         swarm.run(1)
         swarm.kill(name)
     winners = held_winners(author.replica)
@@ -295,46 +288,46 @@ def test_agents_that_come_and_go_leave_as_much_as_one_behind() -> None:
     swarm.run(2)
     for service in (*keepers, listener, late):
         assert held_winners(service.replica) == winners
-        assert service.replica.fingerprint() == keepers[0].replica.fingerprint()
-        assert service.replica.room.marks == len(cells)
-        assert service.replica.room.sets == GRID.tiles
+        assert service.replica.held.fingerprint() == keepers[0].replica.held.fingerprint()
+        assert service.replica.held.capacity.marks == len(cells)
+        assert service.replica.held.capacity.sets == GRID.tiles
     for store in stores:
         assert len(list(store.load())) == GRID.tiles
 
 
 def test_an_author_that_was_only_cut_off_says_all_again() -> None:
     links = LossyLinks(1)
-    swarm = MapSwarm(links)
-    swarm.config = MapConfig(fold_after_s=5)
+    swarm = SwarmModel(links)
+    swarm.scenario = Scenario(map=MapConfig(compact_after_s=5))
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     cut_off, other = swarm.writer("a1.1"), swarm.writer("b1.1")
     swarm.run(2)
-    cut_off.feed.publish(cut_off.replica.write([5, 6], LETHAL, 0.0, swarm.now_ns))
+    cut_off.sync.publish(cut_off.replica.write([5, 6], LETHAL, 0.0, swarm.now_ns))
     swarm.run(1)
-    other.feed.publish(other.replica.write([5], CLEAR, 0.0, swarm.now_ns))
+    other.sync.publish(other.replica.write([5], CLEAR, 0.0, swarm.now_ns))
     swarm.run(1)
     swarm.kill("b1.1")
     links.far_side = {"a1.1"}
     swarm.run(20)
-    assert keeper.replica.room.marks == 2  # of three
+    assert keeper.replica.held.capacity.marks == 2  # of three
     links.far_side = set()
-    cut_off.feed.publish(cut_off.replica.write([7], LETHAL, 0.0, swarm.now_ns))
+    cut_off.sync.publish(cut_off.replica.write([7], LETHAL, 0.0, swarm.now_ns))
     swarm.run(5)
     assert held_winners(keeper.replica) == held_winners(cut_off.replica)
     assert {cell for _, cell in held_winners(keeper.replica)} == {5, 6, 7}
-    assert keeper.replica.fingerprint() == cut_off.replica.fingerprint()
+    assert keeper.replica.held.fingerprint() == cut_off.replica.held.fingerprint()
 
 
-def test_a_full_disk_folds_nothing_and_a_store_grows_no_more_than_the_ground() -> None:
-    swarm = MapSwarm(terrain=terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32)))
-    swarm.config = MapConfig(fold_after_s=5)
+def test_a_full_disk_compacts_nothing_and_a_store_grows_no_more_than_the_ground() -> None:
+    swarm = SwarmModel(terrain=terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32)))
+    swarm.scenario = Scenario(map=MapConfig(compact_after_s=5))
     store = KeeperStore(":memory:")
     keeper = swarm.keeper("keeper", store)
     for name in ("a1.1", "a1.2"):
         author = swarm.writer(name)
         swarm.run(1)
-        author.feed.publish(author.replica.write(np.arange(GRID.cells), LETHAL, 0.0, swarm.now_ns))
-        author.feed.publish(author.replica.write(np.arange(GRID.cells), CLEAR, 0.0, swarm.now_ns + NS_PER_S))
+        author.sync.publish(author.replica.write(np.arange(GRID.cells), LETHAL, 0.0, swarm.now_ns))
+        author.sync.publish(author.replica.write(np.arange(GRID.cells), CLEAR, 0.0, swarm.now_ns + NS_PER_S))
         swarm.run(1)
         swarm.kill(name)
     pages = store._db.execute("PRAGMA page_count").fetchone()[0]
@@ -344,4 +337,4 @@ def test_a_full_disk_folds_nothing_and_a_store_grows_no_more_than_the_ground() -
     assert len(list(store.load())) <= sets
     store._db.execute("PRAGMA max_page_count = 1000000")
     swarm.run(30)
-    assert keeper.replica.room.marks == GRID.cells
+    assert keeper.replica.held.capacity.marks == GRID.cells

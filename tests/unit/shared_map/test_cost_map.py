@@ -1,3 +1,5 @@
+"""The cost map: any sequence of marks gives what is made from scratch, and dirty windows cover the change."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Digests: equal holdings give equal bytes, and a difference names exactly what is newer."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -51,5 +53,6 @@ def test_a_row_recorded_again_replaces_the_older_one() -> None:
     ledger.record("a", 3, 1, 7)
     rows = np.frombuffer(ledger.held()["a"], DIGEST_ROW)
     assert rows.tolist() == [(3, 1, 7), (5, 1, 0), (9, 1, 0)]
-    ledger.forget("a")
+    for tile in (9, 3, 5):
+        ledger.drop("a", tile)
     assert ledger.held() == {}

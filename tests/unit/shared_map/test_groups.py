@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.agent_world import AgentWorld, pace_of
 
-from shared_map.replication.filter import Reading, readable_for_target, readable_groups
+from shared_map.replication.filter import MarkFilter, readable_for_target, readable_groups
 from shared_map.replication.replica import MapReplica, PublishSet
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
@@ -109,26 +109,26 @@ def test_a_replica_that_reads_some_groups_equals_one_to_which_only_they_spoke(
     heard: list[MarkSet] = []
     for now_ns, (name, cell) in enumerate(said):
         heard += sets(writers[name].write([cell], [MarkKind.LETHAL], [0.0], 10_000_000 * now_ns))
-    limited = MapReplica(GRID, reading=Reading(GRID, frozenset(read)))
+    limited = MapReplica(GRID, filter=MarkFilter(GRID, frozenset(read)))
     told = MapReplica(GRID)
     chance.shuffle(heard)  # type: ignore[attr-defined]
     for each in heard:
-        limited.merge(each)
+        limited.merge([each])
         if each.group in read:
-            told.merge(each)
-    assert limited.fingerprint() == told.fingerprint()
+            told.merge([each])
+    assert limited.held.fingerprint() == told.held.fingerprint()
     assert limited.counts["sets_foreign"] == sum(each.group not in read for each in heard)
     everything = MapReplica(GRID)
-    everything.merge_many(heard)
+    everything.merge(heard)
     # A digest of all is no reason to ask for what would be refused.
-    assert limited.compare(everything.digest()) == []
+    assert limited.missing(everything.held.ledger.held()) == []
 
 
 def test_a_set_that_claims_another_group_than_its_author_has_is_refused() -> None:
     red = MapReplica(GRID, author="red.a0.1", group="blue", publish_hz=1000.0)
-    reader = MapReplica(GRID, reading=Reading(GRID, frozenset({"blue"})))
+    reader = MapReplica(GRID, filter=MarkFilter(GRID, frozenset({"blue"})))
     for each in sets(red.write([5], [MarkKind.LETHAL], [0.0], 1)):
-        assert reader.merge(each) is None
+        assert reader.merge([each]).sets == []
     assert reader.counts["sets_foreign"] == 1
 
 
@@ -168,14 +168,14 @@ def test_a_mark_reaches_another_group_only_if_its_own_lets_it(writes: list[str])
     world = AgentWorld(TWO_GROUPS.format(writes=writes), pace_of(PRIOR), pace_of(TRUTH))
     world.put_target("t", 1, 17)
     world.start_all()
-    world.run_s(5.0)
+    world.run(5.0)
     closed = np.isinf(pace_of(TRUTH)) & ~np.isinf(pace_of(PRIOR))
     red, blue = (service._cost_map.ground_s_per_m[closed] for service in world.agents.values())
     assert np.isinf(red).all()
     assert np.isinf(blue).all() == bool(writes)
     refused = world.agents["a1"].counters.counts["sets_foreign"]
     assert (refused > 0) == (not writes)
-    world.run_s(10.0)  # digests go on, and bring nothing more to refuse than what is put
+    world.run(10.0)  # digests go on, and bring nothing more to refuse than what is put
     assert world.agents["a1"].counters.counts["sets_foreign"] <= refused + 1
     world.assert_lawful()
     assert MARKS.key.endswith("/{author}")

@@ -11,8 +11,8 @@ from support.simulated_swarm import Laws, names, seeded
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.cost_map import CostMap
-from shared_map.replication.marks import region_tiles
 from shared_map.replication.replica import MapReplica, PublishSet
+from shared_map.replication.tiles import region_tiles
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
@@ -44,31 +44,31 @@ def test_within_its_regions_it_equals_one_that_holds_all(
     own = MapReplica(GRID, own_map)
     writers = {name: MapReplica(GRID, author=name, publish_hz=1000.0) for name in ("a.0", "b.0")} | {"mine": near}
     held: frozenset[int] = frozenset()
-    near.limit(held)
+    near.limit_to(held)
     for now_ns, step in enumerate(happened):
         if isinstance(step, frozenset):
-            near.limit(step)
-            for each in (each for tile in everything.tiles for each in everything.sets(tile)):
-                near.merge(each)  # what a query about the new regions brings, and more
+            near.limit_to(step)
+            for each in (each for tile in everything.held.tiles for each in everything.held.of_tile(tile)):
+                near.merge([each])  # what a query about the new regions brings, and more
             held = step
             continue
         name, (cell, kind) = step
         for each in sets(writers[name].write([cell], [kind], [0.5], 10_000_000 * (now_ns + 1))):
-            everything.merge(each)
+            everything.merge([each])
             if name == "mine":
-                own.merge(each)
+                own.merge([each])
             else:
-                near.merge(each)
+                near.merge([each])
     inside = np.zeros((GRID.rows, GRID.cols), bool)
     for tile in [tile for region in held for tile in region_tiles(GRID, region)]:
         window = GRID.tile_window(tile)
         inside[window.row0 : window.row1, window.col0 : window.col1] = True
     np.testing.assert_array_equal(near_map.pace_s_per_m[inside], all_map.pace_s_per_m[inside])
     np.testing.assert_array_equal(near_map.pace_s_per_m[~inside], own_map.pace_s_per_m[~inside])
-    far = [tile for tile in near.tiles if not near.reading.concerns(tile)]
-    assert {each.author for tile in far for each in near.sets(tile)} <= {"mine"}
+    far = [tile for tile in near.held.tiles if not near.filter.accepts_tile(tile)]
+    assert {each.author for tile in far for each in near.held.of_tile(tile)} <= {"mine"}
     # Digests of all are no reason to ask for what lies elsewhere.
-    assert near.compare(everything.digest()) == []
+    assert near.missing(everything.held.ledger.held()) == []
 
 
 NEAR: Scenario = parse_scenario("""
@@ -109,11 +109,13 @@ def check_interest(simulation: Simulation) -> tuple[int, int]:
         if not isinstance(node.service, AgentService):
             continue
         replica = node.service._replica
-        for tile in keeper.tiles:
-            there += len(keeper.sets(tile))
-            held += len(replica.sets(tile))
-            if replica.reading.concerns(tile):
-                assert [s for s in replica.sets(tile) if s.kinds] == [s for s in keeper.sets(tile) if s.kinds]
+        for tile in keeper.held.tiles:
+            there += len(keeper.held.of_tile(tile))
+            held += len(replica.held.of_tile(tile))
+            if replica.filter.accepts_tile(tile):
+                assert [s for s in replica.held.of_tile(tile) if s.kinds] == [
+                    s for s in keeper.held.of_tile(tile) if s.kinds
+                ]
     return held, there
 
 

@@ -1,3 +1,5 @@
+"""The keeper: what it acknowledges is on disk, and no other terrain's store is touched."""
+
 from __future__ import annotations
 
 import sqlite3
@@ -5,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.map_strategies import GRID, MapSwarm, set_of
+from support.map_strategies import GRID, Acknowledged, set_of
+from support.swarm_model import SwarmModel
 
 from shared_map.keeper.store import Keeper, KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
@@ -128,37 +131,39 @@ def test_only_what_is_on_the_disk_counts_as_committed() -> None:
 # --- the service --------------------------------------------------------------------------------------------
 
 
-def test_an_author_learns_from_the_keepers_digest_what_is_safe() -> None:
-    swarm = MapSwarm()
+def test_a_keepers_digest_tells_an_author_what_is_safe() -> None:
+    swarm = SwarmModel()
+    acknowledged = Acknowledged(swarm.network.bus("ear"))
     store = KeeperStore(":memory:")
     swarm.keeper("keeper", store)
     author = swarm.writer("a1.1")
     swarm.run(1.2)
-    assert author.feed.unacknowledged == 0
-    author.feed.publish(author.replica.write([5], [LETHAL], [0], swarm.now_ns))
-    assert author.feed.unacknowledged == 1
+    assert acknowledged.not_yet(author) == 0
+    author.sync.publish(author.replica.write([5], [LETHAL], [0], swarm.now_ns))
+    assert acknowledged.not_yet(author) == 1
     swarm.run(1.5)
-    assert author.feed.unacknowledged == 0
+    assert acknowledged.not_yet(author) == 0
     assert [each.author for each in store.load()] == ["a1.1"]
 
 
 def test_a_full_disk_is_told_of_and_the_keeper_goes_on_serving_and_saves_when_there_is_room() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
+    acknowledged = Acknowledged(swarm.network.bus("ear"))
     store = KeeperStore(":memory:")
     keeper = swarm.keeper("keeper", store)
     author = swarm.writer("a1.1")
     swarm.run(1.2)
     fill(store)
     cells = np.arange(swarm.terrain.grid.cells)
-    author.feed.publish(author.replica.write(cells, LETHAL, 0.0, swarm.now_ns))
+    author.sync.publish(author.replica.write(cells, LETHAL, 0.0, swarm.now_ns))
     swarm.run(3)
     assert keeper.counters.counts["saves_failed"] >= 2
     assert keeper.counters.gauges["sets_waiting"] == 6
-    assert author.feed.unacknowledged == 6
+    assert acknowledged.not_yet(author) == 6
     swarm.kill("a1.1")
     late = swarm.listener("late")  # only the keeper is left to ask
     swarm.run(1)
-    assert late.replica.fingerprint() == author.replica.fingerprint()
+    assert late.replica.held.fingerprint() == author.replica.held.fingerprint()
     make_room(store)
     swarm.run(2)
     assert len(list(store.load())) == 6
@@ -166,10 +171,10 @@ def test_a_full_disk_is_told_of_and_the_keeper_goes_on_serving_and_saves_when_th
 
 
 def test_the_marks_of_the_dead_outlive_the_keeper(tmp_path: Path) -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     swarm.keeper("keeper", KeeperStore(tmp_path / "map.sqlite"))
     author = swarm.writer("a1.1")
-    author.feed.publish(author.replica.write([5, 6], [LETHAL, LETHAL], [0, 0], swarm.now_ns))
+    author.sync.publish(author.replica.write([5, 6], [LETHAL, LETHAL], [0, 0], swarm.now_ns))
     swarm.run(1)
     swarm.kill("a1.1")
     swarm.kill("keeper.1")  # its file is as the last commit left it
@@ -177,26 +182,28 @@ def test_the_marks_of_the_dead_outlive_the_keeper(tmp_path: Path) -> None:
     for tail in ("", "-wal"):
         copy.with_name(copy.name + tail).write_bytes((tmp_path / f"map.sqlite{tail}").read_bytes())
     again = swarm.keeper("keeper", KeeperStore(copy), incarnation=2)
-    assert again.replica.fingerprint() == author.replica.fingerprint()
+    assert again.replica.held.fingerprint() == author.replica.held.fingerprint()
     late = swarm.listener("late")
     swarm.run(1)
-    assert late.replica.fingerprint() == author.replica.fingerprint()
+    assert late.replica.held.fingerprint() == author.replica.held.fingerprint()
 
 
 def test_two_keepers_agree_though_each_missed_what_the_other_heard() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     first = swarm.keeper("k1", KeeperStore(":memory:"))
     author = swarm.writer("a1.1")
-    author.feed.publish(author.replica.write([5], [LETHAL], [0], swarm.now_ns))
+    author.sync.publish(author.replica.write([5], [LETHAL], [0], swarm.now_ns))
     swarm.run(1)
     swarm.kill("a1.1")
     second = swarm.keeper("k2", KeeperStore(":memory:"))
     swarm.run(3)
-    assert first.replica.fingerprint() == second.replica.fingerprint() == author.replica.fingerprint()
+    assert (
+        first.replica.held.fingerprint() == second.replica.held.fingerprint() == author.replica.held.fingerprint()
+    )
 
 
 def test_a_keeper_refuses_the_store_of_another_terrain() -> None:
     store = KeeperStore(":memory:")
     store.bind("another", GRID)
     with pytest.raises(StoreError, match="another"):
-        MapSwarm(terrain=terrain_of_pace(np.ones((9, 9), np.float32))).keeper("keeper", store)
+        SwarmModel(terrain=terrain_of_pace(np.ones((9, 9), np.float32))).keeper("keeper", store)

@@ -1,3 +1,5 @@
+"""Marks: which set and which statement win, and what a set changes."""
+
 from __future__ import annotations
 
 import msgspec
@@ -7,18 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.map_strategies import GRID, mark_sets, naive_winners, set_of
 
-from shared_map.replication.marks import (
-    NO_STATEMENT,
-    HybridClock,
-    changes,
-    difference,
-    fault,
-    grid_cells,
-    region_tiles,
-    resolve,
-    supersedes,
-    tile_cells,
-)
+from shared_map.replication import merge as merge_module
+from shared_map.replication.marks import NO_STATEMENT, HybridClock, dense, fault, supersedes
+from shared_map.replication.merge import TileChange, new_winners, winners
+from shared_map.replication.tiles import grid_cells, region_tiles, tile_cells, tile_corners
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import STAMP_LIMIT_NS, MarkKind
 
@@ -36,7 +30,7 @@ def test_the_set_with_the_higher_epoch_and_then_seq_stays() -> None:
 def test_of_two_statements_about_a_cell_the_newer_wins_and_on_a_tie_the_larger_author() -> None:
     a = set_of("a", 0, 0, {5: (LETHAL, 0, 10), 6: (LETHAL, 0, 10)})
     b = set_of("b", 0, 0, {5: (PACE, 2.0, 9), 6: (PACE, 2.0, 10)})
-    won = resolve([a, b])
+    won = dense(winners([a, b], 0))
     assert won.kinds[5] == LETHAL
     assert (won.kinds[6], won.paces[6]) == (PACE, 2.0)
     assert won.kinds[7] == CLEAR
@@ -51,7 +45,7 @@ def test_resolving_agrees_with_the_two_rules_taken_one_statement_at_a_time(sets:
         if held is None or supersedes(each, held):
             newest[each.tile, each.author] = each
     for tile in range(GRID.tiles):
-        won = resolve(newest[at] for at in sorted(newest) if at[0] == tile)
+        won = dense(winners([newest[at] for at in sorted(newest) if at[0] == tile], 0))
         said = np.flatnonzero(won.stamps_ns != NO_STATEMENT)
         found = {(tile, int(c)): (int(won.kinds[c]), float(won.paces[c])) for c in said}
         assert found == {at: what for at, what in naive_winners(sets).items() if at[0] == tile}
@@ -61,7 +55,7 @@ def test_resolving_agrees_with_the_two_rules_taken_one_statement_at_a_time(sets:
 def test_a_cell_is_found_again_from_its_tile(cell: int) -> None:
     tiles, inner = tile_cells(GRID, np.array([cell]))
     assert tiles.tolist() == [GRID.tile_of(cell)]
-    assert grid_cells(GRID, int(tiles[0]), inner).tolist() == [cell]
+    assert grid_cells(GRID, tile_corners(GRID, tiles), inner).tolist() == [cell]
 
 
 def test_every_tile_is_in_exactly_one_region() -> None:
@@ -100,15 +94,21 @@ def test_a_stamp_beyond_time_is_no_mark() -> None:
 def test_the_difference_that_a_set_makes_is_that_between_before_and_after(
     new: MarkSet, old: MarkSet | None, more: list[MarkSet]
 ) -> None:
-    """Whether few or many say something, and by the short way as by the long."""
-    others = sorted({each.author: each for each in more if each.author != new.author}.values(), key=_author)
-    before = resolve(sorted([*others] + ([] if old is None else [_by(new.author, old)]), key=_author))
-    after = resolve(sorted([*others, new], key=_author))
-    changed = difference(None if old is None else _by(new.author, old), new, others)
-    assert changed.cells.tolist() == changes(before, after).cells.tolist()
-    assert changed.kinds.tolist() == after.kinds[changed.cells].tolist()
-    assert changed.paces.tolist() == after.paces[changed.cells].tolist()
-    assert changed.stamps_ns.tolist() == after.stamps_ns[changed.cells].tolist()
+    others = list({each.author: each for each in more if each.author != new.author}.values())
+    held = sorted([*others] + ([] if old is None else [_by(new.author, old)]), key=_author)
+    since = sorted([*others, new], key=_author)
+    before, after = dense(winners(held, 0)), dense(winners(since, 0))
+    differs = np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces))
+    for few in (-1, 10**9):  # by arrays and by lists
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(merge_module, "_FEW", few)
+            changed = new_winners(GRID, [TileChange(0, held, since)], 0, 0)
+        assert changed.counts == [len(differs)]
+        order = np.argsort(changed.cells)
+        assert changed.cells[order].tolist() == grid_cells(GRID, tile_corners(GRID, 0), differs).tolist()
+        assert changed.kinds[order].tolist() == after.kinds[differs].tolist()
+        assert changed.paces[order].tolist() == after.paces[differs].tolist()
+        assert changed.stamps_ns[order].tolist() == after.stamps_ns[differs].tolist()
 
 
 def _author(of: MarkSet) -> str:

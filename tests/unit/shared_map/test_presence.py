@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.agent_world import AgentWorld, pace_of
 
 from shared_map.presence import Presence
-from shared_map.replication.filter import Reading
+from shared_map.replication.filter import MarkFilter
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.fields import pack_column
@@ -80,7 +80,7 @@ def test_a_vehicle_between_two_regions_is_where_it_was_last_seen() -> None:
 
 
 def test_only_the_groups_that_are_read_are_there() -> None:
-    here = presence(reading=Reading(GRID, frozenset({"blue"})))
+    here = presence(filter=MarkFilter(GRID, frozenset({"blue"})))
     here.hear(fleet(("u", 5, 5), group="red", author="red.a0.1"), 0)
     here.hear(fleet(("w", 5, 5), group="blue", author="red.a0.1"), 0)  # says so
     here.hear(fleet(("v", 5, 5), group="blue", author="blue.a1.1"), 0)
@@ -146,7 +146,7 @@ def test_a_parked_vehicle_is_driven_around_without_a_stop() -> None:
     world.put_target("t", 2, 22)
     world.put_target("s", 2, 12)  # the other has arrived before it begins
     world.start_all()
-    world.run_s(3.0)
+    world.run(3.0)
     assert world.states()["a1-00"] is VehicleState.ARRIVED
     took_s = world.until(lambda: world.states()["a0-00"] is VehicleState.ARRIVED, within_s=60)
     # 21 cells of a second each, two of them diagonal, the first of which it has driven: nobody waits five seconds.

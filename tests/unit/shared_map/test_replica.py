@@ -1,12 +1,13 @@
+"""One replica: what it merges, writes, publishes, answers and forgets."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.map_strategies import GRID, Composite, held_winners, mark_sets, naive_winners, set_of
+from support.map_strategies import GRID, Composite, merge_one, replica_of, set_of
 
-from shared_map.replication.digest import fingerprint
 from shared_map.replication.marks import Statements, mark_set
 from shared_map.replication.replica import MapReplica, PublishSet
 from swarm.clock import NS_PER_S
@@ -18,92 +19,32 @@ PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 NOW = 1_000 * NS_PER_S
 
 
-def replica_of(sets: list[MarkSet]) -> tuple[MapReplica, Composite]:
-    composite = Composite()
-    replica = MapReplica(GRID, composite)
-    for each in sets:
-        replica.merge(each)
-    return replica, composite
-
-
-@given(st.lists(mark_sets(), max_size=15), st.data())
-def test_merging_depends_on_neither_order_nor_repetition(sets: list[MarkSet], data: st.DataObject) -> None:
-    replica, composite = replica_of(sets)
-    again = data.draw(st.lists(st.sampled_from(sets), max_size=10)) if sets else []
-    other, other_composite = replica_of(data.draw(st.permutations(sets + again)))
-    assert replica.digest() == other.digest()
-    assert replica.answer(MarksRequest()) == other.answer(MarksRequest())
-    assert composite.same(other_composite)
-
-
-@given(st.lists(mark_sets(), max_size=12), st.lists(mark_sets(), max_size=12))
-def test_merging_does_not_depend_on_grouping(one: list[MarkSet], two: list[MarkSet]) -> None:
-    """What two replicas hold, merged into a third, is what all the sets merge to."""
-    third, composite = replica_of([])
-    for part in (one, two):
-        for each in replica_of(part)[0].answer(MarksRequest()):
-            third.merge(each)
-    whole, whole_composite = replica_of(one + two)
-    assert third.digest() == whole.digest()
-    assert composite.same(whole_composite)
-
-
-@given(st.lists(mark_sets(), max_size=15))
-def test_the_cost_map_always_stands_at_the_winners(sets: list[MarkSet]) -> None:
-    replica, composite = replica_of(sets)
-    winners = naive_winners(sets)
-    assert held_winners(replica) == winners
-    for tile in range(GRID.tiles):
-        window = GRID.tile_window(tile)
-        for row in range(window.row0, window.row1):
-            for col in range(window.col0, window.col1):
-                inner = (row - window.row0) * 32 + col - window.col0
-                expected = winners.get((tile, inner), (CLEAR, 0.0))
-                cell = GRID.cell(row, col)
-                assert (composite.kinds[cell], composite.paces[cell]) == expected
-
-
-@given(st.lists(mark_sets(), max_size=15), st.lists(st.booleans(), min_size=15, max_size=15))
-def test_what_was_lost_is_fetched_after_comparing_digests(sets: list[MarkSet], lost: list[bool]) -> None:
-    whole, composite = replica_of(sets)
-    partial, partial_composite = replica_of([each for each, gone in zip(sets, lost, strict=False) if not gone])
-    asked = partial.compare(whole.digest())
-    for author, tiles in asked:
-        for each in whole.answer(MarksRequest(authors=[author], tiles=tiles)):
-            assert partial.merge(each) is not None, "only what differs is fetched"
-    assert partial.compare(whole.digest()) == []
-    assert fingerprint(partial.digest()) == fingerprint(whole.digest())
-    # Sets that differ under one number are damage, which digests do not show.
-    if len({(s.author, s.tile, s.epoch, s.seq) for s in sets}) == len(sets):
-        assert composite.same(partial_composite)
-
-
 def test_merge_returns_the_cells_that_changed_and_nothing_for_what_is_known() -> None:
     replica, composite = replica_of([])
     first = set_of("a", 4, 1, {0: (LETHAL, 0, 10), 33: (PACE, 2.0, 10)})
-    assert replica.merge(first).tolist() == [32 * 70 + 32, 33 * 70 + 33]  # type: ignore[union-attr]
-    assert replica.merge(first) is None
-    assert replica.merge(set_of("a", 4, 0, {1: (LETHAL, 0, 9)})) is None
+    assert merge_one(replica, first) == [32 * 70 + 32, 33 * 70 + 33]
+    assert merge_one(replica, first) is None
+    assert merge_one(replica, set_of("a", 4, 0, {1: (LETHAL, 0, 9)})) is None
     grown = set_of("a", 4, 2, {0: (LETHAL, 0, 10), 33: (PACE, 2.0, 10), 34: (LETHAL, 0, 11)})
-    assert replica.merge(grown).tolist() == [33 * 70 + 34]  # type: ignore[union-attr]
+    assert merge_one(replica, grown) == [33 * 70 + 34]
     losing = set_of("b", 4, 1, {34: (PACE, 1.0, 1)})
-    assert replica.merge(losing).tolist() == []  # type: ignore[union-attr]
+    assert merge_one(replica, losing) == []
     assert replica.counts["marks_merged"] == 3
     assert composite.kinds[33 * 70 + 34] == LETHAL
 
 
 def test_a_set_off_the_grid_is_refused() -> None:
     replica, _ = replica_of([])
-    assert replica.merge(set_of("a", 6, 0, {})) is None
+    assert merge_one(replica, set_of("a", 6, 0, {})) is None
     assert replica.counts["sets_refused"] == 1
-    assert replica.digest() == {}
+    assert replica.held.ledger.held() == {}
 
 
 def test_the_newest_stamp_is_that_of_marks_that_changed_the_map_since_last_asked() -> None:
     replica, _ = replica_of([set_of("a", 0, 1, {1: (LETHAL, 0, 70)})])
-    replica.merge(set_of("b", 1, 1, {1: (LETHAL, 0, 60)}))
-    replica.merge(set_of("c", 0, 1, {1: (LETHAL, 0, 75)}))  # says what stands already
-    replica.merge(set_of("d", 0, 1, {2: (LETHAL, 0, 99)}), measured=False)
+    replica.merge([set_of("b", 1, 1, {1: (LETHAL, 0, 60)})])
+    replica.merge([set_of("c", 0, 1, {1: (LETHAL, 0, 75)})])  # says what stands already
+    replica.merge([set_of("d", 0, 1, {2: (LETHAL, 0, 99)})], measured=False)
     assert replica.take_newest_stamp_ns() == 70
     assert replica.take_newest_stamp_ns() is None
 
@@ -150,7 +91,7 @@ def test_of_a_cell_named_twice_the_last_statement_counts() -> None:
 
 def test_clear_undoes_an_older_lethal_of_somebody_whose_clock_is_ahead() -> None:
     replica, composite = writer()
-    replica.merge(set_of("zz", 0, 0, {5: (LETHAL, 0, NOW + 3600 * NS_PER_S)}))
+    replica.merge([set_of("zz", 0, 0, {5: (LETHAL, 0, NOW + 3600 * NS_PER_S)})])
     replica.write([5], [CLEAR], [0], NOW)
     assert composite.kinds[5] == CLEAR
     assert replica.winners(0).stamps_ns.tolist() == [NOW + 3600 * NS_PER_S + 1]
@@ -158,7 +99,7 @@ def test_clear_undoes_an_older_lethal_of_somebody_whose_clock_is_ahead() -> None
 
 def test_a_mark_taken_back_leaves_what_others_say() -> None:
     replica, composite = writer()
-    replica.merge(set_of("other", 0, 0, {5: (PACE, 4.0, 1)}))
+    replica.merge([set_of("other", 0, 0, {5: (PACE, 4.0, 1)})])
     replica.write([5, 6], [LETHAL, LETHAL], [0, 0], NOW)
     [action] = replica.retract([5], NOW + NS_PER_S)
     assert np.frombuffer(action.mark_set.cells, "<u2").tolist() == [6]
@@ -171,7 +112,7 @@ def test_a_mark_taken_back_leaves_what_others_say() -> None:
 def test_an_author_taken_for_dead_says_what_it_says_again_under_a_higher_epoch() -> None:
     replica, composite = writer()
     replica.write([5], [LETHAL], [0], NOW)
-    assert replica.merge(set_of("a1.1", 0, 70, {}, epoch=4)) is None
+    assert merge_one(replica, set_of("a1.1", 0, 70, {}, epoch=4)) is None
     [action] = replica.tick(NOW + NS_PER_S)
     assert action.mark_set == set_of("a1.1", 0, 1, {5: (LETHAL, 0, NOW)}, epoch=5)
     assert composite.kinds[5] == LETHAL
@@ -180,7 +121,7 @@ def test_an_author_taken_for_dead_says_what_it_says_again_under_a_higher_epoch()
 def test_a_number_that_nothing_could_follow_does_not_silence_an_author() -> None:
     replica, composite = writer()
     replica.write([5], [LETHAL], [0], NOW)
-    assert replica.merge(set_of("a1.1", 0, 0, {}, epoch=(1 << 62) - 1)) is None
+    assert merge_one(replica, set_of("a1.1", 0, 0, {}, epoch=(1 << 62) - 1)) is None
     assert composite.kinds[5] == LETHAL
     assert len(replica.write([6], [LETHAL], [0], NOW + NS_PER_S)) == 1
 
@@ -196,9 +137,9 @@ def test_a_cell_outside_the_grid_and_a_writer_without_a_name_are_bugs() -> None:
 def test_a_request_is_narrowed_by_authors_tiles_and_the_asked_key() -> None:
     sets = [set_of(author, tile, 1, {0: (LETHAL, 0, 1)}) for tile in (0, 3) for author in ("a", "b", "c")]
     replica, _ = replica_of(sets)
-    assert replica.answer(MarksRequest()) == sets
-    assert replica.answer(MarksRequest(authors=["c", "a"], tiles=[3, 5, 3])) == [sets[3], sets[5]]
-    assert replica.answer(MarksRequest(), author="b") == [sets[1], sets[4]]
+    assert replica.held.answer(MarksRequest()) == sets
+    assert replica.held.answer(MarksRequest(authors=["c", "a"], tiles=[3, 5, 3])) == [sets[3], sets[5]]
+    assert replica.held.answer(MarksRequest(), author="b") == [sets[1], sets[4]]
 
 
 # --- marks that end by themselves ---------------------------------------------------------------------------
@@ -226,7 +167,7 @@ def test_a_mark_ends_by_itself_and_what_it_had_overruled_stands_again() -> None:
 def test_a_mark_that_had_ended_before_it_came_changes_nothing() -> None:
     replica, composite = replica_of([])
     replica.tick(60)
-    assert replica.merge(ending("a", 5, 20, 50)).tolist() == []  # type: ignore[union-attr]
+    assert merge_one(replica, ending("a", 5, 20, 50)) == []
     assert composite.kinds[5] == CLEAR
 
 
@@ -245,7 +186,7 @@ def test_when_all_that_ends_has_ended_the_order_of_marks_and_ticks_does_not_show
         replica, composite = replica_of([])
         now_ns = 0
         for each in data.draw(st.permutations(sets)):
-            replica.merge(each)
+            replica.merge([each])
             now_ns = data.draw(st.integers(now_ns, 12))
             replica.tick(now_ns)
         replica.tick(12)

@@ -9,14 +9,14 @@ from support.simulated_swarm import SMALL, Laws
 
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.keeper.store import KeeperStore
-from shared_map.replication.filter import Reading
+from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings, pose_of
 from swarm.bus.bus import Heard
 from swarm.grid import GridSpec
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.topics import POSE, SIGHTED
 from vehicle_agent.driving.vehicle import Vehicle
-from vehicle_agent.sensing.target_detector import Lookout
+from vehicle_agent.sensing.target_detector import TargetDetector
 
 GRID = GridSpec(40, 40, 10.0, west_m=1000.0, north_m=5000.0)
 
@@ -47,7 +47,7 @@ def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighte
     told = list({(each.target, each.author, each.stamp_ns, each.seq): each for each in told}.values())
     again = [*told, *told]
     chance.shuffle(again)  # type: ignore[attr-defined]
-    one, other = Sightings(Reading(GRID)), Sightings(Reading(GRID))
+    one, other = Sightings(MarkFilter(GRID)), Sightings(MarkFilter(GRID))
     for each in told:
         one.hear(each)
     for each in again:
@@ -59,7 +59,7 @@ def test_what_is_known_depends_on_neither_order_nor_repetition(told: list[Sighte
 
 
 def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
-    seen = Sightings(Reading(GRID))
+    seen = Sightings(MarkFilter(GRID))
     seen.hear(sighted(5, author="red.a0.1", cell=1, until_ns=10))
     seen.hear(sighted(4, author="blue.a1.1", cell=2, until_ns=20))
     assert seen.best(9)["t"].cell == 1
@@ -68,22 +68,22 @@ def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
 
 
 def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
-    seen = Sightings(Reading(GRID, frozenset({"red"})))
+    seen = Sightings(MarkFilter(GRID, frozenset({"red"})))
     assert not seen.hear(sighted(5, author="blue.a1.1"))
     assert seen.hear(sighted(4, author="red.a0.1"))
     assert pose_of(seen.best(9)["t"]).seq == 4
 
 
 def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
-    lookout = Lookout(GRID, "red.a0.1", "red", range_m=100.0, lasts_s=2.0)
+    detector = TargetDetector(GRID, "red.a0.1", "red", range_m=100.0, lasts_s=2.0)
     x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
-    lookout.truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m))
+    detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m))
     far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
-    assert lookout.look([far], 0) == []
-    (told,) = lookout.look([far, near], 0)
+    assert detector.look([far], 0) == []
+    (told,) = detector.look([far, near], 0)
     assert (told.cell, told.until_ns, told.uncertainty_m) == (410, 2_000_000_000, 5.0 + 0.02 * 50.0)
-    assert lookout.look([near], 400_000_000) == []  # not so often
-    assert len(lookout.look([near], 500_000_000)) == 1
+    assert detector.look([near], 400_000_000) == []  # not so often
+    assert len(detector.look([near], 500_000_000)) == 1
 
 
 def test_the_store_keeps_where_each_target_was_seen_last() -> None:

@@ -1,3 +1,5 @@
+"""Sync: marks reach everybody once links are back, whatever was lost, and hostile digests cost little."""
+
 from __future__ import annotations
 
 import socket
@@ -9,13 +11,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_strategies import Composite, FeedService, LossyLinks, MapSwarm, set_of
+from support.map_strategies import Acknowledged, Composite, set_of
+from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.mark_sets import packed
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.sync import MapFeed
+from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Asked, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
@@ -24,7 +27,6 @@ from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
 from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarksRequest
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import DIGEST, MARKS, NOTE
@@ -32,16 +34,16 @@ from swarm.wire.topics import DIGEST, MARKS, NOTE
 LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
 
 
-def write(service: FeedService, swarm: MapSwarm, cells: list[int], kind: MarkKind = LETHAL) -> None:
-    service.feed.publish(service.replica.write(cells, kind, 0.0, swarm.now_ns))
+def write(service: SyncService, swarm: SwarmModel, cells: list[int], kind: MarkKind = LETHAL) -> None:
+    service.sync.publish(service.replica.write(cells, kind, 0.0, swarm.now_ns))
 
 
-def all_equal(services: Sequence[FeedService | KeeperService]) -> bool:
-    return len({service.replica.fingerprint() for service in services}) == 1
+def all_equal(services: Sequence[SyncService | KeeperService]) -> bool:
+    return len({service.replica.held.fingerprint() for service in services}) == 1
 
 
 def test_a_mark_reaches_every_replica_at_once() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     author, listener = swarm.writer("a1.1"), swarm.listener("p")
     write(author, swarm, [5])
     swarm.run(0.01)
@@ -49,7 +51,7 @@ def test_a_mark_reaches_every_replica_at_once() -> None:
 
 
 def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     swarm.keeper("keeper", KeeperStore(":memory:"))
     dead, alive = swarm.writer("a1.1"), swarm.writer("a2.1")
     write(dead, swarm, [5, 900])
@@ -58,14 +60,14 @@ def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -
     swarm.kill("a1.1")
     late = swarm.listener("late")
     swarm.run(0.05)
-    assert late.feed.joined
+    assert late.sync.joined
     assert all_equal([late, dead, alive])
     assert late.replica.take_newest_stamp_ns() is None  # old news say nothing about latency
 
 
 def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> None:
     links = LossyLinks(1)
-    swarm = MapSwarm(links)
+    swarm = SwarmModel(links)
     author, listener = swarm.writer("a1.1"), swarm.listener("p")
     write(author, swarm, [5])
     swarm.run(0.5)
@@ -82,7 +84,7 @@ def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> No
 
 def test_when_a_partition_heals_all_replicas_are_equal_within_two_seconds() -> None:
     links = LossyLinks(2)
-    swarm = MapSwarm(links)
+    swarm = SwarmModel(links)
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     near, far, listener = swarm.writer("a1.1"), swarm.writer("a2.1"), swarm.listener("p")
     swarm.run(1)
@@ -95,12 +97,12 @@ def test_when_a_partition_heals_all_replicas_are_equal_within_two_seconds() -> N
     links.far_side = set()
     swarm.run(2)
     assert all_equal([near, far, listener])
-    assert keeper.replica.fingerprint() == near.replica.fingerprint()
+    assert keeper.replica.held.fingerprint() == near.replica.held.fingerprint()
 
 
 def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it() -> None:
     links = LossyLinks(3)
-    swarm = MapSwarm(links)
+    swarm = SwarmModel(links)
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     author, listener = swarm.writer("a1.1"), swarm.listener("p")
     swarm.run(1)
@@ -110,22 +112,26 @@ def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it()
     swarm.kill("a1.1")
     links.far_side = set()
     swarm.run(6)
-    assert keeper.replica.fingerprint() == listener.replica.fingerprint() == author.replica.fingerprint()
+    assert (
+        keeper.replica.held.fingerprint()
+        == listener.replica.held.fingerprint()
+        == author.replica.held.fingerprint()
+    )
 
 
 def test_nobody_speaks_under_anothers_key() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     listener = swarm.listener("p")
     liar = swarm.network.bus("liar")
     liar.publish(MARKS, set_of("a1.1", 0, 1, {5: (LETHAL, 0, 1)}), region=0, tile=0, author="liar")
     liar.publish(MARKS, set_of("liar", 1, 1, {5: (LETHAL, 0, 1)}), region=0, tile=0, author="liar")
     swarm.run(0.1)
-    assert listener.replica.tiles == []
+    assert listener.replica.held.tiles == []
     assert listener.replica.counts["sets_refused"] == 2
 
 
 def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     liar = swarm.network.bus("liar")
     [lies] = packed([set_of("a1.1", tile, 9, {5: (LETHAL, 0, 1)}) for tile in range(3)])
     [truth] = packed([set_of("liar", 1, 1, {6: (LETHAL, 0, 1)})])
@@ -139,12 +145,12 @@ def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
     liar.serve(MARKS, answer, author="liar")
     late = swarm.listener("late")
     swarm.run(0.1)
-    assert [(each.author, each.tile) for each in late.replica.answer(MarksRequest())] == [("liar", 1)]
+    assert [(each.author, each.tile) for each in late.replica.held.answer(MarksRequest())] == [("liar", 1)]
     assert late.replica.counts["sets_refused"] == 1
 
 
 def test_digests_without_end_are_held_within_bounds() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     listener = swarm.listener("p")
     hostile = swarm.network.bus("hostile")
     rows = np.array([(tile, 1, 1) for tile in range(6)], DIGEST_ROW).tobytes()
@@ -152,14 +158,15 @@ def test_digests_without_end_are_held_within_bounds() -> None:
         digest = Digest(author=f"x{n}", role="agent", held={f"x{n}": rows})
         hostile.publish(DIGEST, digest, author=f"x{n}")
     swarm.run(0.01)
-    assert len(listener.feed._claims) <= 4096
-    assert listener.feed._claim_bytes == sum(claim.size for claim in listener.feed._claims.values())
+    digests = listener.sync._digests
+    assert len(digests._pending) <= 4096
+    assert digests._bytes == sum(pending.size for pending in digests._pending.values())
     swarm.run(10)
-    assert listener.feed._claim_bytes == 0
+    assert digests._bytes == 0
 
 
 def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     keeper_says = swarm.network.bus("k")
     listener = swarm.listener("p")
     kept = {seq: np.array([(3, 1, seq)], DIGEST_ROW).tobytes() for seq in (1, 2, 3)}
@@ -167,19 +174,20 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
         digest = Digest(author="k.1", role="keeper", held={"a1.1": kept[seq]}, seq=seq)
         keeper_says.publish(DIGEST, digest, author="k.1")
         swarm.run(0.01)
-    [claim] = listener.feed._claims.values()
-    assert claim.digest.held == listener.feed._kept == {"a1.1": kept[2]}
+    [pending] = listener.sync._digests._pending.values()
+    assert pending.digest.held == {"a1.1": kept[2]}
     uncounted = Digest(author="k.1", role="keeper", held={"a1.1": kept[3]})
     keeper_says.publish(DIGEST, uncounted, author="k.1")
     swarm.run(0.01)
-    assert listener.feed._kept == {"a1.1": kept[3]}
+    [pending] = listener.sync._digests._pending.values()
+    assert pending.digest.held == {"a1.1": kept[3]}
 
 
 def test_events_of_others_are_left_to_others() -> None:
-    swarm = MapSwarm()
+    swarm = SwarmModel()
     listener = swarm.listener("p")
     note = set_of("a", 0, 1, {})
-    assert not listener.feed.handle(Heard(NOTE, {}, note), 0)
+    assert not listener.sync.handle(Heard(NOTE, {}, note), 0)
 
 
 @settings(max_examples=25, deadline=None)
@@ -194,7 +202,7 @@ def test_events_of_others_are_left_to_others() -> None:
 def test_with_30_percent_dropped_10_percent_doubled_and_500_ms_jitter_replicas_agree_after_quiet(
     seed: int, writes: list[tuple[int, int, MarkKind, float]]
 ) -> None:
-    swarm = MapSwarm(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
+    swarm = SwarmModel(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
     store = KeeperStore(":memory:")
     keeper = swarm.keeper("keeper", store)
     authors = [swarm.writer(f"a{n}.1") for n in range(3)]
@@ -203,7 +211,7 @@ def test_with_30_percent_dropped_10_percent_doubled_and_500_ms_jitter_replicas_a
         write(authors[author], swarm, [cell], kind)
         swarm.run(pause_s)
     waited_s = 0.0
-    everybody: list[FeedService | KeeperService] = [*authors, listener, keeper]
+    everybody: list[SyncService | KeeperService] = [*authors, listener, keeper]
     while not all_equal(everybody) and waited_s < 30:
         swarm.run(0.5)
         waited_s += 0.5
@@ -211,21 +219,10 @@ def test_with_30_percent_dropped_10_percent_doubled_and_500_ms_jitter_replicas_a
     swarm.run(0.2)
     sinks = [service.replica._cost_map for service in [*authors, listener]]
     assert all(isinstance(sink, Composite) and sink.same(sinks[0]) for sink in sinks)  # type: ignore[arg-type]
-    assert len(list(store.load())) == sum(len(keeper.replica.sets(t)) for t in keeper.replica.tiles)
+    assert len(list(store.load())) == sum(len(keeper.replica.held.of_tile(t)) for t in keeper.replica.held.tiles)
 
 
 # --- on real zenoh ------------------------------------------------------------------------------------------
-
-
-class Ticking(FeedService):
-    """A feed as a whole service, so that a real `Process` can run it."""
-
-    def __init__(self, feed: MapFeed) -> None:
-        super().__init__(feed)
-        self.counters = Counters()
-
-    def stop(self, now_ns: int) -> None:
-        pass
 
 
 class Running:
@@ -237,10 +234,10 @@ class Running:
         self.scenario = Scenario(network=network)
         self._undo: list[Callable[[], None]] = []
 
-    def feed(self, author: str | None) -> Ticking:
+    def sync(self, author: str | None) -> SyncService:
         bus, inbox = open_bus(self.network), Inbox()
         replica = MapReplica(self.terrain.grid, Composite(self.terrain.grid), author=author)
-        service = Ticking(MapFeed(replica, bus, inbox.post, MapConfig(), "agent"))
+        service = SyncService(MapSync(replica, bus, inbox.post, MapConfig(), "agent"))
         self._run(service, bus, inbox)
         return service
 
@@ -251,7 +248,12 @@ class Running:
         self._run(service, bus, inbox)
         return service
 
-    def _run(self, service: Ticking | KeeperService, bus: ZenohBus, inbox: Inbox) -> None:
+    def acknowledged(self) -> Acknowledged:
+        bus = open_bus(self.network)
+        self._undo.append(bus.close)
+        return Acknowledged(bus)
+
+    def _run(self, service: SyncService | KeeperService, bus: ZenohBus, inbox: Inbox) -> None:
         process = Process(service, inbox, MonotonicClock(), 10.0)
         thread = threading.Thread(target=process.run)
         thread.start()
@@ -296,13 +298,14 @@ def eventually(condition: Callable[[], bool], within_s: float = 10.0) -> None:
 def test_on_real_zenoh_marks_are_heard_kept_and_handed_to_who_comes_late(running: Running) -> None:
     store = KeeperStore(":memory:")
     running.keeper(store)
-    listener = running.feed(None)
-    author = running.feed("a1.1")
-    author.feed.publish(author.replica.write([5, 3000], LETHAL, 0.0, time.time_ns()))
-    eventually(lambda: listener.replica.fingerprint() == author.replica.fingerprint())
-    eventually(lambda: author.feed.unacknowledged == 0)
+    listener = running.sync(None)
+    acknowledged = running.acknowledged()
+    author = running.sync("a1.1")
+    author.sync.publish(author.replica.write([5, 3000], LETHAL, 0.0, time.time_ns()))
+    eventually(lambda: listener.replica.held.fingerprint() == author.replica.held.fingerprint())
+    eventually(lambda: acknowledged.not_yet(author) == 0)
     running.stop_last()  # the author ends; the keeper answers for it
-    late = running.feed(None)
-    eventually(lambda: late.replica.fingerprint() == author.replica.fingerprint(), within_s=2)
-    assert late.feed.joined
+    late = running.sync(None)
+    eventually(lambda: late.replica.held.fingerprint() == author.replica.held.fingerprint(), within_s=2)
+    assert late.sync.joined
     assert len(list(store.load())) == 2

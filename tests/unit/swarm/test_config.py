@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from swarm.config.describe import meanings
 from swarm.config.load import load_scenario, parse_scenario
-from swarm.config.scenario import Scenario, plan_agents
+from swarm.config.scenario import Scenario, Section, plan_agents
 from swarm.errors import ConfigError
 
 
@@ -129,3 +130,26 @@ def test_a_scenario_comes_through_a_file_unchanged():
     assert scenario.targets[0].start == (3, 4)
     assert scenario.targets[0].speed_m_per_s == 2.0
     assert scenario.target_ids == ["x0", "x1"]
+
+
+@pytest.mark.parametrize("section", Section.__subclasses__(), ids=lambda section: section.__name__)
+def test_every_setting_has_its_row_and_every_row_its_setting(section):
+    assert list(meanings(section)) == list(section.__struct_fields__)
+    assert all(meaning.strip() for meaning in meanings(section).values())
+
+
+def test_a_row_goes_on_in_the_lines_below_it_and_ends_before_the_next_sentence():
+    class Tank(Section, frozen=True):
+        """A tank.
+
+        size_l  how much it holds,
+                in litres
+        full    whether it is
+
+        A sentence with  two blanks.
+        """
+
+        size_l: float = 1.0
+        full: bool = False
+
+    assert meanings(Tank) == {"size_l": "how much it holds, in litres", "full": "whether it is"}

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from support.memory_world import MemoryWorld
+from support.swarm_model import SwarmModel
 
 from swarm.bus.bus import Event, Heard, LinkChanged
 from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
-from swarm.runtime.membership import Member, check_same_run
+from swarm.runtime.membership import NO_RUN, Member, check_same_run
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import NOTE, STATS
+from swarm.wire.topics import NOTE, RUN, STATS
 
 INFO = RunInfo(
     run_id="r1", role="planner", id="t0", incarnation=7, scenario="demo", terrain="aaaa", rows=4, cols=5,
@@ -22,7 +22,7 @@ INFO = RunInfo(
 class Node:
     """A process that is nothing but a member."""
 
-    def __init__(self, world: MemoryWorld, **changes: object) -> None:
+    def __init__(self, world: SwarmModel, **changes: object) -> None:
         self.info = msgspec.structs.replace(INFO, **changes)
         self.bus = world.bus(self.info.id)
         self.member = Member(self.info, self.bus, self.post)
@@ -38,7 +38,7 @@ class Node:
 
 
 def test_members_of_one_run_get_along():
-    world = MemoryWorld()
+    world = SwarmModel()
     nodes = [Node(world, id=id) for id in ("t0", "t1", "t2")]
     for node in nodes:
         node.member.join()
@@ -61,7 +61,7 @@ def test_members_of_one_run_get_along():
     ],
 )
 def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(changes, words):
-    world = MemoryWorld()
+    world = SwarmModel()
     first, stranger = Node(world), Node(world, id="t1", **changes)
     first.member.join()
     world.settle()
@@ -73,7 +73,7 @@ def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(chan
 
 
 def test_of_two_that_start_at_once_at_least_one_notices():
-    world = MemoryWorld()
+    world = SwarmModel()
     one, other = Node(world), Node(world, id="t1", run_id="r2")
     one.member.join()
     other.member.join()
@@ -82,7 +82,7 @@ def test_of_two_that_start_at_once_at_least_one_notices():
 
 
 def test_who_meets_only_after_a_cut_heals_is_checked_then():
-    world = MemoryWorld()
+    world = SwarmModel()
     one, other = Node(world), Node(world, id="t1", run_id="r2")
     world.cut(other.bus)
     one.member.join()
@@ -97,7 +97,7 @@ def test_who_meets_only_after_a_cut_heals_is_checked_then():
 
 
 def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_to_be_up():
-    world = MemoryWorld()
+    world = SwarmModel()
     node = Node(world)
     node.member.join()
     world.settle()
@@ -109,16 +109,16 @@ def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_t
 
 
 def test_counters_are_told_once_a_second_and_at_the_end():
-    world, heard = MemoryWorld(), []
+    world, heard = SwarmModel(), []
     node = Node(world)
     world.bus("watcher").subscribe(STATS, heard.append)
     node.member.join()
     node.member.counters.count("marks", 3)
     node.member.counters.observe("tick_ms", 2.0)
     for _ in range(25):
-        node.member.tick(world.scheduler.clock.now_ns())
-        world.run_ms(100)
-    node.member.publish_stats(world.scheduler.clock.now_ns())
+        node.member.tick(world.now_ns)
+        world.run(0.1)
+    node.member.publish_stats(world.now_ns)
     world.settle()
     assert len(heard) == 4
     last = heard[-1].message
@@ -129,7 +129,7 @@ def test_counters_are_told_once_a_second_and_at_the_end():
 
 
 def test_a_note_reaches_whoever_watches():
-    world, heard = MemoryWorld(), []
+    world, heard = SwarmModel(), []
     node = Node(world)
     world.bus("watcher").subscribe(NOTE, heard.append)
     node.member.note(5, "closure", "road closed", cell=9)
@@ -140,3 +140,48 @@ def test_a_note_reaches_whoever_watches():
 
 def test_the_same_run_from_anywhere_is_the_same_run():
     check_same_run(INFO, msgspec.structs.replace(INFO, role="agent", id="a0", incarnation=9, started_ns=5))
+
+
+def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_stranger_is_named_once():
+    world, notes = SwarmModel(), []
+    world.bus("watcher").subscribe(NOTE, notes.append)
+    nodes = [Node(world, id=id) for id in ("t0", "t1")]
+    for node in nodes:
+        node.member.join()
+        world.settle()
+    liar = Node(world, role="agent", id="zz", run_id="another", terrain="bbbb")
+    liar.bus.serve(RUN, liar.post, role="agent", id="zz")
+    for turn in range(3):
+        world.bus("r").declare_alive(Peer("router", "0", turn + 1))  # everybody asks anew
+        world.settle()
+        for node in nodes:
+            node.member.tick(world.scheduler.clock.now_ns())
+    world.settle()
+    assert [node.failure for node in nodes] == [None, None]
+    assert [node.member.counters.counts["strangers"] for node in nodes] == [1, 1]
+    assert sorted(event.message.id for event in notes) == ["t0", "t1"]
+    assert "belongs to run r1, but agent zz" in notes[0].message.text
+
+
+def test_a_process_that_starts_beside_a_stranger_joins_those_who_agree():
+    world = SwarmModel()
+    first, liar = Node(world), Node(world, role="agent", id="zz", run_id="another")
+    first.member.join()
+    world.settle()
+    liar.bus.serve(RUN, liar.post, role="agent", id="zz")
+    late = Node(world, id="t1")
+    late.member.join()
+    world.settle()
+    assert late.failure is None
+
+
+def test_a_router_belongs_to_no_run_and_ends_nobody():
+    world = SwarmModel()
+    router = Node(world, role="router", id="0", run_id=NO_RUN, terrain="", rows=0)
+    router.member.join()
+    world.settle()
+    runs = [Node(world, id="t0"), Node(world, id="t1")]
+    for node in runs:
+        node.member.join()
+        world.settle()
+    assert [node.failure for node in (router, *runs)] == [None] * 3

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from swarm.bus.bus import Event, Heard, HeardMany, LinkChanged, WorkDone
@@ -185,6 +186,24 @@ def test_events_are_handled_between_ticks_and_ticks_come_though_the_inbox_is_ful
     process.run()
     assert [tick // 10**6 for tick in service.ticks] == [0, 100, 200, 300, 400]
     assert len(service.log) == 52
+
+
+def test_ticks_that_take_longer_than_their_period_leave_events_as_much_time_as_they_take():
+    clock, inbox = ManualClock(), Inbox()
+    handled_before_tick: list[int] = []
+
+    def on_tick(ticks):
+        handled_before_tick.append(sum(isinstance(each, Heard) for each in service.log))
+        clock.advance_to(clock.now_ns() + 150_000_000)  # one and a half periods
+        if len(ticks) == 5:
+            process.stop()
+
+    service = Recording(on_tick, lambda event: clock.advance_to(clock.now_ns() + 1_000_000))
+    process = Process(service, inbox, clock, 10.0)
+    for n in range(1000):
+        inbox.post(note(str(n)))
+    process.run()
+    assert np.diff(handled_before_tick).tolist() == [150] * 4
 
 
 def test_a_service_that_raises_is_stopped_and_the_error_goes_on():

@@ -16,15 +16,15 @@ from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Claims, VehicleState
+from swarm.wire.messages.vehicles import Reservations, VehicleState
 from swarm.wire.routes import RouteBatch
-from vehicle_agent.agent import Agent, AskCosts, AskRoutes, LocalMap
-from vehicle_agent.assignment import UNSETTLED, Choice, choose
+from vehicle_agent.agent import Agent, AskRoutes, LocalMap
+from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.fleet import FleetReport
-from vehicle_agent.placement import nearest_free, spawn_cells
+from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.traffic.resumption import Resumption
+from vehicle_agent.traffic.resumption import Resumption, nearest_free
 
 GRID = GridSpec(12, 12, 10.0)
 LEVEL = np.full((12, 12), 0.1, np.float32)
@@ -48,10 +48,14 @@ def agent_of(scenario: Scenario, index: int = 0) -> Agent:
     return Agent(plan_agents(scenario)[index], scenario, ground, TruthSensor(GRID, LEVEL, 20.0), spawns, 1)
 
 
+def resumption_of(scenario: Scenario) -> Resumption:
+    return Resumption("a0", spawn_cells(scenario, GRID, LEVEL, LEVEL), GRID.cells)
+
+
 @pytest.fixture
 def agent() -> Agent:
     agent = agent_of(parse_scenario(TEXT))
-    agent.placed_by(Resumption("a0"))
+    agent.place(resumption_of(parse_scenario(TEXT)).placement({}))
     agent.set_planners({"t0": 1, "t1": 1}, 0)
     return agent
 
@@ -138,25 +142,25 @@ def test_a_target_outside_the_terrain_is_not_believed(agent: Agent) -> None:
 def test_vehicles_go_on_where_they_last_stood_and_not_where_somebody_else_is() -> None:
     scenario = parse_scenario(TEXT)
     agent = agent_of(scenario)
-    known = Resumption("a0")
-    last = Claims(
+    known = resumption_of(scenario)
+    last = Reservations(
         agent="a0",
         incarnation=0,
         seq=9,
         clock=3,
-        holds={"a0-00": [17, 18], "a0-01": [40]},
-        wants=[],
+        held={"a0-00": [17, 18], "a0-01": [40]},
+        requested=[],
         seen={},
     )
-    other = Claims(agent="a1", incarnation=1, seq=4, clock=8, holds={"a1-00": [40]}, wants=[], seen={})
-    for claims in (last, other):
-        known.answered(claims)
-    agent.placed_by(known)
+    other = Reservations(agent="a1", incarnation=1, seq=4, clock=8, held={"a1-00": [40]}, requested=[], seen={})
+    for reservations in (last, other):
+        known.answered(reservations)
+    agent.place(known.placement({"a1": 1}))
     assert {id: vehicle.cell for id, vehicle in agent.vehicles.items()} == {"a0-00": 17}
     # The other one asks for a free cell nearby, and stands there once it is granted.
     agent.rights.set_alive({})
     agent.decide(0)
-    agent.rights.speak()
+    agent.rights.next_message()
     agent.rights.grant()
     agent.decide(S)
     assert GRID.distance_cells(agent.vehicles["a0-01"].cell, 40) == 1
@@ -170,28 +174,28 @@ TARGETS = ["t0", "t1", "t2"]
 
 def test_the_cheapest_of_the_allowed_targets_is_chosen() -> None:
     costs = {"t0": 9.0, "t1": 5.0, "t2": 1.0}
-    assert choose(costs, ["t0", "t1"], ALIVE, None, 0.15, True) == Choice("t1")
+    assert choose(costs, ["t0", "t1"], ALIVE, None, True) == Choice("t1")
 
 
 @pytest.mark.parametrize(("other_s", "chosen"), [(8.6, "t0"), (8.4, "t1")])
 def test_another_target_must_be_worth_the_change(other_s: float, chosen: str) -> None:
-    assert choose({"t0": 10.0, "t1": other_s}, TARGETS, {"t0": 1}, "t0", 0.15, True) == Choice(chosen)
+    assert choose({"t0": 10.0, "t1": other_s}, TARGETS, {"t0": 1}, "t0", True) == Choice(chosen)
 
 
 def test_a_target_that_cannot_be_reached_any_more_is_left_for_any_other() -> None:
-    assert choose({"t0": math.inf, "t1": 1e6}, TARGETS, ALIVE, "t0", 0.15, True) == Choice("t1")
+    assert choose({"t0": math.inf, "t1": 1e6}, TARGETS, ALIVE, "t0", True) == Choice("t1")
 
 
 def test_a_silent_planner_keeps_its_vehicles_until_they_give_it_up() -> None:
-    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", 0.15, True) == Choice("t0")
-    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", 0.15, False) == Choice("t1")
+    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", True) == Choice("t0")
+    assert choose({"t1": 1.0}, TARGETS, {"t1": 1}, "t0", False) == Choice("t1")
 
 
 def test_no_way_is_certain_only_when_all_live_planners_have_said_so() -> None:
     walled_in = {"t0": math.inf, "t1": math.inf}
-    assert choose(walled_in, TARGETS, ALIVE, None, 0.15, True) == UNSETTLED
-    assert choose(walled_in, TARGETS, {"t0": 1, "t1": 1}, None, 0.15, True) == Choice(None)
-    assert choose({}, TARGETS, {}, None, 0.15, True) == UNSETTLED
+    assert choose(walled_in, TARGETS, ALIVE, None, True) == UNSETTLED
+    assert choose(walled_in, TARGETS, {"t0": 1, "t1": 1}, None, True) == Choice(None)
+    assert choose({}, TARGETS, {}, None, True) == UNSETTLED
 
 
 # --- where they start ---------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import random
 import numpy as np
 import pytest
 from support.agent_world import AgentWorld, pace_of
+from support.swarm_model import LossyLinks
 
 from swarm.errors import ConfigError
 from swarm.wire.messages.vehicles import VehicleState
@@ -55,25 +56,6 @@ def test_four_agents_share_the_ground_without_meeting() -> None:
     world.start_all()
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
     world.assert_lawful()
-
-
-class Lossy:
-    """Loses, repeats, delays and so reorders; seeded."""
-
-    def __init__(self, seed: int, loss: float = 0.1) -> None:
-        self._chance = random.Random(seed)
-        self._loss = loss
-
-    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> list[int]:
-        copies = 1 + (self._chance.random() < 0.1)
-        return [
-            int(self._chance.uniform(0.2, 150.0) * 1e6)
-            for _ in range(copies)
-            if self._chance.random() >= self._loss
-        ]
-
-    def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        return True
 
 
 # --- driving ------------------------------------------------------------------------------------------------
@@ -137,7 +119,7 @@ def test_a_vehicle_goes_on_when_its_target_jumps() -> None:
     world.start_all()
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
     world.put_target("t", 2, 17, jumped=True)
-    world.run_s(1.0)
+    world.run(1.0)
     assert world.all_in(VehicleState.FOLLOWING)
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
     row, col = world.where()["a0-00"]
@@ -158,7 +140,7 @@ def test_nothing_is_ever_forced_until_a_route_has_run_out() -> None:
     world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN))
     world.put_target("t", 10, 12)
     world.start_all()
-    world.run_s(3.0)
+    world.run(3.0)
     planner = world.planners["t"]
     assert [request.force for request in planner.requests] == [False]
     assert planner.requests[0].vehicles == ["a0-00"]
@@ -179,12 +161,12 @@ def test_each_vehicle_goes_for_the_cheapest_target_and_changes_only_for_a_better
     world.put_target("t0", 10, 25)
     world.put_target("t1", 10, 0)
     world.start_all()
-    world.run_s(1.0)
+    world.run(1.0)
     vehicle = world.agents["a0"].agent.vehicles["a0-00"]
     assert vehicle.target == "t1"
     world.put_target("t0", 10, 17)
     world.put_target("t1", 19, 4)
-    world.run_s(6.0)
+    world.run(6.0)
     assert vehicle.target == "t1"
     world.put_target("t0", *world.where()["a0-00"])
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
@@ -197,7 +179,7 @@ def test_a_walled_in_vehicle_is_stranded_until_the_wall_is_known_to_be_open() ->
     world.put_target("t", 6, 6)
     world.start_all()
     world.until(lambda: world.all_in(VehicleState.STRANDED), within_s=5)
-    world.run_s(0.2)
+    world.run(0.2)
     assert world.agents["a0"].counters.gauges["stranded"] == 1.0
     world.put_target("t", 1, 8)
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
@@ -210,16 +192,16 @@ def test_a_vehicle_whose_planner_is_gone_keeps_its_route_and_says_so() -> None:
     world = AgentWorld(scenario(1, [(10, 1)]), pace_of(OPEN))
     world.put_target("t", 10, 15)
     world.start_all()
-    world.run_s(3.0)
+    world.run(3.0)
     world.stop_planner("t")
-    world.run_s(0.5)
+    world.run(0.5)
     assert world.all_in(VehicleState.LOST)
     before = world.where()["a0-00"][1]
-    world.run_s(3.0)
+    world.run(3.0)
     assert world.all_in(VehicleState.LOST)
     assert world.where()["a0-00"][1] - before == 3
     world.start_planner("t", incarnation=2)
-    world.run_s(1.0)
+    world.run(1.0)
     assert world.all_in(VehicleState.FOLLOWING)
     assert world.planners["t"].requests[0].vehicles == ["a0-00"]
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=20)
@@ -230,7 +212,7 @@ def test_a_planner_that_does_not_answer_is_asked_again_and_again_but_not_in_a_fr
     world.put_target("t", 10, 5)
     world.start_all()
     world.planners["t"].mute = True
-    world.run_s(5.0)
+    world.run(5.0)
     assert world.all_in(VehicleState.IDLE)
     world.planners["t"].mute = False
     world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=10)
@@ -326,7 +308,7 @@ def maze(seed: int, size: int = 14) -> list[str]:
 def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
     chance = random.Random(seed)
     text = scenario(24, per_agent=6, capture=15.0).replace('name = "t"\n', 'name = "t"\ncount = 3\n')
-    world = AgentWorld(text, pace_of(maze(seed)), links=Lossy(seed, loss=0.05))
+    world = AgentWorld(text, pace_of(maze(seed)), links=LossyLinks(seed, dropped=0.05, repeated=0.1, jitter_ms=150))
     homes = sorted(cell for spawns in spawn_cells_of(world).values() for cell in spawns.values())
     places = [world.terrain.grid.row_col(cell) for cell in homes]
     for target in world.scenario.target_ids:
@@ -335,7 +317,7 @@ def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
     stands_since: dict[str, tuple[tuple[int, int], int]] = {}
     longest_s = captures = 0
     for second in range(100):
-        world.run_s(1.0)
+        world.run(1.0)
         for target in world.scenario.target_ids:
             if any(v.target == target and v.in_reach for v in world.vehicles()):
                 captures += 1
@@ -360,10 +342,10 @@ def test_a_restarted_agent_goes_on_where_its_vehicles_last_stood() -> None:
     world = AgentWorld(scenario(4), pace_of(OPEN))
     world.put_target("t", 10, 10)
     world.start_all()
-    world.run_s(4.0)
+    world.run(4.0)
     before = world.where()
     world.crash_agent("a1")
-    world.run_s(1.5)
+    world.run(1.5)
     world.start_agent("a1")
     world.until(lambda: len(world.agents["a1"].agent.vehicles) == 2, within_s=0.6)
     after = world.where()
@@ -380,7 +362,7 @@ def test_the_first_to_start_does_not_wait_for_anybody() -> None:
     world.start_agent("a0")
     assert world.until(lambda: len(world.agents["a0"].agent.vehicles) == 2, within_s=1) <= 0.5
     # a1 never starts: its places stay free.
-    world.run_s(20)
+    world.run(20)
     world.assert_lawful()
 
 
@@ -388,22 +370,23 @@ def test_the_first_to_start_does_not_wait_for_anybody() -> None:
 def test_crashes_and_bad_links_bring_no_two_vehicles_together(seed: int) -> None:
     chance = random.Random(seed)
     text = scenario(12, per_agent=3, capture=15.0).replace("seed = 3", f"seed = {seed}")
-    world = AgentWorld(text, pace_of(["." * 12] * 12), links=Lossy(seed))
+    links = LossyLinks(10 + seed, dropped=0.1, repeated=0.1, jitter_ms=150)
+    world = AgentWorld(text, pace_of(["." * 12] * 12), links=links)
     world.put_target("t", 6, 6)
     world.start_all()
     moved = 0
     for round in range(12):
         world.put_target("t", chance.randrange(12), chance.randrange(12), jumped=True)
         before = world.where()
-        world.run_s(3.0)
+        world.run(3.0)
         after = world.where()
         moved += sum(after[id] != place for id, place in before.items() if id in after)
         if round % 3 == 1:
             dead = chance.choice(["a1", "a2", "a3"])
             world.crash_agent(dead)
-            world.run_s(chance.uniform(0.0, 2.0))
+            world.run(chance.uniform(0.0, 2.0))
             world.start_agent(dead)
-    world.run_s(5.0)
+    world.run(5.0)
     assert len(world.states()) == 12
     assert moved > 20
     world.assert_lawful()
@@ -413,13 +396,13 @@ def test_an_agent_that_is_cut_off_stays_on_the_cells_that_it_holds() -> None:
     world = AgentWorld(scenario(2, [(10, 2), (0, 0)], per_agent=1), pace_of(OPEN))
     world.put_target("t", 10, 18)
     world.start_all()
-    world.run_s(4.0)
-    world.network.link_changed("agent-a0", False)
-    world.run_s(1.0)
+    world.run(4.0)
+    world.cut(world.buses["agent-a0"])
+    world.run(1.0)
     column = world.where()["a0-00"][1]
-    world.run_s(10.0)
+    world.run(10.0)
     assert world.where()["a0-00"][1] - column <= 3
-    world.network.link_changed("agent-a0", True)
+    world.heal(world.buses["agent-a0"])
     world.until(lambda: world.states()["a0-00"] is VehicleState.ARRIVED, within_s=30)
     world.assert_lawful()
 

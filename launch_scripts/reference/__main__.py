@@ -1,0 +1,47 @@
+"""Writes every generated page of the reference.
+
+python -m launch_scripts.reference            writes them
+python -m launch_scripts.reference --check    exit code 1 if a file is not what the code says
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from launch_scripts.reference import cli_page, scenario_page, wire_page
+
+PAGES: dict[Path, Callable[[], str]] = {
+    wire_page.PATH: wire_page.document,
+    scenario_page.PATH: scenario_page.document,
+    scenario_page.SCHEMA_PATH: scenario_page.schema,
+    cli_page.PATH: cli_page.document,
+}
+
+
+def stale() -> list[Path]:
+    """The files that are not what the code says."""
+    return [
+        path for path, make in PAGES.items() if not path.is_file() or path.read_text(encoding="utf-8") != make()
+    ]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m launch_scripts.reference", description="Write the generated pages of the reference."
+    )
+    parser.add_argument("--check", action="store_true", help="only tell whether the files are current")
+    if parser.parse_args().check:
+        for path in stale():
+            print(f"{path} is not current: run `python -m launch_scripts.reference`", file=sys.stderr)
+        return 1 if stale() else 0
+    for path, make in PAGES.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(make(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

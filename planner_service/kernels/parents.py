@@ -1,0 +1,89 @@
+"""Parents from costs: every cell leads to the neighbour that offers it least.
+
+Where costs are exact such parents are a shortest-path tree. Costs grow strictly along them, backwards, so that they
+cannot form a cycle. Arrays are laid out as `layout` says.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from planner_service.kernels.compile import njit
+from planner_service.kernels.layout import HUGE, INF, NONE, RULE_FOUR, diagonal_length
+
+_ONE = np.uint64(1)
+
+
+@njit
+def _parents_of_four(cell_cost, cost, s, first, last, parent):
+    for i in range(first, last):
+        best = cost[i - s] + cell_cost[i - s]
+        code = np.uint8(0)
+        key = cost[i + _ONE] + cell_cost[i + _ONE]
+        code = np.uint8(2) if key < best else code
+        best = min(best, key)
+        key = cost[i + s] + cell_cost[i + s]
+        code = np.uint8(4) if key < best else code
+        best = min(best, key)
+        key = cost[i - _ONE] + cell_cost[i - _ONE]
+        code = np.uint8(6) if key < best else code
+        best = min(best, key)
+        parent[i] = code if max(cost[i], best) < INF else NONE
+
+
+@njit
+def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
+    """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
+    vectorises."""
+    for i in range(first, last):
+        north = cost[i - s] + cell_cost[i - s]
+        east = cost[i + _ONE] + cell_cost[i + _ONE]
+        south = cost[i + s] + cell_cost[i + s]
+        west = cost[i - _ONE] + cell_cost[i - _ONE]
+        best = north
+        code = np.uint8(0)
+        code = np.uint8(2) if east < best else code
+        best = min(best, east)
+        code = np.uint8(4) if south < best else code
+        best = min(best, south)
+        code = np.uint8(6) if west < best else code
+        best = min(best, west)
+        key = cost[i - s + _ONE] + cell_cost[i - s + _ONE] * step
+        key = key if max(north, east) <= limit else INF
+        code = np.uint8(1) if key < best else code
+        best = min(best, key)
+        key = cost[i + s + _ONE] + cell_cost[i + s + _ONE] * step
+        key = key if max(south, east) <= limit else INF
+        code = np.uint8(3) if key < best else code
+        best = min(best, key)
+        key = cost[i + s - _ONE] + cell_cost[i + s - _ONE] * step
+        key = key if max(south, west) <= limit else INF
+        code = np.uint8(5) if key < best else code
+        best = min(best, key)
+        key = cost[i - s - _ONE] + cell_cost[i - s - _ONE] * step
+        key = key if max(north, west) <= limit else INF
+        code = np.uint8(7) if key < best else code
+        best = min(best, key)
+        parent[i] = code if max(cost[i], best) < INF else NONE
+
+
+@njit
+def point_row_to_parents(cell_cost, cost, stride, rule, corners, first, last, parent):
+    """As `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out."""
+    s, begin, end = np.uint64(stride), np.uint64(first), np.uint64(last)
+    if rule == RULE_FOUR:
+        _parents_of_four(cell_cost, cost, s, begin, end, parent)
+    else:
+        limit = INF if corners else HUGE
+        _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent)
+
+
+@njit
+def point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent):
+    """Write the parents of the cells of a window: the neighbour with the smallest exit key; of equals the first of
+    north, east, south, west, then of the diagonals clockwise."""
+    row0, col0, row1, col1 = box
+    for row in range(row0, row1):
+        start = (row + 1) * stride + 1
+        point_row_to_parents(cell_cost, cost, stride, rule, corners, start + col0, start + col1, parent)
+    parent[root] = NONE

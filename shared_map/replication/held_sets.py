@@ -1,0 +1,140 @@
+"""The sets that a replica holds: the newest of every (tile, author)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from shared_map.replication.digest import Held, Ledger, fingerprint
+from shared_map.replication.limits import Capacity
+from shared_map.replication.marks import fault, is_tombstone, supersedes
+from shared_map.replication.tombstones import Tombstones
+from swarm.grid import TILE_CELLS, GridSpec
+from swarm.wire.messages.marks import MarkSet, MarksRequest
+
+
+class HeldSets:
+    """A table of sets, with its digest, its size and the tombstones of what was deleted from it.
+
+    ledger      number of every set held; digests are made of it
+    capacity    counts what is held and bounds it
+    tombstones  numbers under which sets were deleted lately
+    """
+
+    def __init__(self, grid: GridSpec, capacity: Capacity) -> None:
+        self.ledger = Ledger()
+        self.capacity = capacity
+        self.tombstones = Tombstones()
+        self._grid = grid
+        self._tile_count = grid.tiles
+        self._ragged = bool(grid.rows % TILE_CELLS or grid.cols % TILE_CELLS)
+        self._tiles: dict[int, dict[str, MarkSet]] = {}  # tile -> author -> set; no tile without sets
+
+    def get(self, tile: int, author: str | None) -> MarkSet | None:
+        """The set of an author about a tile; None if there is none, or no author."""
+        sets = self._tiles.get(tile)
+        return None if sets is None or author is None else sets.get(author)
+
+    def of_tile(self, tile: int) -> list[MarkSet]:
+        """The sets about a tile, in order of author."""
+        sets = self._tiles.get(tile)
+        if sets is None:
+            return []
+        return list(sets.values()) if len(sets) == 1 else [sets[name] for name in sorted(sets)]
+
+    @property
+    def tiles(self) -> list[int]:
+        """Tiles with at least one set, in order."""
+        return sorted(self._tiles)
+
+    def off_grid(self, received: MarkSet) -> bool:
+        """Whether a set states something about cells which this grid does not have."""
+        return received.tile >= self._tile_count or (self._ragged and fault(received, self._grid) is not None)
+
+    def is_news(self, received: MarkSet, held: MarkSet | None) -> bool:
+        """Whether a set supersedes the held one of its tile and author, or if there is none, the deleted one."""
+        return not self.tombstones.covers(received) if held is None else supersedes(received, held)
+
+    def put(self, new: MarkSet, *, own: bool = False) -> bool:
+        """Hold a set instead of the one which it supersedes; False if there is no capacity for it.
+
+        own  capacity does not matter
+        """
+        tile, author = new.tile, new.author
+        sets = self._tiles.get(tile)
+        if not self.capacity.take(new, None if sets is None else sets.get(author), own=own):
+            return False
+        if sets is None:
+            self._tiles[tile] = {author: new}
+        else:
+            sets[author] = new
+        self.ledger.record(author, tile, new.epoch, new.seq)
+        return True
+
+    def put_all(self, author: str, first: Sequence[MarkSet]) -> bool:
+        """Hold sets of an author, each the first about its tile; False, and nothing changes, if that exceeds the
+        capacity."""
+        if not self.capacity.take_all(author, len(first), sum([len(each.kinds) for each in first])):
+            return False
+        self._tiles.update([(each.tile, {author: each}) for each in first])
+        self.ledger.record_all(author, first)
+        return True
+
+    def __contains__(self, tile: int) -> bool:
+        """Whether anybody's set of this tile is held."""
+        return tile in self._tiles
+
+    def bury(self, tombstone: MarkSet, now_ns: int) -> None:
+        """Delete what its author stated about a tile, and remember under which number."""
+        assert is_tombstone(tombstone)
+        self.tombstones.add(tombstone, now_ns)
+        held = self.get(tombstone.tile, tombstone.author)
+        if held is not None:
+            self.remove(held)
+
+    def remove(self, held: MarkSet) -> None:
+        """Forget a set as if it had never come."""
+        sets = self._tiles[held.tile]
+        del sets[held.author]
+        if not sets:
+            del self._tiles[held.tile]
+        self.ledger.drop(held.author, held.tile)
+        self.capacity.free(held)
+
+    # --- comparing with others ------------------------------------------------------------------------------
+
+    def missing(self, theirs: Held) -> list[tuple[str, list[int]]]:
+        """(author, tiles) of which they hold a newer set than we, and which we could hold.
+
+        What there is no capacity for is left out: it would be asked for again with every digest.
+        """
+        newer = self.ledger.missing(theirs)
+        possible = [(author, [tile for tile in tiles if self._could_hold(author, tile)]) for author, tiles in newer]
+        return [(author, tiles) for author, tiles in possible if tiles]
+
+    def _could_hold(self, author: str, tile: int) -> bool:
+        if tile >= self._tile_count:
+            return False
+        return not self.capacity.full_for(author) or self.get(tile, author) is not None
+
+    def fingerprint(self) -> str:
+        """16 hex digits, equal for replicas that hold the same."""
+        return fingerprint(self.ledger.held())
+
+    def ahead_of(self, theirs: Held, authors: list[str]) -> list[MarkSet]:
+        """The sets of these authors that we hold newer than they."""
+        newer = self.ledger.ahead(theirs, authors)
+        return [self._tiles[tile][author] for author, tiles in newer for tile in tiles]
+
+    def answer(self, request: MarksRequest, author: str | None = None) -> list[MarkSet]:
+        """The sets asked for, in order of tile and author.
+
+        author  only this author's, as the key of the query says
+        """
+        wanted = set(request.authors)
+        tiles: Sequence[int] = sorted(set(request.tiles)) if request.tiles else self.tiles
+        return [
+            each
+            for tile in tiles
+            for each in self.of_tile(tile)
+            if (author is None or each.author == author) and (not wanted or each.author in wanted)
+        ]

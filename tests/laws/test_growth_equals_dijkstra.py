@@ -1,0 +1,138 @@
+"""Growth against an independent Dijkstra, on every rule; the same uncompiled and with bounds checks on."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import slow_twins as naive
+from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
+from support.planner_strategies import RULES, random_pace
+
+from planner_service.kernels.layout import Labels
+from planner_service.kernels.radix_heap import grow_by_radix_heap
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.growth import MAX_RATIO, grow_tree
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec
+
+
+def test_a_thousand_random_grids_equal_dijkstra() -> None:
+    random_grids(1000, 1, 30)
+
+
+@pytest.mark.slow
+def test_ten_thousand_random_grids_equal_dijkstra() -> None:
+    random_grids(10_000, 2, 40)
+
+
+def test_scipy_equals_twelve_lines_that_can_be_read() -> None:
+    rng = np.random.default_rng(3)
+    for n in range(20):
+        pace = random_pace(rng, 9, 8, RATIOS[n % 7], 0.25)
+        rules = RULES[n % 5]
+        target = int(np.flatnonzero(np.isfinite(pace))[0])
+        by_hand = naive.cost_to_go_by_hand(pace, target, **rules)
+        np.testing.assert_allclose(naive.cost_to_go(pace, target, **rules), by_hand)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 17), (17, 1), (2, 2)])
+@pytest.mark.parametrize("rules", RULES)
+def test_the_smallest_grids_equal_dijkstra(shape: tuple[int, int], rules: dict) -> None:
+    assert_equals_dijkstra(np.full(shape, 0.5, np.float32), 0, rules)
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_ring_and_radix_heap_give_the_same_costs_to_the_last_bit(rules: dict) -> None:
+    rng = np.random.default_rng(4)
+    for ratio in (1.0, 50.0, 2000.0):
+        pace = random_pace(rng, 260, 259, ratio, 0.2)
+        target = int(np.flatnonzero(np.isfinite(pace))[0])
+        ground = CostGrid(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules))
+        ground.load(pace)
+        root = ground.pad(target)
+        by_ring, by_heap = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
+        parent = np.empty(ground.size, np.uint8)
+        longest = ground.highest_cell_cost * ground.diagonal
+        assert longest <= MAX_RATIO * ground.lowest_cell_cost  # so that it is the ring that grows it
+        grow_tree(ground.padded, ground.lowest_cell_cost, ground.highest_cell_cost, root, by_ring, None)
+        grow_by_radix_heap(ground.padded, Labels(by_heap, parent, root), np.float32(ground.lowest_cell_cost))
+        np.testing.assert_array_equal(by_heap, by_ring)
+
+
+@pytest.mark.parametrize("ratio", [1e4, 1e6, 1e9, 1e30])
+def test_no_ratio_of_paces_breaks_or_crawls(ratio: float) -> None:
+    rng = np.random.default_rng(6)
+    for walls in (0.0, 0.2):
+        pace = random_pace(rng, 120, 120, ratio, walls)
+        target = int(np.flatnonzero(np.isfinite(pace))[77])
+        for rules in RULES:
+            assert_equals_dijkstra(pace, target, rules)
+            begin = time.thread_time()
+            grown(pace, target, rules)
+            assert time.thread_time() - begin < 0.5  # 14,400 cells: 5 ms where nothing else runs
+
+
+def test_large_fields_of_every_kind_equal_dijkstra() -> None:
+    from launch_scripts.bench.planning.fields import make_field
+
+    for name in ("terrain", "uniform", "maze"):
+        pace = make_field(name, 300)
+        target = int(np.flatnonzero(np.isfinite(pace))[1234])
+        assert_equals_dijkstra(pace, target, RULES[0])
+        assert_equals_dijkstra(pace, target, RULES[3])
+
+
+@pytest.mark.parametrize(
+    ("pace", "complaint"),
+    [
+        (np.full((3, 4), np.nan, np.float32), "NaN"),
+        (np.zeros((3, 4), np.float32), "zero"),
+        (np.full((3, 4), -1.0, np.float32), "negative"),
+        (np.ones((3, 4)), "float32"),
+        (np.ones((4, 3), np.float32), "shape"),
+        (np.ones((4, 3), np.float32).T, "contiguous"),
+    ],
+)
+def test_a_pace_that_is_none_is_refused(pace: np.ndarray, complaint: str) -> None:
+    ground = CostGrid(GridSpec(3, 4, 1.0), PlannerConfig())
+    with pytest.raises(ValueError, match=complaint):
+        ground.load(pace)
+
+
+_SMALL = """
+import sys
+sys.path.insert(0, {tests!r})
+import numpy as np
+from support.kernel_oracle import random_grids
+from support.planner_play import Play
+from support.planner_strategies import Job, Marks, Move, random_pace
+from swarm.config.scenario import PlannerConfig
+random_grids({count}, 5, 9)
+for strategy in ("full", "variable_range", "rotation", "multi_resolution"):
+    pace = random_pace(np.random.default_rng(1), 9, 11, 6.0, 0.2)
+    play = Play(pace, PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9))
+    first = (Move(1, 0), Job("begin"), Marks(3, 3), Move(0, 1), Job("end"))
+    for event in (*first, Move(1, 1), Move(5, 5), Marks(4, 3)):
+        play.happen(event)
+        play.check()
+print("fine")
+"""
+
+
+@pytest.mark.parametrize(("setting", "count"), [("NUMBA_DISABLE_JIT", 60), ("NUMBA_BOUNDSCHECK", 200)])
+def test_kernels_do_the_same_uncompiled_and_never_leave_their_arrays(
+    setting: str, count: int, tmp_path: Path
+) -> None:
+    here = Path(__file__).parents[1]
+    environment = {**os.environ, setting: "1", "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(here.parent)}
+    script = _SMALL.format(tests=str(here), count=count)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script], env=environment, capture_output=True, text=True, timeout=280
+    )
+    assert done.stdout.strip() == "fine", done.stderr[-2000:]

@@ -1,0 +1,240 @@
+"""Many sets at once: the same map, digests and counts as one by one, and as the two rules taken by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.map_strategies import GRID, Composite, held_winners, mark_sets, merge_one, naive_winners, set_of
+
+from shared_map.replication import merge as merge_module
+from shared_map.replication import replica as replica_module
+from shared_map.replication.limits import Capacity
+from shared_map.replication.mark_sets import packed, unpacked
+from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.replica import MapReplica
+from swarm.errors import ProtocolError
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.marks import MarkSet, MarkSets, MarksRequest
+from swarm.wire.statements import FOREVER, MarkKind
+
+LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
+
+
+@st.composite
+def ending_sets(draw: st.DrawFn) -> MarkSet:
+    """As `mark_sets`, some of whose statements end by themselves between 0 and 9."""
+    made = draw(mark_sets())
+    count = len(made.kinds)
+    untils = draw(st.lists(st.sampled_from([1, 5, 9, FOREVER]), min_size=count, max_size=count))
+    said = Statements(
+        np.frombuffer(made.cells, "<u2"),
+        np.frombuffer(made.kinds, "<u1"),
+        np.frombuffer(made.paces, "<f4"),
+        np.frombuffer(made.stamps_ns, "<i8"),
+        np.array(untils, np.int64),
+    )
+    return mark_set(made.author, made.group, made.tile, made.epoch, made.seq, said)
+
+
+@pytest.fixture(autouse=True, params=[(-1, 1), (10**9, 10**9)], ids=["many", "few"])
+def _both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As arrays and with the fast path for a late join, and as lists without it."""
+    few, many = request.param
+    monkeypatch.setattr(merge_module, "_FEW", few)
+    monkeypatch.setattr(replica_module, "_MANY", many)
+
+
+def replica() -> tuple[MapReplica, Composite]:
+    composite = Composite()
+    return MapReplica(GRID, composite), composite
+
+
+@given(st.lists(mark_sets() | ending_sets(), max_size=30), st.data())
+def test_many_at_once_in_any_order_grouping_and_repetition_are_as_one_by_one(
+    sets: list[MarkSet], data: st.DataObject
+) -> None:
+    singly, single = replica()
+    together, many = replica()
+    singly.tick(3)
+    together.tick(3)
+    for each in sets:
+        singly.merge([each])
+    again = data.draw(st.lists(st.sampled_from(sets), max_size=10)) if sets else []
+    left = data.draw(st.permutations(sets + again))
+    while left:
+        count = data.draw(st.integers(1, len(left)))
+        together.merge(left[:count])
+        left = left[count:]
+    assert many.same(single)
+    assert together.held.ledger.held() == singly.held.ledger.held()
+    assert together.held.answer(MarksRequest()) == singly.held.answer(MarksRequest())
+    assert (together.held.capacity.sets, together.held.capacity.marks) == (
+        singly.held.capacity.sets,
+        singly.held.capacity.marks,
+    )
+    for now_ns in (5, 9):
+        singly.tick(now_ns)
+        together.tick(now_ns)
+        assert many.same(single)
+
+
+@given(st.lists(mark_sets(), max_size=30))
+def test_many_at_once_stand_at_the_winners_of_the_two_rules(sets: list[MarkSet]) -> None:
+    together, _ = replica()
+    together.merge(sets)
+    assert held_winners(together) == naive_winners(sets)
+
+
+@given(st.lists(mark_sets(), max_size=12), st.lists(mark_sets(), max_size=12))
+def test_what_is_returned_is_what_was_news_and_how_many_cells_it_changed(
+    before: list[MarkSet], sets: list[MarkSet]
+) -> None:
+    newest = {(each.tile, each.author): each for each in sets}
+    some = [
+        each for n, each in enumerate(newest.values()) if all(e.tile != each.tile for e in [*newest.values()][:n])
+    ]
+    singly, _ = replica()
+    together, _ = replica()
+    for each in before:
+        singly.merge([each])
+        together.merge([each])
+    expected = {each.tile: changed for each in some if (changed := merge_one(singly, each)) is not None}
+    merged = together.merge(some)
+    found = {each.tile: changed for each, changed in zip(merged.sets, merged.changed, strict=True)}
+    assert len(merged.sets) == len(found)
+    assert found == {tile: len(changed) for tile, changed in expected.items()}
+    assert together.counts == singly.counts
+
+
+def test_an_author_whose_set_was_replaced_reasserts_it_among_many_too() -> None:
+    own = MapReplica(GRID, Composite(), author="a1.1")
+    own.write([5], [LETHAL], [0], 100)
+    own.merge([set_of("a1.1", 0, 9, {}, epoch=4), set_of("b", 1, 0, {3: (LETHAL, 0, 1)})])
+    assert [(each.author, each.epoch) for each in own.held.of_tile(0)] == [("a1.1", 5)]
+    assert held_winners(own) == {(0, 5): (LETHAL, 0.0), (1, 3): (LETHAL, 0.0)}
+
+
+# --- many in one message ------------------------------------------------------------------------------------
+
+
+@given(st.lists(mark_sets() | ending_sets(), max_size=20))
+def test_sets_come_out_of_a_message_as_they_went_in(sets: list[MarkSet]) -> None:
+    one_each = list({(each.tile, each.author): each for each in sets}.values())
+    messages = [decode(encode(message), MarkSets) for message in packed(one_each)]
+    out = [each for message in messages for each in unpacked(message)]
+    by = sorted(one_each, key=lambda each: (each.author, each.tile))
+    assert sorted(out, key=lambda each: (each.author, each.tile)) == by
+    assert len(messages) == len({(each.author, each.group) for each in one_each})
+
+
+def test_a_message_is_cut_off_at_about_a_quarter_of_a_megabyte() -> None:
+    full: dict[int, tuple[int, float, int]] = dict.fromkeys(range(1024), (LETHAL, 0.0, 1))
+    sets = [set_of("a", tile, 1, full) for tile in range(200)]
+    sizes = [len(encode(message)) for message in packed(sets)]
+    assert len(sizes) == 12
+    assert max(sizes) < (1 << 18) + 20_000
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"tiles": b"\1\0\0\0\1\0\0\0"}, "twice"),
+        ({"tiles": b"\1\0\0\0"}, "tiles has 4 bytes, expected 2 values of 4"),
+        ({"counts": b"\2\0\1\0"}, "cells has 4 bytes, expected 3 values"),
+        ({"ending": b"\0\2"}, "ending has a 2"),
+        ({"ending": b"\0\1"}, "untils_ns has 0 bytes, expected 1 values"),
+        ({"cells": b"\0\0\0\4"}, "set 1 of 2 breaks a rule"),
+        ({"kinds": b"\7\1"}, "set 0 of 2 breaks a rule"),
+        ({"seqs": b"\xff" * 16}, "seqs must be below"),
+    ],
+)
+def test_a_message_of_many_sets_is_refused_with_the_rule_that_it_breaks(
+    change: dict[str, bytes], reason: str
+) -> None:
+    sets = [set_of("a", tile, 1, {tile: (LETHAL, 0.0, 1)}) for tile in (0, 1)]
+    [message] = packed(sets)
+    fields = {name: getattr(message, name) for name in message.__struct_fields__} | change
+    with pytest.raises(ProtocolError, match=reason):
+        decode(encode(MarkSets(**fields)), MarkSets)
+
+
+# --- bounds -------------------------------------------------------------------------------------------------
+
+
+def test_beyond_its_share_an_author_is_refused_and_the_others_are_not() -> None:
+    composite = Composite()
+    bounded = MapReplica(GRID, composite, capacity=Capacity(max_sets=8, max_marks=12))
+    bounded.merge([set_of("a", tile, 1, {0: (LETHAL, 0, 1)}) for tile in range(4)])
+    assert bounded.counts["sets_without_room"] == 2  # an author has a quarter: two sets, three marks
+    assert bounded.over_capacity == "a"
+    assert bounded.merge([set_of("a", 0, 2, dict.fromkeys(range(5), (LETHAL, 0, 1)))]).sets == []
+    bounded.merge([set_of("b", tile, 1, {1: (LETHAL, 0, 1)}) for tile in range(2)])
+    assert [len(bounded.held.of_tile(tile)) for tile in range(4)] == [2, 2, 0, 0]
+
+
+def test_what_has_no_room_is_not_asked_for_again() -> None:
+    whole, _ = replica()
+    whole.merge([set_of("a", tile, 1, {0: (LETHAL, 0, 1)}) for tile in range(4)])
+    bounded = MapReplica(GRID, capacity=Capacity(max_sets=8))
+    for each in whole.held.answer(MarksRequest()):
+        bounded.merge([each])
+    assert bounded.missing(whole.held.ledger.held()) == []
+    whole.merge([set_of("a", 1, 2, {})])
+    assert bounded.missing(whole.held.ledger.held()) == [("a", [1])]  # what it has is kept up to date
+
+
+def test_a_tombstone_gives_the_marks_back_but_not_the_set() -> None:
+    bounded = MapReplica(GRID, capacity=Capacity(max_sets=8, max_marks=8))
+    bounded.merge([set_of("a", 0, 1, {0: (LETHAL, 0, 1), 1: (CLEAR, 0, 1)})])
+    bounded.merge([set_of("a", 0, 2, {})])
+    assert (bounded.held.capacity.sets, bounded.held.capacity.marks) == (1, 0)
+
+
+@given(st.lists(mark_sets() | ending_sets(), max_size=30), st.integers(0, 30), st.data())
+def test_messages_of_many_sets_merge_as_these_one_by_one(
+    sets: list[MarkSet], cut: int, data: st.DataObject
+) -> None:
+    """Also after other sets and tombstones were heard, in any order of the messages."""
+    singly, single = replica()
+    together, many = replica()
+    singly.tick(3)
+    together.tick(3)
+    for each in sets[:cut]:
+        singly.merge([each])
+        together.merge([each])
+    one_each = list({(each.tile, each.author): each for each in sets[cut:]}.values())
+    for message in data.draw(st.permutations(list(packed(one_each)))):
+        merged = together.merge(unpacked(message))
+        changed = [(each, merge_one(singly, each)) for each in unpacked(message)]
+        taken = {(each.tile, each.author): len(cells) for each, cells in changed if cells is not None}
+        assert {(e.tile, e.author): n for e, n in zip(merged.sets, merged.changed, strict=True)} == taken
+    assert many.same(single)
+    assert together.held.ledger.held() == singly.held.ledger.held()
+    assert together.counts == singly.counts
+    assert together.held.answer(MarksRequest()) == singly.held.answer(MarksRequest())
+    assert (together.held.capacity.sets, together.held.capacity.marks) == (
+        singly.held.capacity.sets,
+        singly.held.capacity.marks,
+    )
+    for now_ns in (5, 9):
+        singly.tick(now_ns)
+        together.tick(now_ns)
+        assert many.same(single)
+
+
+def test_what_has_no_room_for_all_is_taken_in_as_far_as_there_is_room() -> None:
+    sets = [set_of("b", tile, 1, {3: (LETHAL, 0, 1)}) for tile in range(4)]
+    bounded = MapReplica(GRID, Composite(), capacity=Capacity(max_sets=8, max_marks=1 << 20))
+    [message] = packed(sets)
+    assert len(bounded.merge(unpacked(message)).sets) == 2
+    assert (bounded.held.capacity.sets, bounded.counts["sets_without_room"]) == (2, 2)
+
+
+def test_an_author_of_whom_nothing_is_taken_in_has_no_place_in_the_books() -> None:
+    listener = MapReplica(GRID, Composite())
+    [message] = packed([set_of("b", 9999, 1, {3: (LETHAL, 0, 1)})])
+    assert listener.merge(unpacked(message)).sets == []
+    assert listener.held.capacity._authors == {}
+    assert listener.held.ledger.held() == {}

@@ -1,0 +1,245 @@
+"""The wire: every message is decoded as it was encoded, and no payload at all becomes anything but a message."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import tracemalloc
+
+import msgpack
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.wire_strategies import EXAMPLES, MESSAGES
+
+from swarm.errors import ProtocolError
+from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES, decode, encode
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.base import Message, Nothing, schema_of
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+from swarm.wire.messages.processes import Note, Stats
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Reservations
+from swarm.wire.readable import decode_parameters, encode_readable
+from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.topics import TOPICS
+
+BY_TYPE = {type(example): example for example in EXAMPLES}
+TYPES = tuple(BY_TYPE)
+
+
+def test_every_message_of_every_topic_has_an_example_and_a_strategy():
+    on_the_wire = {kind for topic in TOPICS for kind in (topic.message, topic.request, topic.bulk) if kind}
+    assert on_the_wire <= set(TYPES)
+    assert set(TYPES) == set(MESSAGES) == set(Message.__subclasses__())
+
+
+@pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)
+def test_a_message_comes_out_as_it_went_in_and_msgspec_alone_would_write_the_same_bytes(kind):
+    @settings(max_examples=60, deadline=None)
+    @given(MESSAGES[kind])
+    def round_trip(message):
+        payload = encode(message)
+        assert decode(payload, kind) == message
+        assert payload == msgspec.msgpack.encode(message)
+
+    round_trip()
+
+
+@pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)
+def test_a_payload_of_another_type_is_refused(kind):
+    for other in EXAMPLES:
+        if type(other) is not kind:
+            with pytest.raises(ProtocolError, match="schema"):
+                decode(encode(other), kind)
+
+
+def test_a_later_wire_version_is_refused_and_a_later_field_ignored():
+    fields = msgpack.unpackb(encode(BY_TYPE[Note]))
+    assert decode(msgpack.packb(fields | {"mood": "good"}), Note) == BY_TYPE[Note]
+    with pytest.raises(ProtocolError, match="note/9"):
+        decode(msgpack.packb(fields | {"schema": "note/9"}), Note)
+
+
+def _attempt(payload: bytes, kind: type[Message]) -> bool:
+    try:
+        decode(payload, kind)
+    except ProtocolError:
+        return False
+    return True
+
+
+def test_a_hundred_thousand_mutations_raise_nothing_but_protocol_errors():
+    rng = random.Random(1)
+    payloads = {kind: encode(example) for kind, example in BY_TYPE.items()}
+    everything = list(payloads.values())
+    accepted = 0
+    for n in range(100_000):
+        kind = TYPES[n % len(TYPES)]
+        data = bytearray(payloads[kind])
+        for _ in range(rng.choice((1, 1, 1, 2, 4))):
+            at = rng.randrange(len(data) + 1)
+            match rng.randrange(6):
+                case 0:
+                    data[at : at + 1] = bytes([rng.randrange(256)])
+                case 1:
+                    if at < len(data):
+                        data[at] ^= 1 << rng.randrange(8)
+                case 2:
+                    del data[at : at + rng.randrange(1, 9)]
+                case 3:
+                    data[at:at] = rng.randbytes(rng.randrange(1, 9))
+                case 4:
+                    del data[at:]
+                case 5:
+                    other = rng.choice(everything)
+                    start = rng.randrange(len(other))
+                    data[at : at + 4] = other[start : start + rng.randrange(1, 20)]
+            if not data:
+                break
+        accepted += _attempt(bytes(data), kind)
+    assert 0 < accepted < 50_000
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200), st.sampled_from(TYPES))
+def test_random_bytes_are_no_message(payload, kind):
+    assert not _attempt(payload, kind)
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(1 << 63), (1 << 64) - 1) | st.floats() | st.text() | st.binary(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.data(), st.sampled_from(TYPES))
+def test_any_value_in_any_field_parses_or_is_refused(data, kind):
+    fields = msgpack.unpackb(encode(BY_TYPE[kind]), strict_map_key=False)
+    name = data.draw(st.sampled_from(sorted(fields)))
+    _attempt(msgpack.packb(fields | {name: data.draw(values)}), kind)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xc1",
+        b"\x91" * 100_000,
+        b"\xdd\xff\xff\xff\xff",
+        b"\xdf\xff\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+        b"\xdd\x00\x04\x00\x00" * 2_000,
+        b"\xa1\xff",
+        b"\xc7\x01\x05a",
+        bytes(MAX_PAYLOAD_BYTES + 1),
+    ],
+    ids=["empty", "reserved", "deep", "array", "map", "bin", "deep-arrays", "utf8", "ext", "long"],
+)
+def test_a_hostile_payload_is_refused(payload):
+    for kind in TYPES:
+        assert not _attempt(payload, kind)
+
+
+@pytest.mark.parametrize("junk", [{}, [], {1: 1}], ids=["map", "list", "pair"])
+def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(junk):
+    half = [junk] * (MAX_ITEMS // 2)
+    fields = msgpack.unpackb(encode(BY_TYPE[Note])) | {"mood": [half] * 8}
+    payload = msgpack.packb(fields)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ProtocolError, match="more than 262144 items"):
+            decode(payload, Note)
+        assert tracemalloc.get_traced_memory()[1] < 40 << 20
+    finally:
+        tracemalloc.stop()
+    assert _attempt(msgpack.packb(fields | {"mood": [b"abc"] * (MAX_ITEMS - 100)}), Note)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "complaint"),
+    [
+        (MarkSet, {"kinds": b"\x00"}, "cells has 4 bytes, expected 1 values of 2"),
+        (MarkSet, {"cells": pack_column([7, 7], "<u2")}, "strictly"),
+        (MarkSet, {"cells": pack_column([7, 1024], "<u2")}, "below 1024"),
+        (MarkSet, {"kinds": b"\x00\x03"}, "kind 3 is not in 0..2"),
+        (MarkSet, {"paces": pack_column([math.nan, 1], "<f4")}, "positive and finite"),
+        (MarkSet, {"paces": pack_column([0, 1], "<f4")}, "positive and finite"),
+        (MarkSet, {"stamps_ns": pack_column([-1, 1], "<i8")}, "negative"),
+        (MarkSet, {"author": "a/b"}, "author 'a/b' is not"),
+        (MarkSet, {"seq": 1 << 62}, "seq"),
+        (TargetPose, {"x_m": math.nan}, "x_m"),
+        (TargetPose, {"y_m": 1e10}, "y_m"),
+        (TargetPose, {"target": "*"}, "target"),
+        (Reservations, {"held": {"v": []}}, "at least the cell"),
+        (Reservations, {"clock": (1 << 64) - 1}, "clock"),
+        (RouteRequest, {"cells": [1 << 40]}, "cells"),
+        (RouteRequest, {"cells": [1], "vehicles": ["a", "b"]}, "2 vehicles for 1 cells"),
+        (RouteRequest, {"row": 3, "col": None}, "both row and col"),
+        (CostReply, {"cost_to_go_s": b"123"}, "float32"),
+        (CostReply, {"cost_to_go_s": pack_column([math.nan], "<f4")}, "NaN"),
+        (Stats, {"histograms": {"x": {10**9: 1}}}, "bucket 1000000000"),
+        (Stats, {"gauges": {"x": math.inf}}, "finite"),
+    ],
+)
+def test_what_parses_but_cannot_be_is_refused_in_words(kind, change, complaint):
+    fields = msgpack.unpackb(encode(BY_TYPE[kind]), strict_map_key=False)
+    with pytest.raises(ProtocolError, match=complaint.replace("(", r"\(")):
+        decode(msgpack.packb(fields | change), kind)
+
+
+def test_a_route_leaves_the_eight_directions_never():
+    with pytest.raises(ValueError, match="code 8"):
+        Route(status=RouteStatus.OK, start=0, directions=bytes([8]))
+
+
+def test_a_route_reply_is_readable_as_json():
+    reply = json.loads(encode_readable(BY_TYPE[RouteReply]))
+    found, none = reply["routes"]
+    assert reply["schema"] == schema_of("route")
+    assert found["status"] == "ok"
+    assert found["directions"] == ["E", "SE"]
+    assert found["cells_row_col"] == [[1, 1], [1, 2], [2, 3]]
+    assert none["status"] == "unreachable"
+    assert none["cost_s"] is None
+
+
+def test_every_message_is_readable_as_json():
+    for example in EXAMPLES:
+        fields = json.loads(encode_readable(example))
+        assert set(msgpack.unpackb(encode(example), strict_map_key=False)) <= set(fields)
+    assert json.loads(encode_readable(BY_TYPE[CostReply]))["cost_to_go_s"] == [3.0, None]
+    assert json.loads(encode_readable(BY_TYPE[MarkSet]))["cells"] == [5, 1023]
+
+
+def test_a_person_asks_with_parameters():
+    assert decode_parameters({"row": "40", "col": "200", "format": "json"}, RouteRequest) == RouteRequest(
+        row=40, col=200
+    )
+    assert decode_parameters({"row": "4", "col": "2", "force": "true"}, RouteRequest).force
+    assert decode_parameters({}, Nothing) == Nothing()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "complaint"),
+    [
+        ({"row": "1"}, "both row and col"),
+        ({"row": "north", "col": "2"}, "row"),
+        ({"rwo": "1", "col": "2"}, "unknown parameter 'rwo', allowed: cells, row, col"),
+    ],
+)
+def test_wrong_parameters_are_refused_in_words(parameters, complaint):
+    with pytest.raises(ProtocolError, match=complaint):
+        decode_parameters(parameters, CostRequest)
+
+
+def test_the_gap_is_cost_over_the_proven_bound():
+    assert Route(status=RouteStatus.OK, start=0, cost_s=3.0, lower_bound_s=2.0).gap == 1.5
+    assert Route(status=RouteStatus.OK, start=0, cost_s=3.0, lower_bound_s=3.0).gap == 1.0
+    assert Route(status=RouteStatus.OK, start=0, cost_s=3.0, lower_bound_s=0.0).gap == math.inf
+    assert Route(status=RouteStatus.UNREACHABLE, start=0).gap == 1.0

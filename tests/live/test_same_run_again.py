@@ -1,0 +1,52 @@
+"""A run outlives its processes: they may all be started again, and what was acknowledged is there."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from support.live_swarm import LiveSwarm, swarm
+from support.processes import eventually, session_of
+
+from launch_scripts.launcher.options import find_scenario
+
+pytestmark = pytest.mark.network
+
+
+def sets_in(store: Path) -> int:
+    done = swarm("map", "inspect", store, "--json")
+    assert done.returncode == 0, done.stderr
+    return int(json.loads(done.stdout)["sets"])
+
+
+def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_with_the_keepers_store(
+    tmp_path: Path,
+) -> None:
+    first = LiveSwarm(tmp_path, "--run-id", "again", "--no-live")
+    try:
+        first.wait_until_up()
+        store = tmp_path / "runs" / "again" / "map.sqlite"
+        eventually(lambda: store.exists() and sets_in(store) > 0, 60, "marks in the store")
+        os.killpg(first.process.pid, signal.SIGKILL)
+        first.process.wait(10)
+        eventually(lambda: not session_of(first.process.pid), 10, "the end of all")
+        before = sets_in(store)
+    finally:
+        first.kill()
+    second = LiveSwarm(tmp_path, "--run-id", "again", "--no-live")
+    try:
+        second.wait_until_up()
+        assert sets_in(store) >= before
+    finally:
+        second.end()
+
+
+def test_parts_of_a_swarm_that_are_started_on_several_machines_belong_to_one_run_whoever_comes_first() -> None:
+    from launch_scripts.launcher.options import common_run_id, with_port
+
+    scenario = find_scenario("synthetic")
+    assert common_run_id(with_port(scenario, 4711)) == common_run_id(scenario)
+    assert common_run_id(find_scenario("jacksboro")) != common_run_id(scenario)

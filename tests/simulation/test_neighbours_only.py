@@ -1,0 +1,89 @@
+"""The laws on a map of several regions, where agents come to terms only with those who are near."""
+
+from __future__ import annotations
+
+import pytest
+from support.simulated_swarm import Laws, names, seeded
+
+from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
+from launch_scripts.simulation.simulate import Simulation
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+from vehicle_agent.service import AgentService
+
+SECONDS = 24.0
+WIDE: Scenario = parse_scenario("""
+name = "wide"
+time_scale = 40
+[terrain]
+source = "synthetic"
+rows = 280
+cols = 800
+resolution_m = 30
+relief_m = 200
+[terrain.hidden]
+rubble_fields = 6
+[cost]
+max_slope_deg = 25
+[[targets]]
+count = 3
+speed_m_per_s = 3
+[[groups]]
+vehicles = 24
+[vehicles]
+per_agent = 3
+sense_range_m = 120
+capture_range_m = 60
+reassign_s = 2
+""")
+"""Eight regions, the vehicles of eight agents, ten cells a second: they cross borders all the time."""
+
+
+def service_of(simulation: Simulation, name: str) -> AgentService | None:
+    service = simulation.nodes[name].service
+    assert service is None or isinstance(service, AgentService)
+    return service
+
+
+def agents_of(simulation: Simulation) -> list[AgentService]:
+    found = [service_of(simulation, name) for name in simulation.nodes if name.startswith("agent-")]
+    return [service for service in found if service is not None]
+
+
+def test_agents_listen_to_their_neighbours_only_and_keep_every_law():
+    simulation = Simulation(seeded(1, WIDE))
+    laws = Laws(simulation)
+    simulation.run_until(6)
+    heard = [len(service._neighbourhood.listens_to) for service in agents_of(simulation)]
+    assert len(heard) == 8
+    assert sum(each < 7 for each in heard) >= 4  # of the seven others
+    simulation.run_until(SECONDS)
+    simulation.finish()
+    report = simulation.report(SECONDS)
+    assert report["vehicles_routed"] == 24
+    assert report["captures"] > 0
+    assert laws.collisions == laws.lethal == []
+    assert report["collisions"] == report["lost"] == report["payloads_dropped"] == 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nobody_meets_under_seeded_faults(seed):
+    simulation = Simulation(seeded(seed, WIDE), faults=random_plan(seed, names(WIDE), SECONDS))
+    laws = Laws(simulation)
+    simulation.run_until(SECONDS)
+    simulation.finish()
+    assert laws.collisions == laws.lethal == []
+    report = simulation.report(SECONDS)
+    assert report["vehicles_routed"] == 24
+    assert report["captures"] > 0
+
+
+def test_agents_that_drove_alone_and_died_are_not_driven_into():
+    crashes = tuple(Crash(3 + 1.1 * n, f"agent-a{(3 * n) % 8}") for n in range(12))
+    plan = FaultPlan(drop=0.05, jitter_ms=20, reorder=0.05, quiet_s=17, crashes=crashes)
+    simulation = Simulation(seeded(7, WIDE), faults=plan)
+    laws = Laws(simulation)
+    simulation.run_until(SECONDS)
+    assert laws.collisions == laws.lethal == []
+    back = [vehicle for service in agents_of(simulation) for vehicle in service.agent.vehicles]
+    assert len(back) == 24

@@ -1,0 +1,101 @@
+"""A target's tree, the map it is told of, and whatever happens to both."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from support import slow_twins as naive
+from support.planner_strategies import Job, Marks, Move
+
+from planner_service.target_tree import GrownTree, TargetTree
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec, Window
+from swarm.wire.routes import RouteStatus
+
+
+class Play:
+    """A tree, the map it is told of, and the job that a worker may have of it."""
+
+    def __init__(self, pace: np.ndarray, config: PlannerConfig) -> None:
+        self.pace = pace
+        self.config = config
+        self.grid = GridSpec(*pace.shape, 1.0)
+        self.tree = TargetTree(self.grid, config)
+        self.version = 0
+        self.target = int(np.flatnonzero(np.isfinite(pace))[0])
+        self.grown: GrownTree | None = None
+        self.since: list[Window] = []
+        self.rules = {
+            "neighbours": config.neighbours,
+            "edge": config.edge,
+            "corner_cutting": config.corner_cutting,
+        }
+        self.last = self.tree.update(self.pace, self.target, [], 0)
+
+    def happen(self, event: Move | Marks | Job) -> None:
+        if isinstance(event, Move):
+            row, col = self.grid.row_col(self.target)
+            row = min(max(row + event.rows, 0), self.grid.rows - 1)
+            col = min(max(col + event.cols, 0), self.grid.cols - 1)
+            self.target = row * self.grid.cols + col
+            self.last = self.tree.update(self.pace, self.target, [], self.version)
+        elif isinstance(event, Marks):
+            window = self._mark(event)
+            self.since.append(window)
+            self.version += 1
+            self.tree.update(self.pace, self.target, [window], self.version)
+        elif event.what == "begin":
+            job = self.tree.full_job(self.pace.copy(), self.target, self.version)
+            self.grown = job()
+            self.since = []
+        elif event.what == "end" and self.grown is not None:
+            self.tree.adopt(
+                self.grown, self.pace, self.target, self.since, self.version, np.arange(self.grid.cells)
+            )
+            self.grown = None
+        elif event.what == "force":
+            self.tree.force([0, self.grid.cells - 1])
+
+    def _mark(self, event: Marks) -> Window:
+        rng = np.random.default_rng(event.seed)
+        window = Window(0, 0, 0, 0)
+        for _ in range(event.count):
+            row, col = int(rng.integers(self.grid.rows)), int(rng.integers(self.grid.cols))
+            self.pace[row, col] = rng.choice(np.array([np.inf, 0.5, 1.0, 20.0, 500.0], np.float32))
+            window = window.union(Window(row, col, row + 1, col + 1))
+        return window
+
+    def check(self) -> None:
+        """Laws (a) to (c), certificates and upper bounds, for a route from every cell."""
+        routes = self.tree.routes(np.arange(self.grid.cells))
+        if not np.isfinite(self.pace.flat[self.target]):
+            assert all(route.status is RouteStatus.NO_TARGET for route in routes)
+            return
+        optimum = naive.cost_to_go(self.pace, self.target, **self.rules).reshape(-1)
+        lethal = ~np.isfinite(self.pace.reshape(-1))
+        for cell, route in enumerate(routes):
+            if lethal[cell]:
+                assert route.status is RouteStatus.LETHAL_START
+            elif not math.isfinite(optimum[cell]):
+                assert route.status is RouteStatus.UNREACHABLE
+            else:
+                assert route.status is RouteStatus.OK
+        served = np.isfinite(optimum) & ~lethal
+        cells = np.flatnonzero(served)
+        driven = np.empty(cells.size)
+        for n, cell in enumerate(cells.tolist()):
+            found = naive.follow(self.pace, cell, routes[cell].directions, **self.rules)
+            assert found is not None, "the route enters a lethal cell, squeezes or leaves the grid"
+            last, driven[n] = found
+            assert last == self.target
+        cost = np.array([routes[cell].cost_s for cell in cells])
+        bound = np.array([routes[cell].lower_bound_s for cell in cells])
+        upper = self.tree.cost_to_go_at(cells)
+        best = optimum[cells]
+        np.testing.assert_allclose(cost, driven, rtol=1e-6)
+        assert (bound <= best * (1 + 1e-12)).all()
+        assert (cost >= best * (1 - 1e-6)).all()
+        assert (upper >= driven * (1 - 1e-4)).all()
+        if self.config.strategy == "full":
+            np.testing.assert_allclose(cost, best, rtol=1e-5)

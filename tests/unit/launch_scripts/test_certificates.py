@@ -1,0 +1,79 @@
+"""Certificates: signed by the folder's authority, keys for their owner only, faults told in a sentence."""
+
+from __future__ import annotations
+
+import datetime
+import stat
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+from launch_scripts.deploy.certificates import authority, issue
+from swarm.errors import ConfigError, StoreError
+
+
+def read(path: Path) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(path.read_bytes())
+
+
+def test_a_certificate_is_signed_by_the_folders_authority_and_names_its_bearer_and_hosts(tmp_path: Path) -> None:
+    path = issue(tmp_path / "certs", "router", ["10.0.0.1", "base.local"], 30)
+    ca, made = read(path.with_name("ca.pem")), read(path)
+    made.verify_directly_issued_by(ca)
+    (name,) = made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    assert name.value == "router"
+    hosts = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert [str(host.value) for host in hosts] == ["10.0.0.1", "base.local"]
+    assert not made.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    good_for = made.not_valid_after_utc - datetime.datetime.now(datetime.UTC)
+    assert 29 <= good_for.days <= 30
+
+
+def test_keys_are_for_their_owner_only_and_the_authority_is_made_once(tmp_path: Path) -> None:
+    for name in ("a0", "a1"):
+        issue(tmp_path, name, [], 30)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"{n}.{k}" for n in ("ca", "a0", "a1") for k in ("pem", "key")
+    }
+    for key in tmp_path.glob("*.key"):
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    assert read(tmp_path / "a0.pem").issuer == read(tmp_path / "a1.pem").issuer
+    assert isinstance(authority(tmp_path).key, ec.EllipticCurvePrivateKey)
+
+
+def test_what_is_there_is_replaced_only_when_asked(tmp_path: Path) -> None:
+    path = issue(tmp_path, "a0", [], 30)
+    before = path.read_bytes()
+    with pytest.raises(StoreError, match=r"a0.pem is there already; --renew replaces it"):
+        issue(tmp_path, "a0", [], 30)
+    issue(tmp_path, "a0", [], 30, renew=True)
+    assert path.read_bytes() != before
+
+
+@pytest.mark.parametrize(
+    ("name", "hosts", "says"),
+    [
+        ("no/name", [], "name 'no/name' is not 1 to 64 of letters"),
+        ("ca", [], "the name ca is the authority's own"),
+        ("a0", ["bücher.example"], "host 'bücher.example' is neither an address nor a name in ASCII"),
+    ],
+)
+def test_a_name_that_cannot_be_one_is_refused(tmp_path: Path, name: str, hosts: list[str], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        issue(tmp_path, name, hosts, 30)
+
+
+def test_a_damaged_authority_is_told_of(tmp_path: Path) -> None:
+    issue(tmp_path, "a0", [], 30)
+    (tmp_path / "ca.key").write_bytes((tmp_path / "a0.key").read_bytes())
+    with pytest.raises(StoreError, match=r"ca.key is not the key of"):
+        issue(tmp_path, "a1", [], 30)
+    (tmp_path / "ca.key").write_text("nothing")
+    with pytest.raises(StoreError, match="is no certificate and key in PEM"):
+        issue(tmp_path, "a1", [], 30)
+    (tmp_path / "ca.key").unlink()
+    with pytest.raises(StoreError, match="cannot read the authority"):
+        issue(tmp_path, "a1", [], 30)

@@ -1,0 +1,85 @@
+"""The referee: what is a collision or an entry onto lethal ground, whatever reports are lost, late or repeated."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from support.target_reports import fleet
+
+from launch_scripts.world.referee import Collision, LethalEntry, Referee
+from swarm.wire.messages.vehicles import Fleet
+
+
+def judged(*reports: Fleet, passable: NDArray[np.bool_] | None = None) -> list[Collision | LethalEntry]:
+    referee = Referee(np.ones(100, np.bool_) if passable is None else passable)
+    return [broken for report in reports for broken in referee.hear(report)]
+
+
+def b(stamp_ms: float, cell: int) -> Fleet:
+    return fleet(stamp_ms, ("b", cell), author="a1.1")
+
+
+def a(stamp_ms: float, cell: int, **fields: Any) -> Fleet:
+    return fleet(stamp_ms, ("a", cell), **fields)
+
+
+def test_two_vehicles_on_one_cell_at_one_time_collide() -> None:
+    (collision,) = judged(a(100, 5), b(150, 5), a(200, 6), b(250, 5))
+    assert collision == Collision("a", "b", 5, 200_000_000)
+
+
+def test_an_encounter_counts_once_and_the_next_one_again() -> None:
+    together = [report for n in range(1, 20) for report in (a(100 * n, 5), b(100 * n + 50, 5))]
+    apart = [report for n in range(20, 50) for report in (a(100 * n, 5), b(100 * n + 50, 6))]
+    again = [report for n in range(50, 60) for report in (a(100 * n, 5), b(100 * n + 50, 5))]
+    assert len(judged(*together)) == 1
+    assert len(judged(*together, *apart)) == 1
+    assert len(judged(*together, *apart, *again)) == 2
+
+
+def test_entering_a_cell_that_another_has_just_left_is_no_collision() -> None:
+    assert judged(a(100, 5), a(200, 6), b(150, 4), b(200, 5), a(300, 7), b(300, 5)) == []
+    assert judged(a(100, 5), b(150, 4), a(200, 6), b(201, 5), a(300, 7), b(301, 5)) == []
+
+
+def test_the_order_in_which_two_agents_are_heard_does_not_matter() -> None:
+    reports_a = [a(100, 5), a(200, 5), a(300, 6)]
+    reports_b = [b(150, 4), b(250, 5), b(350, 5)]
+    for order in ([*reports_a, *reports_b], [*reports_b, *reports_a]):
+        assert [(c.first, c.second, c.cell) for c in judged(*order) if isinstance(c, Collision)] == [("a", "b", 5)]
+
+
+def test_a_lost_report_is_not_held_against_anybody() -> None:
+    """The report of 200 ms, that `a` has left cell 5, is lost: that it stood there when `b` came is not known."""
+    assert judged(a(100, 5), b(150, 4), b(250, 5), a(300, 7), b(350, 5)) == []
+
+
+def test_who_is_seen_standing_still_stood_there_meanwhile() -> None:
+    assert len(judged(a(100, 5), b(150, 4), b(250, 5), a(900, 5), b(950, 5))) == 1
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.sampled_from("ab"), st.integers(0, 3)), max_size=30), st.randoms())
+def test_repeated_and_late_reports_change_nothing(moves: list[tuple[str, int]], chance: random.Random) -> None:
+    reports = [(a if id == "a" else b)(100.0 * n, cell) for n, (id, cell) in enumerate(moves)]
+    repeated: list[Fleet] = []
+    for n, report in enumerate(reports):
+        repeated += [report, *(reports[chance.randrange(n + 1)] for _ in range(2))]
+    assert judged(*reports) == judged(*repeated)
+
+
+def test_coming_onto_lethal_ground_counts_once_per_entry() -> None:
+    passable = np.ones(100, np.bool_)
+    passable[7] = False
+    reports = [a(100 * n, cell) for n, cell in enumerate([6, 7, 7, 7, 6, 7], start=1)]
+    entries = judged(*reports, passable=passable)
+    assert entries == [LethalEntry("a", 7, 200_000_000), LethalEntry("a", 7, 600_000_000)]
+
+
+def test_a_cell_outside_the_grid_is_nobodys_business() -> None:
+    assert judged(a(100, 2**32 - 1), a(200, 100)) == []

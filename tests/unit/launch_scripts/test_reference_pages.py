@@ -1,0 +1,149 @@
+"""The generated pages say what the code says; a setting that nobody explains is refused."""
+
+from __future__ import annotations
+
+import doctest
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import pytest
+
+from launch_scripts import cli
+from launch_scripts.reference import cli_page, scenario_page
+from launch_scripts.reference.__main__ import PAGES
+from launch_scripts.reference.docstrings import as_markdown, meanings, prose
+from swarm.config.scenario import Scenario
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_the_page_is_current(path):
+    assert path.read_text(encoding="utf-8") == PAGES[path](), "run `python -m launch_scripts.reference`"
+
+
+class Explained(msgspec.Struct):
+    """A section.
+
+    width_m  how wide
+             it is
+    colour, shade  which
+    """
+
+    width_m: Annotated[float, msgspec.Meta(gt=0, le=5)] = 1.0
+    colour: str = "red"
+    shade: str = ""
+
+
+class Unexplained(msgspec.Struct):
+    """A section.
+
+    width_m  how wide
+    """
+
+    width_m: float = 1.0
+    depth_m: float = 1.0
+
+
+def test_a_key_has_its_meaning_unit_range_and_default_on_the_page():
+    page = scenario_page.document(Explained)
+    assert "| `width_m` | how wide it is | m | number > 0, ≤ 5 | `1.0` |" in page
+    assert '| `shade` | which |  | text | `""` |' in page
+
+
+def test_a_key_without_a_row_is_refused_by_page_and_schema():
+    for make in (scenario_page.document, scenario_page.schema):
+        with pytest.raises(scenario_page.UndocumentedKeyError, match=r"Unexplained: no row .* for depth_m"):
+            make(Unexplained)
+
+
+def test_every_key_of_every_section_is_on_the_page():
+    page = scenario_page.PATH.read_text(encoding="utf-8")
+    for path, section in scenario_page._sections(Scenario):
+        assert f"## `{path}`" in page or path == ""
+        for field in msgspec.structs.fields(section):
+            assert f"| `{field.name}` |" in page or f".{field.name}]" in page or f"[{field.name}]" in page
+
+
+@pytest.mark.parametrize(
+    "scenario", sorted((ROOT / "launch_scripts" / "scenarios").glob("*.toml")), ids=lambda p: p.stem
+)
+def test_the_schema_knows_every_key_of_a_shipped_scenario_and_no_other(scenario):
+    schema = json.loads(scenario_page.SCHEMA_PATH.read_text(encoding="utf-8"))
+
+    def check(value, kind):
+        kind = schema["$defs"][kind["$ref"].rpartition("/")[2]] if "$ref" in kind else kind
+        if isinstance(value, dict) and "properties" in kind:
+            assert kind["additionalProperties"] is False
+            for key, inner in value.items():
+                assert kind["properties"][key]["description"]
+                check(inner, kind["properties"][key])
+        elif isinstance(value, list) and "items" in kind:
+            for inner in value:
+                check(inner, kind["items"])
+
+    check(tomllib.loads(scenario.read_text(encoding="utf-8")), schema)
+
+
+def test_every_command_and_option_of_the_command_line_is_on_the_page():
+    page = cli_page.document()
+    commands = cli_page._commands(cli.app)
+    assert {name for name, command in commands.items() if cli_page.is_family(command)} == set(cli_page.FAMILIES)
+    for name, command in commands.items():
+        section = page.partition(f"## `swarm {name}`\n")[2].partition("\n## `")[0]
+        assert section
+        for param in command.params:
+            if not cli_page.is_family(command):
+                assert param.opts[0] in section or param.name.upper() in section or param.metavar in section
+
+
+def test_rows_of_a_docstring_are_read_with_all_their_names_and_lines():
+    doc = """What it is.
+
+    rows, cols  how many
+    name        goes on
+                and on
+
+    More of it.
+    """
+    assert meanings(doc) == {"rows": "how many", "cols": "how many", "name": "goes on and on"}
+    assert prose(doc) == "What it is.\n\nMore of it."
+    assert "- `rows`, `cols`: how many\n- `name`: goes on and on" in as_markdown(doc)
+
+
+_FILE = re.compile(r"`((?:[\w.-]+/)+[\w-]+\.(?:py|toml|md|sh|yml|json))`")
+_FOLDER = re.compile(
+    r"`((?:swarm|shared_map|planner_service|vehicle_agent|launch_scripts|tests|docs)/(?:[\w-]+/)*)`"
+)
+_PAGES = [*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+
+
+@pytest.mark.parametrize("page", _PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_file_and_folder_that_a_page_names_exists(page):
+    text = page.read_text(encoding="utf-8")
+    named = [name for name in (*_FILE.findall(text), *_FOLDER.findall(text)) if not name.startswith("runs/")]
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_the_python_of_the_tutorial_runs_as_it_says():
+    failed, tried = doctest.testfile(str(ROOT / "docs" / "tutorial" / "python.md"), module_relative=False)
+    assert tried > 8
+    assert failed == 0
+
+
+@pytest.mark.parametrize("page", ["tutorial/scenario.md", "tutorial/terrain.md"])
+def test_every_scenario_of_the_tutorial_is_accepted(page):
+    blocks = re.findall(r"^```toml\n(.*?)^```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.M | re.S)
+    assert blocks
+    for block in blocks:
+        msgspec.convert(tomllib.loads(block), Scenario)
+
+
+def test_file_names_in_commands_exist():
+    for page in _PAGES:
+        for name in re.findall(r"(?:python|pytest) ((?:[\w-]+/)+[\w-]+\.py)", page.read_text(encoding="utf-8")):
+            assert (ROOT / name).is_file(), f"{page.name}: {name}"

@@ -1,0 +1,84 @@
+"""The documentation builds: no dead link, no page outside of the navigation, nothing from other hosts."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mkdocs", reason="the documentation's packages (dependency group dev) are not installed")
+pytest.importorskip("mkdocstrings", reason="the documentation's packages (dependency group dev) are not installed")
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_every_page_is_built_and_in_the_navigation(site):
+    """Every page links to those of its section, and the home page to the first of each; so follow the menus."""
+    found, waiting = set(), [site / "index.html"]
+    while waiting:
+        page = waiting.pop()
+        if page in found or not page.is_file():
+            continue
+        found.add(page)
+        menu = "".join(re.findall(r"<nav.*?</nav>", page.read_text(encoding="utf-8"), re.DOTALL))
+        links = re.findall(r'href="([^"#:]+\.html)[^"]*"', menu)
+        waiting += [(page.parent / link).resolve() for link in links]
+    for page in (ROOT / "docs").rglob("*.md"):
+        assert site / page.relative_to(ROOT / "docs").with_suffix(".html") in found
+
+
+def test_a_page_of_the_python_api_stands_for_every_room(site):
+    from launch_scripts.reference.site import rooms
+
+    for room, modules in rooms().items():
+        page = (site / "reference" / "api" / f"{room}.html").read_text(encoding="utf-8")
+        for module in modules:
+            assert f'id="{module}"' in page
+
+
+def test_a_browser_loads_nothing_from_other_hosts(site):
+    for page in site.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert not re.findall(r'(?:src|srcset|poster)="(?:https?:)?//[^"]*"', text), page
+        assert not re.findall(r'<link[^>]+href="(?:https?:)?//[^"]*"', text), page
+    for sheet in site.rglob("*.css"):
+        assert not re.findall(r"(?:url\(|@import )[\"']?(?:https?:)?//", sheet.read_text(encoding="utf-8")), sheet
+
+
+def test_a_dead_link_fails_the_build(tmp_path):
+    """The build is strict about links and about their anchors."""
+    for folder in ("docs", "launch_scripts", "swarm", "shared_map", "planner_service", "vehicle_agent"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    (tmp_path / "docs").unlink()
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "index.md").write_text("# Home\n\n[gone](gone.md) [nowhere](#nowhere)\n", encoding="utf-8")
+    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nhooks:")[0]
+    validation = (
+        (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nvalidation:")[2].partition("\nmarkdown")[0]
+    )
+    (tmp_path / "mkdocs.yml").write_text(f"{config}\nvalidation:{validation}\n", encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=tmp_path,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode != 0
+    assert "gone.md" in done.stderr
+    assert "#nowhere" in done.stderr

@@ -1,0 +1,169 @@
+"""How simulated targets walk: every step is legal, ways are the cheapest, evaders get away."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from support.target_reports import FLAT, RES, flat
+
+from launch_scripts.world.walks import Budget, Ground, Walk, Walker, far_place, slowness_of
+from swarm.config.scenario import CostConfig, TargetConfig
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+
+NOBODY = np.empty(0, np.int64)
+
+
+def ground(pace: NDArray[np.float32]) -> Ground:
+    rows, cols = pace.shape
+    return Ground(GridSpec(rows, cols, RES), pace)
+
+
+def rough(seed: int, rows: int = 30, cols: int = 34, lethal: float = 0.3) -> NDArray[np.float32]:
+    rng = np.random.default_rng(seed)
+    pace = rng.uniform(0.05, 0.5, (rows, cols)).astype(np.float32)
+    pace[rng.random((rows, cols)) < lethal] = np.inf
+    pace[rows // 2] = 0.1
+    return pace
+
+
+def walker(where: Ground, cell: int, walk: Walk, slowness: float = 1.0, seed: int = 1) -> Walker:
+    return Walker("t", walk, slowness, random.Random(seed), cell)
+
+
+def test_the_largest_part_is_what_legal_steps_connect() -> None:
+    pace = flat(4, 6)
+    pace[:, 3] = np.inf
+    pace[0, 2] = pace[1, 3] = np.inf
+    pace[1, 3] = np.inf
+    assert ground(pace).home.tolist() == [0, 1, 6, 7, 8, 12, 13, 14, 18, 19, 20]
+
+
+def test_nobody_squeezes_past_the_corner_of_a_lethal_cell() -> None:
+    pace = flat(2, 2)
+    pace[0, 1] = np.inf
+    assert ground(pace).step(0, 3) is None
+    assert ground(pace).step(0, 4) == 2
+    pace[1, 0] = np.inf
+    assert len(ground(pace).home) == 1
+
+
+def test_a_terrain_without_a_passable_cell_is_refused() -> None:
+    with pytest.raises(TerrainError, match="every cell of the terrain is lethal"):
+        ground(np.full((3, 3), np.inf, np.float32))
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 10_000), st.sampled_from(["random", "waypoints", "evade"]))
+def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
+    where = ground(rough(seed))
+    one = walker(where, where.random_home(random.Random(seed)), walk, seed=seed)
+    vehicles = where.home[:3]
+    for _ in range(80):
+        before, heading_to = one.cell, one.towards
+        one.advance(where, 3.0, vehicles, Budget())
+        if one.towards is not None:
+            assert one.towards in [to for _, to in where.steps(one.cell)]
+        assert not where.lethal(one.cell)
+        if one.cell != before and heading_to is not None:
+            assert heading_to in [to for _, to in where.steps(before)]
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 10_000))
+def test_a_way_is_the_cheapest_there_is(seed: int) -> None:
+    where = ground(rough(seed, 12, 14))
+    start = where.random_home(random.Random(seed))
+    way = where.way(start, random.Random(seed))
+    cost, at = 0.0, start
+    for cell in way:
+        assert cell in [to for _, to in where.steps(at)]
+        cost += where.length_m(at, cell) * float(where.pace_s_per_m.flat[cell])
+        at = cell
+    assert cost == pytest.approx(naive_cost(where, start, at))
+
+
+def naive_cost(where: Ground, start: int, end: int) -> float:
+    """Bellman-Ford: slow and obviously right."""
+    cost = {start: 0.0}
+    changed = True
+    while changed:
+        changed = False
+        for cell, so_far in list(cost.items()):
+            for _, to in where.steps(cell):
+                there = so_far + where.length_m(cell, to) * float(where.pace_s_per_m.flat[to])
+                if there < cost.get(to, math.inf) - 1e-12:
+                    cost[to] = there
+                    changed = True
+    return cost[end]
+
+
+def test_a_walled_in_target_stays_where_it_is() -> None:
+    pace = flat(5, 5)
+    pace[1:4, 1:4] = np.inf
+    pace[2, 2] = FLAT
+    where = ground(pace)
+    walks: tuple[Walk, ...] = ("random", "waypoints", "evade")
+    for walk in walks:
+        one = walker(where, 12, walk)
+        one.advance(where, 100.0, NOBODY, Budget())
+        assert one.cell == 12
+
+
+@pytest.mark.parametrize(
+    ("speed", "pace", "metres"),
+    [
+        (4.0, 0.1, 40.0),
+        (4.0, 0.4, 10.0),
+        (4.0, 0.05, 80.0),
+        (10.0, 0.1, 100.0),
+        (50.0, 0.1, 100.0),
+        (0.0, 0.1, 0.0),
+    ],
+)
+def test_ten_seconds_of_driving(speed: float, pace: float, metres: float) -> None:
+    """At 10 m/s on level ground: a target's own speed there, as much slower on slow ground, never outrunning it."""
+    where = ground(np.full((1, 40), pace, np.float32))
+    config = TargetConfig(speed_m_per_s=speed)
+    one = walker(where, 0, "waypoints", slowness_of(config, CostConfig(flat_speed_m_per_s=10.0)))
+    one.way = list(range(39, 0, -1))
+    for _ in range(100):
+        one.advance(where, 0.1, NOBODY, Budget())
+    x_m, _ = one.position_m(where)
+    assert x_m - 5.0 == pytest.approx(metres, abs=1e-4)
+
+
+def test_an_evader_gets_away_from_the_vehicles_near_it() -> None:
+    where = ground(flat())
+    grid = where.grid
+    one = walker(where, grid.cell(20, 25), "evade")
+    vehicles = np.array([grid.cell(20, 22), grid.cell(18, 23)])
+    one.advance(where, 8.0, vehicles, Budget())
+    assert min(grid.distance_cells(one.cell, cell) for cell in vehicles.tolist()) >= 7
+
+
+def test_ways_are_computed_one_a_tick() -> None:
+    where = ground(flat())
+    walkers = [walker(where, 100 * n, "waypoints") for n in range(4)]
+    for ticked in range(1, 5):
+        budget = Budget()
+        for one in walkers:
+            one.advance(where, 0.1, NOBODY, budget)
+        assert sum(1 for one in walkers if one.way) == ticked
+
+
+def test_a_jump_leads_far_away_and_clear_of_vehicles() -> None:
+    where = ground(flat())
+    grid = where.grid
+    vehicles = np.array([grid.cell(row, 40) for row in range(40)])
+    for seed in range(50):
+        place = far_place(where, grid.cell(20, 10), vehicles, 3, random.Random(seed))
+        row, col = grid.row_col(place)
+        assert math.hypot(row - 20, col - 10) >= math.hypot(40, 50) / 4
+        assert abs(col - 40) > 3

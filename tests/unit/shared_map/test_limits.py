@@ -1,0 +1,121 @@
+"""Quotas: an author that overdraws its budget waits, loses nothing and holds nobody up."""
+
+from __future__ import annotations
+
+import numpy as np
+from support.map_strategies import set_of
+from support.swarm_model import SwarmModel
+
+from shared_map.keeper.service import THROTTLED
+from shared_map.keeper.store import KeeperStore
+from shared_map.replication.limits import Quota
+from swarm.bus.bus import Event, Heard
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import MapConfig, Scenario
+from swarm.wire.messages.processes import Note, Stats
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import NOTE
+
+
+def test_an_author_that_overdraws_its_budget_waits_until_it_has_filled_up_and_others_do_not() -> None:
+    quota = Quota(author_marks_per_s=10)
+    loud, calm = set_of("loud", 0, 1, {}), set_of("calm", 0, 1, {})
+    assert quota.admits(loud, 0)
+    quota.charge("loud", 150, 0)  # of ten seconds' worth: 50 too many
+    assert not quota.admits(loud, NS_PER_S)
+    assert quota.admits(calm, NS_PER_S)
+    assert quota.throttled == ["loud"]
+    assert quota.due(5 * NS_PER_S) is None
+    assert quota.due(6 * NS_PER_S) == loud
+    assert quota.due(6 * NS_PER_S) is None
+    assert quota.throttled == []
+
+
+def test_of_a_waiting_tile_only_the_newest_set_is_kept() -> None:
+    quota = Quota(author_marks_per_s=1)
+    quota.charge("loud", 100, 0)
+    for seq in (3, 9, 5):
+        assert not quota.admits(set_of("loud", 0, seq, {}), 0)
+    assert quota.due(1000 * NS_PER_S) == set_of("loud", 0, 9, {})
+    assert quota.due(1000 * NS_PER_S) is None
+
+
+def test_budgets_that_are_full_again_are_forgotten() -> None:
+    quota = Quota(author_marks_per_s=1)
+    quota.charge("a", 1, 0)
+    quota.forget(100 * NS_PER_S)
+    assert quota._authors == {}
+
+
+def test_of_all_together_only_who_exceeds_its_share_waits() -> None:
+    quota = Quota(author_marks_per_s=1000, total_marks_per_s=100)
+    for name in ("loud", "calm"):
+        assert quota.admits(set_of(name, 0, 1, {}), 0)
+    quota.charge("calm", 10, 0)
+    quota.charge("loud", 3000, 0)  # all are allowed 1,000 in ten seconds
+    for second in range(2, 40):
+        now_ns = second * NS_PER_S
+        assert not quota.admits(set_of("loud", 0, second, {}), now_ns), second
+        assert quota.admits(set_of("calm", 0, second, {}), now_ns), second
+        quota.charge("calm", 40, now_ns)
+        assert quota.throttled == ["loud"]
+
+
+def test_what_others_leave_of_the_total_may_be_used() -> None:
+    quota = Quota(author_marks_per_s=1000, total_marks_per_s=100)
+    for second in range(100):
+        now_ns = second * NS_PER_S
+        for name, marks in (("busy", 90), ("calm", 1)):
+            assert quota.admits(set_of(name, 0, second, {}), now_ns), (name, second)
+            quota.charge(name, marks, now_ns)
+
+
+def test_two_that_wait_take_turns() -> None:
+    quota = Quota(author_marks_per_s=10)
+    for name in ("a", "b"):
+        quota.charge(name, 101, 0)
+        for tile in range(3):
+            quota.admits(set_of(name, tile, 1, {}), 0)
+    let_in = []
+    while (each := quota.due(100 * NS_PER_S)) is not None:
+        let_in.append(each.author)
+    assert let_in == ["a", "b"] * 3
+
+
+def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up() -> None:
+    swarm = SwarmModel(scenario=Scenario(map=MapConfig(author_marks_per_s=20)))
+    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
+    keeper._sync._quota = Quota(20)
+    notes: list[str] = []
+
+    def hear(event: Event) -> None:
+        if isinstance(event, Heard) and isinstance(event.message, Note):
+            notes.append(event.message.text)
+
+    swarm.network.bus("ear").subscribe(NOTE, hear)
+    loud, calm, listener = swarm.writer("loud.1"), swarm.writer("calm.1"), swarm.listener("p")
+    swarm.run(1)
+    cells = np.arange(40 * 70)
+    for kind in (MarkKind.LETHAL, MarkKind.CLEAR):
+        loud.sync.publish(loud.replica.write(cells, kind, 0.0, swarm.now_ns))
+        swarm.run(0.2)
+    calm.sync.publish(calm.replica.write([5], MarkKind.LETHAL, 0.0, swarm.now_ns))
+    swarm.run(1)
+    assert listener.sync.throttled == ["loud.1"]
+    assert "calm.1" in listener.replica.held.ledger.held()
+    assert keeper.counters.gauges[THROTTLED + "loud.1"] == 1
+    assert notes == ["author loud.1 marks more than its share: it is heard with delay"]
+    swarm.run(400)
+    assert listener.sync.throttled == []
+    assert THROTTLED + "loud.1" not in keeper.counters.gauges
+    assert (
+        listener.replica.held.fingerprint() == loud.replica.held.fingerprint() == keeper.replica.held.fingerprint()
+    )
+
+
+def test_status_names_who_is_throttled() -> None:
+    from launch_scripts.commands.query import _throttled
+
+    gauges = {"sets_waiting": 0.0, THROTTLED + "loud.1": 1.0}
+    stats = Stats(role="keeper", id="0", incarnation=1, stamp_ns=1, counts={}, gauges=gauges, histograms={})
+    assert _throttled({("keeper", "0"): stats}) == ["loud.1"]
