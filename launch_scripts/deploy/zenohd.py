@@ -13,12 +13,14 @@ from swarm.wire.topics import (
     DIGEST,
     FLEET,
     FOLLOWED,
+    KNOWN,
     MARKS,
     NOTE,
-    RESERVATIONS,
     SIGHTED,
+    STANDING,
     STATS,
-    TERRITORY,
+    STORED,
+    TABLE,
 )
 
 ANSWERS = ("declare_queryable", "reply")
@@ -73,22 +75,19 @@ def zenohd_config(
 def access_control(namespace: str, trusted: Sequence[str], agents: Sequence[str]) -> dict[str, Any]:
     """Access control rules, by the common name of the certificate at the other end of a link.
 
-    An agent hears everything and writes under its own name only: authors are called `GROUP.ID.INCARNATION`. It
-    answers for others, too, where it is asked for the newest reservations of those that are gone.
+    An agent hears everything and writes under its own name only: authors are called `GROUP.ID.INCARNATION`.
     """
     whole = [f"{namespace}/**"]
     rules = [_rule("all", (*PUTS, *READS), whole), _rule("hear", READS, whole)]
     # Egress is a rule of its own: messages of others must reach those that may hear them.
     rules.append(_rule("told", PUTS, whole, flows=["egress"]))
     rules.append(_rule("asked", READS, whole, flows=["egress"]))
-    # Only those which heard a dead agent last know where its vehicles stand.
-    rules.append(_rule("relayed", ANSWERS, [RESERVATIONS.expression(namespace)]))
     policies = [{"rules": ["all"], "subjects": ["trusted"]}] if trusted else []
     subjects = [{"id": "trusted", "cert_common_names": list(trusted)}] if trusted else []
     for agent in agents:
         rules.append(_rule(f"own-{agent}", PUTS, [f"{namespace}/{key}" for key in own_keys(agent)]))
         subjects.append({"id": agent, "cert_common_names": [agent]})
-        policies.append({"rules": ["hear", "told", "asked", "relayed", f"own-{agent}"], "subjects": [agent]})
+        policies.append({"rules": ["hear", "told", "asked", f"own-{agent}"], "subjects": [agent]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -106,8 +105,8 @@ def own_keys(name: str) -> list[str]:
         DIGEST.key.format(author=author),
         FLEET.key.format(region="*", author=author),
         SIGHTED.key.format(target="*", author=author),
-        RESERVATIONS.key.format(agent=agent),
-        TERRITORY.key.format(agent=agent),
+        *(topic.key.format(plot="*", agent=agent) for topic in (STANDING, TABLE, STORED)),
+        KNOWN.key.format(agent=agent),
         FOLLOWED.key.format(agent=agent, vehicle="*"),
         STATS.key.format(role="agent", id=agent),
         NOTE.key.format(role="agent", id=agent),

@@ -12,10 +12,10 @@ from functools import cache
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.traffic import Known, KnownRequest, Standing, Stored, Table
-from vehicle_agent.traffic.council import Action, Council, OwnRecord
 from vehicle_agent.traffic.holdings import Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.plots import Plots
+from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
 
 MS = NS_PER_S // 1000
 TICK_NS = 100 * MS
@@ -54,7 +54,7 @@ class Process:
         self.world, self.agent, self.disk = world, agent, disk
         self.alive = True
         self.hung: list[Callable[[], None]] | None = None
-        self.council = Council(agent, world.plots, world.spawns, disk.own, disk.saved, self.find_body)
+        self.rights = RightOfWay(agent, world.plots, world.spawns, disk.own, disk.saved, self.find_body)
         # A clock of its own: it may be years off, and leaps.
         self.offset_ns = world.chance.randrange(60 * 60 * NS_PER_S)
         self.ages: dict[str, int] = {}
@@ -71,7 +71,7 @@ class Process:
         if self.world.last_disk.setdefault(self.agent, self.disk) is not self.disk:
             self.disk.bodies.clear()  # they have been driven from elsewhere since
         self.world.last_disk[self.agent] = self.disk
-        self.perform(self.council.begin(self.world.chance.getrandbits(32)))
+        self.perform(self.rights.begin(self.world.chance.getrandbits(32)))
 
     def perform(self, actions: list[Action]) -> None:
         for action in actions:
@@ -83,7 +83,7 @@ class Process:
                         self.world.claim(self, action, member)
                 case Standing():
                     for member in self.world.plots.members(action.plot):
-                        self.world.send(self, member, lambda to, s=action: to.council.hear_standing(s, to.now_ns))
+                        self.world.send(self, member, lambda to, s=action: to.rights.hear_standing(s, to.now_ns))
                 case Table():
                     self.world.send(self, None, lambda to, t=action: to.hear_table(t))
                 case Stored():
@@ -94,34 +94,34 @@ class Process:
                     self.world.refused.append(action.text)
 
     def hear_table(self, table: Table) -> None:
-        actions, placed = self.council.hear_table(table, self.now_ns)
+        actions, placed = self.rights.hear_table(table, self.now_ns)
         self.perform(actions)
         self.place(placed)
 
     def hear_stored(self, stored: Stored) -> None:
-        self.place(self.council.hear_stored(stored, self.now_ns))
+        self.place(self.rights.hear_stored(stored, self.now_ns))
 
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:
-            self.disk.bodies[vehicle] = self.council.holdings.path(vehicle)[0]
+            self.disk.bodies[vehicle] = self.rights.holdings.path(vehicle)[0]
             self.world.unmoved.pop(vehicle, None)
             self.world.placed += 1
         self.world.look()
 
     def tick(self) -> None:
-        holdings = self.council.holdings
+        holdings = self.rights.holdings
         wishes = {}
-        if holdings is not None and not holdings.replaced:
+        if holdings.life and not holdings.replaced:
             for vehicle in self.world.spawns[self.agent]:
                 if holdings.path(vehicle):
                     self.drive(vehicle)
                     wishes[vehicle] = self.wish(vehicle)
-        self.perform(self.council.tick(wishes, self.now_ns))
-        if holdings is not None and holdings.replaced:
+        self.perform(self.rights.tick(wishes, self.now_ns))
+        if holdings.replaced:
             self.world.ended(self)
 
     def drive(self, vehicle: str) -> None:
-        holdings, chance = self.council.holdings, self.world.chance
+        holdings, chance = self.rights.holdings, self.world.chance
         if chance.random() < 0.05:
             holdings.give_back(vehicle)
         while len(holdings.path(vehicle)) > 1 and chance.random() < 0.7:
@@ -133,7 +133,7 @@ class Process:
 
     def wish(self, vehicle: str) -> Wish:
         world = self.world
-        path = holdings_path = self.council.holdings.path(vehicle)
+        path = holdings_path = self.rights.holdings.path(vehicle)
         goal = world.goals[vehicle]
         if path[0] == goal:
             goal = world.new_goal(vehicle)
@@ -147,7 +147,7 @@ class Process:
         here = path[0]
         wants = sorted(world.next_to(here), key=lambda cell: (cost[cell], cell))[:8]
         better = sum(cost[cell] < cost[here] for cell in wants)
-        pushed = self.council.holdings.pushed(vehicle)
+        pushed = self.rights.holdings.pushed(vehicle)
         if pushed:
             better = len(wants)
         return Wish(ahead, wants, better, max(self.ages[vehicle], pushed))
@@ -275,14 +275,14 @@ class TrafficWorld:
 
     def claim(self, source: Process, claim: AskPromises, member: str) -> None:
         def ask(to: Process) -> None:
-            actions = to.council.hear_claim(claim.plot, source.agent, claim.epoch, to.now_ns)
+            actions = to.rights.hear_claim(claim.plot, claim.epoch, to.now_ns)
             to.perform([action for action in actions if not isinstance(action, Table)])
             for table in actions:
                 if isinstance(table, Table):
                     self.carry(to, source, lambda: answer(table))
 
         def answer(table: Table) -> None:
-            source.council.hear_promise(member, claim.epoch, table, source.now_ns)
+            source.rights.hear_promise(member, claim.epoch, table, source.now_ns)
             self.takeovers += 1
 
         self.send(source, member, ask)
@@ -291,13 +291,13 @@ class TrafficWorld:
         """Ask everybody what they know of us, again and again until all have noted our file."""
 
         def answer(to: Process) -> None:
-            for action in to.council.answer_known(KnownRequest(agent=source.agent, disk=source.disk.own.disk)):
+            for action in to.rights.answer_known(KnownRequest(agent=source.agent, disk=source.disk.own.disk)):
                 if isinstance(action, Known):
-                    self.carry(to, source, lambda: source.perform(source.council.hear_known(action)))
+                    self.carry(to, source, lambda: source.perform(source.rights.hear_known(action)))
                 else:
                     to.perform([action])
 
-        if source.alive and (first or not source.council.settled):
+        if source.alive and (first or not source.rights.settled):
             for process in self.processes:
                 if process.agent != source.agent:
                     self.carry(source, process, lambda to=process: answer(to))

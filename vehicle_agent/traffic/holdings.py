@@ -51,17 +51,14 @@ class _View:
 class Holdings:
     """The host's side of right of way.
 
-    dead      earlier lives of this host that are proved to have ended
-
+    life      which life of the host this is; 0 before `begin`
     plots     those that concern the host now: it speaks to their members and listens to their tables
     replaced  a later life of this host has spoken: this one must end
     """
 
-    def __init__(
-        self, plots: Plots, agent: str, vehicles: Collection[str], life: int, dead: Sequence[int] = ()
-    ) -> None:
-        self.life = life
-        self._dead = list(dead)
+    def __init__(self, plots: Plots, agent: str, vehicles: Collection[str]) -> None:
+        self.life = 0
+        self._dead: list[int] = []
         self.replaced = False
         self.plots: dict[int, None] = {}
         self._plots = plots
@@ -70,6 +67,11 @@ class Holdings:
         self._paths: dict[str, list[int]] = {}
         self._views: dict[int, _View] = {}
         self._seq = 0
+
+    def begin(self, life: int, dead: Sequence[int]) -> None:
+        """Begin a life; `dead` are earlier ones that are proved to have ended."""
+        self.life = life
+        self._dead = list(dead)
 
     # --- what is held ---------------------------------------------------------------------------------------
 

@@ -1,10 +1,9 @@
-"""Messages about vehicles: positions, right of way, followed routes."""
+"""Messages about vehicles: positions and followed routes."""
 
 from __future__ import annotations
 
 import enum
 
-import msgspec
 import numpy as np
 
 from swarm.wire.fields import Cell, Natural, check_column, check_directions, check_finite, check_id
@@ -81,83 +80,6 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
         for name in ("east_m", "south_m", "heading_rad"):
             if not np.isfinite(column(getattr(self, name), "<f4")).all():
                 raise ValueError(f"{name} must be finite")
-
-
-class RequestedCell(msgspec.Struct, frozen=True, kw_only=True):
-    """A cell that a vehicle requests. Of rival requests the lowest (ticket, agent, vehicle) goes first.
-
-    ticket  Lamport time of the request
-    """
-
-    vehicle: str
-    cell: Cell
-    ticket: Natural
-
-    def __post_init__(self) -> None:
-        check_id("vehicle", self.vehicle)
-
-
-class Reservations(Message, frozen=True, kw_only=True, tag=schema_of("reservations")):
-    """The cells that an agent's vehicles hold and request, and the newest reservations that it has seen of others.
-
-    seq        grows with each message within an incarnation; 0 while the agent has not placed its vehicles
-    clock      the sender's Lamport clock
-    held       vehicle -> the cells that it occupies or may enter, the one on which it stands first
-    requested  in the order in which each vehicle enters them
-    seen       agent -> [incarnation, seq] of the newest reservations heard of it
-    """
-
-    agent: str
-    incarnation: Natural
-    seq: Natural
-    clock: Natural
-    held: dict[str, list[Cell]]
-    requested: list[RequestedCell]
-    seen: dict[str, tuple[Natural, Natural]]
-
-    def __post_init__(self) -> None:
-        check_id("agent", self.agent)
-        for vehicle in self.held:
-            check_id("vehicle", vehicle)
-        if any(not cells for cells in self.held.values()):
-            raise ValueError("a vehicle holds at least the cell that it stands on")
-
-
-class TerritoryRequest(Message, frozen=True, kw_only=True, tag=schema_of("territory-request")):
-    """Tells all agents in which plots the sender may reserve cells, and asks each for its own.
-
-    seq     grows with each change within an incarnation; 0 while the agent has not placed its vehicles
-    plots   squares of 64 x 64 cells, numbered row by row as regions are
-    silent  dead agents whose newest reservations the sender needs
-    """
-
-    agent: str
-    incarnation: Natural
-    seq: Natural
-    plots: list[Natural]
-    silent: list[str] = []
-
-    def __post_init__(self) -> None:
-        check_id("agent", self.agent)
-        for agent in self.silent:
-            check_id("silent", agent)
-
-
-class TerritoryReply(Message, frozen=True, kw_only=True, tag=schema_of("territory")):
-    """The plots in which an agent may reserve cells: its answer to a `TerritoryRequest`.
-
-    seq, plots    as in the request
-    reservations  the newest that it has heard of the agents named as silent
-    """
-
-    agent: str
-    incarnation: Natural
-    seq: Natural
-    plots: list[Natural]
-    reservations: list[Reservations] = []
-
-    def __post_init__(self) -> None:
-        check_id("agent", self.agent)
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from vehicle_agent.traffic.resumption import Resumption, nearest_free
 
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, plan_agents
@@ -24,7 +25,6 @@ from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.fleet import FleetReport
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.traffic.resumption import Resumption, nearest_free
 
 GRID = GridSpec(12, 12, 10.0)
 LEVEL = np.full((12, 12), 0.1, np.float32)
