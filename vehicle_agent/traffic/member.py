@@ -84,7 +84,8 @@ class Member:
 
     def hear_standing(self, standing: Standing, now_ns: int) -> None:
         if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
-            self._due_ns = max(self._due_ns, now_ns + _START_NS + self._rank * _RANK_NS)
+            wait_ns = _START_NS if self.promised else 0  # nobody can be in charge of a plot that is new
+            self._due_ns = max(self._due_ns, now_ns + wait_ns + self._rank * _RANK_NS)
             self._acked_ns = now_ns
         self._wanted_ns = now_ns
         if self.warden is not None:

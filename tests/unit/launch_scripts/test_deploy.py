@@ -38,7 +38,7 @@ def test_an_agent_writes_nothing_but_what_its_certificate_allows(monkeypatch: py
     agents = [name for name in written if name.startswith("agent-")]
     assert len(agents) == 3
     roots = {key.partition("/")[0] for name in agents for key in written[name]}
-    assert roots >= {"marks", "digest", "fleet", "reservations", "sighted", "vehicle", "stats"}
+    assert roots >= {"marks", "digest", "fleet", "standing", "table", "stored", "sighted", "vehicle", "stats"}
     for name in agents:
         allowed = own_keys(f"all.{name.removeprefix('agent-')}")
         refused = {key for key in written[name] if not any(matches(key, own) for own in allowed)}
