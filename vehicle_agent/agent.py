@@ -97,7 +97,9 @@ class Agent:
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
-        self._steering = Steering(ground.grid, ground.pace, scenario.planner, config.reserve_cells, chance)
+        self._steering = Steering(
+            ground.grid, ground.pace, scenario.planner, config.reserve_cells, chance, holdings.occupied
+        )
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._requests = 0

@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.cost_map import CostMap
-from shared_map.presence import Presence
 from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
-from swarm.clock import NS_PER_S
 from swarm.config.scenario import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
@@ -25,7 +23,7 @@ from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
+from swarm.wire.messages.vehicles import Followed, VehicleState
 from swarm.wire.topics import (
     COST,
     FLEET,
@@ -48,10 +46,8 @@ from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTarge
 
 log = logging.getLogger(__name__)
 
-_NEAR_CELLS = 4
-"""Bucket of the presence index: about the radius in which traffic looks for other vehicles."""
 _LEAD_CELLS = 24
-"""Regions are followed so far ahead of the vehicles."""
+"""Marks are followed so far ahead of the vehicles at least."""
 
 
 class AgentService:
@@ -95,8 +91,6 @@ class AgentService:
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
-        lease_ns = int(scenario.network.lease_s * NS_PER_S)
-        self._presence = Presence(grid, lease_ns, _NEAR_CELLS * grid.resolution_m, self._replica.filter)
         self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
         self._detector = TargetDetector(
             grid,
@@ -107,7 +101,6 @@ class AgentService:
         self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
         self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings)
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
-        self._near_fleets = Interest(grid, lead_cells)
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
@@ -140,8 +133,6 @@ class AgentService:
             return
         agent = self._agent
         match event:
-            case Heard(message=Fleet() as fleet):
-                self._presence.hear(fleet, now_ns)
             case Heard(topic=topic, message=TargetPose() as pose):
                 self._detector.set_truth(pose)
                 if topic is POSE and pose.target not in self._untracked.targets:
@@ -180,8 +171,8 @@ class AgentService:
             self._stand_down(now_ns)
         if self._cost_map.take_dirty():
             agent.map_changed(now_ns, look=True)
-        self._follow()
-        self._presence.expire(now_ns)
+        if agent.places:
+            self._sync.enter(self._near_marks.update(agent.places))
         agent.begin_drive(now_ns)
         while (findings := agent.drive()) is not None:
             if len(findings):
@@ -193,7 +184,6 @@ class AgentService:
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
-            self._presence.hear(fleet, now_ns)
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
         self._right_of_way.tick(agent.wishes, agent.places, now_ns)
         self._gauge()
@@ -219,19 +209,6 @@ class AgentService:
         text = f"agent {self._setup.id} runs elsewhere, too, and that one is the younger: this one drives no more"
         log.warning(text)
         self._member.note(now_ns, "replaced", text)
-
-    def _follow(self) -> None:
-        """Subscribe to what concerns our vehicles where they are now."""
-        places = self._agent.places
-        if not places:
-            return
-        self._sync.enter(self._near_marks.update(places))
-        before = self._near_fleets.squares
-        after = self._near_fleets.update(places)
-        for region in sorted(after - before):
-            self._bus.subscribe(FLEET, self._post, region=region)
-        for region in sorted(before - after):
-            self._bus.unsubscribe(FLEET, region=region)  # what was heard there ends with its lease
 
     # --- targets in sight -----------------------------------------------------------------------------------
 

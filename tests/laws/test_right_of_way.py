@@ -1,5 +1,5 @@
 """Right of way: never two vehicles on one cell, and everybody moves again once all is quiet, whatever the network, the
-processes and the clocks do. Each rule that decision 22 needs is taken out in turn, and the law must notice."""
+processes and the clocks do. Each rule that decision 25 needs is taken out in turn, and the law must notice."""
 
 from __future__ import annotations
 

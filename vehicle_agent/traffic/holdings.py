@@ -36,6 +36,8 @@ class _View:
     knows    stamp of the table in use; it never goes back, not even when the vehicles leave the plot and return
     heard    the newest standing of ours that the table in use takes into account
     seen     vehicle -> the cells that the table in use grants it
+    pushed   vehicle -> the age with which it is to make way into another plot
+    others   the cells that are granted to vehicles of other hosts, or to nobody
     quiet    the first standing from which on we want nothing here; None while we do
     """
 
@@ -45,6 +47,7 @@ class _View:
     heard: int = 0
     seen: dict[str, list[int]] = field(default_factory=dict)
     pushed: dict[str, int] = field(default_factory=dict)
+    others: frozenset[int] = frozenset()
     quiet: int | None = None
 
 
@@ -82,6 +85,12 @@ class Holdings:
     def pushed(self, vehicle: str) -> int:
         """The age with which it is asked to make way into another plot; 0 if it is not."""
         return max((view.pushed.get(vehicle, 0) for view in self._views.values()), default=0)
+
+    def occupied(self, cell: int) -> bool:
+        """Whether another vehicle holds a cell, as far as the tables in use tell."""
+        view = self._views.get(self._plots.of(cell))
+        mine = any(cell in path for path in self._paths.values())
+        return mine or (view is not None and cell in view.others)
 
     def moved(self, vehicle: str, cell: int) -> None:
         """It has come to the next cell of its path."""
@@ -136,6 +145,14 @@ class Holdings:
             return []  # what it grants was granted to another life
         view.knows, view.heard = stamp, heard
         view.pushed = {id: age for id, age in table.pushed.items() if id in self._paths}
+        view.others = frozenset(
+            cell
+            for cells in (
+                *(grant.cells for vehicle, grant in table.grants.items() if vehicle not in self._paths),
+                *(shut.cells for shut in table.shut),
+            )
+            for cell in cells
+        )
         placed = []
         for vehicle in self._vehicles:
             grant = table.grants.get(vehicle)

@@ -89,7 +89,7 @@ class RightOfWay:
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
         first.
         """
-        if request.agent not in self._spawns:
+        if request.agent not in self._spawns or request.agent == self.agent:
             return []
         actions: list[Action] = []
         if request.agent not in self.own.noted:
@@ -101,10 +101,12 @@ class RightOfWay:
 
     def hear_known(self, known: Known) -> list[Action]:
         """An answer to our question."""
+        if known.agent not in self._spawns or known.agent == self.agent:
+            return []
         if not is_far_ahead(known.life, self._known_life):
             self._known_life = max(self._known_life, known.life)
         self.holdings.watch([plot for plot in known.plots if plot < self.plots.count])
-        if known.disk != self.own.disk or known.agent in self.own.noted_by or known.agent not in self._spawns:
+        if known.disk != self.own.disk or known.agent in self.own.noted_by:
             return []
         self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
         return [self.own]

@@ -18,6 +18,8 @@ from vehicle_agent.traffic.holdings import Wish
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
 _OFF_ROUTE = 4.0
+_OCCUPIED = 0.9
+"""What it costs to push another vehicle, in cells: less than a step, so that one that has no other way on pushes."""
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for so long on its way asks its planner for another route."""
 _MS = NS_PER_S // 1000
@@ -32,6 +34,7 @@ class Steering:
 
     pace         float32 (rows, cols), s/m; inf is lethal; read at each call
     reserve      cells ahead of itself that a vehicle may be granted
+    occupied     whether another vehicle holds a cell
     """
 
     def __init__(
@@ -41,6 +44,7 @@ class Steering:
         planner: PlannerConfig,
         reserve: int,
         chance: random.Random,
+        occupied: Callable[[int], bool],
     ) -> None:
         self._grid = grid
         self._pace = pace.reshape(-1)
@@ -48,6 +52,7 @@ class Steering:
         self._corner_cutting = planner.corner_cutting
         self._reserve = reserve
         self._chance = chance
+        self._occupied = occupied
         self._since_ns: dict[str, int] = {}
         """Vehicle -> since when it has been on its way to a target."""
         self._stood_ns: dict[str, tuple[int, int]] = {}
@@ -69,7 +74,9 @@ class Steering:
         if vehicle.in_reach or vehicle.target is None:
             self._since_ns[vehicle.id] = now_ns
             steps = self.steps(path[0]) if still else []
-            wants = sorted(steps, key=lambda cell: (not in_reach(cell), self._chance.random()))
+            wants = sorted(
+                steps, key=lambda cell: (not in_reach(cell), self._occupied(cell), self._chance.random())
+            )
             return Wish((), wants, len(wants) if pushed_ms else 0, pushed_ms)
         age_ms = (now_ns - self._since_ns.setdefault(vehicle.id, now_ns)) // _MS
         age_ms = max(1, min(age_ms, _OLDEST_MS), pushed_ms)
@@ -77,7 +84,9 @@ class Steering:
         if not still:
             return Wish(ahead, (), 0, age_ms)
         near = vehicle.route.near(_NEAR_CELLS)
-        cost = {cell: self._cost(cell, near) for cell in self.steps(path[0])}
+        cost = {
+            cell: self._cost(cell, near) + _OCCUPIED * self._occupied(cell) for cell in self.steps(path[0])
+        }
         wants = sorted(cost, key=lambda cell: (cost[cell], self._chance.random()))
         here = self._cost(path[0], near)
         better = len(wants) if pushed_ms else sum(each < here for each in cost.values())

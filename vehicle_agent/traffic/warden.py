@@ -1,7 +1,7 @@
 """The warden of a plot: it grants cells to vehicles, and frees them only by their host's own word.
 
 No cell is in two vehicles' grants; a grant is never revoked. So whoever obeys a table that a majority has stored is
-alone on its cells (see decision 22 for the proof).
+alone on its cells (see decision 25 for the proof).
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-WIRE_VERSION = 3
+WIRE_VERSION = 4
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema"):

@@ -1,4 +1,4 @@
-"""Messages about right of way: what hosts say of their vehicles, and what wardens grant (decision 22)."""
+"""Messages about right of way: what hosts say of their vehicles, and what wardens grant (decision 25)."""
 
 from __future__ import annotations
 
