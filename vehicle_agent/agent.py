@@ -67,7 +67,7 @@ class LocalMap:
 class Agent:
     """The vehicles of one agent process.
 
-    Call `place` as soon as a vehicle's place is known. Then in each tick call `begin_drive`, `drive` until it returns
+    Call `place` as soon as a vehicle's place is known. In each tick call `begin_drive`, `drive` until it returns
     None, writing what it found into the map each time, and `decide`.
 
     plan      which vehicles, of which group

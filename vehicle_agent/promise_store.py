@@ -70,9 +70,7 @@ class FilePromiseStore(MemoryPromiseStore):
             self._lock = os.open(f"{path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise StoreError(
-                f"{path} is in use: the same agent runs on this machine already; end it first"
-            ) from error
+            raise StoreError(f"{path} is in use: the same agent runs here already; end it first") from error
         except OSError as error:
             raise StoreError(f"cannot open {path}: {error.strerror}") from error
         self._read()

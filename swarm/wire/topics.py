@@ -162,16 +162,16 @@ STANDING = Topic(
 )  # fmt: skip
 TABLE = Topic(
     "table", "table/{plot}/{agent}", Table,
-    "which cells the warden of a plot has granted; a member that is asked promises an epoch and answers with what it "
-    "has stored", "on change, at least 5 Hz while vehicles are near", request=Claim, priority=Priority.INTERACTIVE,
+    "which cells the warden of a plot has granted; a member that is asked promises an epoch and answers with what "
+    "it has stored", "on change, at least 5 Hz where vehicles are", request=Claim, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
     "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file", "per table",
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(
-    "known", "known/{agent}", Known, "what an agent has on file about another, for a new life of that", "asked at a start",
-    request=KnownRequest, published=False, priority=Priority.INTERACTIVE,
+    "known", "known/{agent}", Known, "what an agent has on file about another, for a new life of that",
+    "asked at a start", request=KnownRequest, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
@@ -211,8 +211,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, STANDING, TABLE, STORED, KNOWN, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED,
-    TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, STANDING, TABLE, STORED, KNOWN, FOLLOWED, PUSHED_ROUTE, POSE,
+    SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

@@ -1,5 +1,5 @@
-"""Right of way: never two vehicles on one cell, and everybody moves again once all is quiet, whatever the network, the
-processes and the clocks do. Each rule that decision 25 needs is taken out in turn, and the law must notice."""
+"""Right of way: never two vehicles on one cell, and everybody moves again once all is quiet, whatever the network,
+the processes and the clocks do. Each rule that decision 25 needs is taken out in turn, and the law must notice."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from vehicle_agent.traffic.warden import Warden
 
 QUIET_S = 12.0
 SHAPES = ((3, 4, 9, 9), (4, 3, 10, 5), (8, 3, 14, 7), (2, 5, 8, 4), (5, 4, 12, 4), (1, 5, 7, 4))
-"""(agents, vehicles each, side of the map, side of a plot): from one plot to nine, with a third of the cells taken."""
+"""(agents, vehicles each, side of the map, side of a plot): one to nine plots, a sixth to a third of the cells
+taken."""
 
 
 def faults_of(chance: random.Random) -> Faults:

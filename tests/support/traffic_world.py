@@ -154,7 +154,7 @@ class Process:
 
 
 class TrafficWorld:
-    """`collisions` are pairs of different vehicles that were seen on one cell, the dead and the replaced included."""
+    """`collisions` are pairs of different vehicles that were on one cell, also of the dead and the replaced."""
 
     def __init__(
         self, seed: int, agents: int, per_agent: int, size: int, side: int, faults: Faults, walls: float = 0.0
@@ -279,7 +279,7 @@ class TrafficWorld:
             to.perform([action for action in actions if not isinstance(action, Table)])
             for table in actions:
                 if isinstance(table, Table):
-                    self.carry(to, source, lambda: answer(table))
+                    self.carry(to, source, lambda table=table: answer(table))
 
         def answer(table: Table) -> None:
             source.rights.hear_promise(member, claim.epoch, table, source.now_ns)
@@ -293,7 +293,7 @@ class TrafficWorld:
         def answer(to: Process) -> None:
             for action in to.rights.answer_known(KnownRequest(agent=source.agent, disk=source.disk.own.disk)):
                 if isinstance(action, Known):
-                    self.carry(to, source, lambda: source.perform(source.rights.hear_known(action)))
+                    self.carry(to, source, lambda known=action: source.perform(source.rights.hear_known(known)))
                 else:
                     to.perform([action])
 

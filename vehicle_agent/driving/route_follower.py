@@ -26,8 +26,8 @@ class Follower:
         """Whether the route ends before its target, because the planner gave a part of it."""
 
     def begin(self, cells: Sequence[int], path: Sequence[int], partial: bool = False) -> bool:
-        """Follow a route from the first cell of a vehicle's path that it passes. False if it passes none; then nothing
-        changes."""
+        """Follow a route from the first cell of a vehicle's path that it passes. False if it passes none; then
+        nothing changes."""
         at = next((cells.index(cell) for cell in path if cell in cells), None)
         if at is None:
             return False

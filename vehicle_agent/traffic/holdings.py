@@ -211,7 +211,7 @@ class Holdings:
         ]
 
     def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
-        """Without cells that were left or given back while a table still grants them: once granted anew, such a cell
+        """Without cells that were left or given back while a table still grants them: granted anew, such a cell
         could not be told from one that is about to be freed."""
         lapsed = {cell for plot in self.plots for cell in self._views[plot].seen.get(vehicle, ())}.difference(path)
         if lapsed.isdisjoint(wish.ahead) and lapsed.isdisjoint(wish.wants):

@@ -1,7 +1,7 @@
 """A member of a plot: it promises, stores tables, and becomes the plot's warden when the last one is silent.
 
-The rules are those of a Paxos acceptor (Lamport, 1998) with the whole table as the value. What is promised or stored
-must be on file before anybody is told. No clock decides anything but when a member tries to become warden.
+The rules are those of a Paxos acceptor (Lamport, 1998) with the whole table as the value. What is promised or
+stored must be on file before anybody is told. No clock decides anything but when a member tries to become warden.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Member:
         if table.agent != self._plots.warden(self.plot, table.epoch):
             return []
         if table.epoch < self.promised:
-            # A claim of ours or of another came to nothing: let the warden claim once more, so that we can follow it.
+            # A claim of ours or of another came to nothing: let the warden claim again, so that we can follow it.
             return [Stored(plot=self.plot, agent=self._me, epoch=self.promised, seq=0)]
         if table.epoch > self.promised + _FURTHEST_EPOCH:
             return [Refused(f"{table.agent} names an epoch that is implausibly far ahead: {table.epoch}")]

@@ -2,9 +2,9 @@
 different times for their steps.
 
 The vehicle of the highest priority takes the best cell that it can get. Where another stands there, that one is
-planned next, with the priority that it inherits, and must go anywhere else; if it cannot, the first takes its second
-best. Here no vehicle enters a cell before the one that stands there has left it, so no two exchange places and none
-go around in a ring.
+planned next, with the priority that it inherits, and must go anywhere else; if it cannot, the first takes its
+second best. Here no vehicle enters a cell before the one that stands there has left it, so no two exchange places
+and none go around in a ring.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
 _OFF_ROUTE = 4.0
 _OCCUPIED = 0.9
-"""What it costs to push another vehicle, in cells: less than a step, so that one that has no other way on pushes."""
+"""What it costs to push another vehicle, in cells: less than a step, so that one without another way pushes."""
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for so long on its way asks its planner for another route."""
 _MS = NS_PER_S // 1000
@@ -29,8 +29,8 @@ _OLDEST_MS = 1 << 31
 class Steering:
     """Ranks the cells around vehicles by their routes.
 
-    A planner's route is the cost-to-go along one line. A cell beside it costs the step back to the route and the rest
-    from there; so a host needs no tree of the planner, and a vehicle that is pushed aside finds back by itself.
+    A planner's route is the cost-to-go along one line. A cell beside it costs the step back to the route and the
+    rest from there; so a host needs no tree of the planner, and one that is pushed aside finds back by itself.
 
     pace         float32 (rows, cols), s/m; inf is lethal; read at each call
     reserve      cells ahead of itself that a vehicle may be granted
@@ -84,9 +84,7 @@ class Steering:
         if not still:
             return Wish(ahead, (), 0, age_ms)
         near = vehicle.route.near(_NEAR_CELLS)
-        cost = {
-            cell: self._cost(cell, near) + _OCCUPIED * self._occupied(cell) for cell in self.steps(path[0])
-        }
+        cost = {cell: self._cost(cell, near) + _OCCUPIED * self._occupied(cell) for cell in self.steps(path[0])}
         wants = sorted(cost, key=lambda cell: (cost[cell], self._chance.random()))
         here = self._cost(path[0], near)
         better = len(wants) if pushed_ms else sum(each < here for each in cost.values())

@@ -20,8 +20,8 @@ BEAT_NS = NS_PER_S // 5
 SILENT_NS = NS_PER_S
 """Vehicles of a host that has not spoken for so long are obstacles: nobody waits for them or pushes them."""
 _AGE_BITS = 12
-"""Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is the
-older most of the time, or each lets its own wait for the other."""
+"""Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is
+the older most of the time, or each lets its own wait for the other."""
 _LIFE_BITS = 32
 _FURTHEST_LIFE = 1 << 16
 

@@ -64,7 +64,10 @@ class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
 
 
 class Grant(msgspec.Struct, frozen=True, array_like=True):
-    """The cells that one vehicle may stand on or enter, in driving order; `stamp` of the table that last added one."""
+    """The cells that one vehicle may stand on or enter, in driving order.
+
+    stamp  of the table that last added one
+    """
 
     cells: Annotated[list[Cell], Meta(min_length=1, max_length=64)]
     stamp: Stamp
