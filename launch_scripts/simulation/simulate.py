@@ -80,12 +80,12 @@ class Node:
         self._clock = simulation.scheduler.clock
         self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))
         self._phase_ns = phase_ns % self._tick_ns
-        self._skew_ns = skew_ns
+        self.skew_ns = skew_ns
         self._worker: InlineWorker | None = None
 
     def now_ns(self) -> int:
         """Time of this node's clock, its skew included."""
-        return self._clock.now_ns() + self._skew_ns
+        return self._clock.now_ns() + self.skew_ns
 
     def boot(self) -> None:
         """Start a new incarnation."""
