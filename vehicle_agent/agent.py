@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.presence import Presence
 from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
@@ -25,10 +24,8 @@ from vehicle_agent.assignment import AskCosts, Assignment
 from vehicle_agent.driving.route_follower import route_cells
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
-from vehicle_agent.traffic.deadlock import Traffic
-from vehicle_agent.traffic.resumption import Placement, Unplaced
-from vehicle_agent.traffic.right_of_way import RightOfWay
-from vehicle_agent.traffic.territory import Territory
+from vehicle_agent.traffic.holdings import Holdings, Wish
+from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
 _STALE_CELLS = 8
@@ -72,14 +69,14 @@ class LocalMap:
 class Agent:
     """The vehicles of one agent process.
 
-    Call `place` once. Then in each tick call `begin_drive`, `drive` until it returns None, writing what it found
-    into the map each time, and `decide`.
+    Call `place` as soon as a vehicle's place is known. In each tick call `begin_drive`, `drive` until it returns
+    None, writing what it found into the map each time, and `decide`.
 
-    plan       which vehicles, of which group
-    ground     the agent's map
-    spawns     agent -> vehicle -> cell where the vehicles of the run first start
-    presence   where all vehicles are; None to know of none but our own
-    territory  which agents share plots with us; None if all do
+    plan      which vehicles, of which group
+    ground    the agent's map
+    holdings  the cells that the vehicles may stand on and enter
+
+    wishes    what to ask of wardens, as of the last `decide`
     """
 
     def __init__(
@@ -88,27 +85,26 @@ class Agent:
         scenario: Scenario,
         ground: LocalMap,
         sensor: Sensor,
-        spawns: Mapping[str, Mapping[str, int]],
-        incarnation: int,
-        presence: Presence | None = None,
-        territory: Territory | None = None,
+        holdings: Holdings,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
         self.targets = list(plan.group.targets) or scenario.target_ids
-        self.rights = RightOfWay(plan.id, incarnation, spawns, territory)
+        self.holdings = holdings
+        self.wishes: dict[str, Wish] = {}
         self.blocked_ticks = 0
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = ground
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
-        presence = presence or Presence(ground.grid, 0, 1.0)
-        self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance, presence)
+        config = scenario.vehicles
+        self._steering = Steering(
+            ground.grid, ground.pace, scenario.planner, config.reserve_cells, chance, holdings.occupied
+        )
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._newest_poses = Newest(silence_ns=POSE_SILENCE_NS)
-        self._unplaced = Unplaced(ground.grid, self.rights, self._traffic.closed)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
@@ -118,24 +114,22 @@ class Agent:
 
     # --- where vehicles start -------------------------------------------------------------------------------
 
-    def place(self, placement: Placement) -> None:
-        """Put the vehicles where they stand, and take in the reservations of all agents."""
-        for reservations in placement.reservations:
-            self.rights.hear(reservations)
-        for id, cell in placement.cells.items():
-            self.rights.place(id, cell)
-            self._enter(id, cell)
-        self._unplaced.add(placement.unplaced)
+    def place(self, vehicles: Sequence[str]) -> None:
+        """These have found their places."""
+        for id in vehicles:
+            cell = self.holdings.path(id)[0]
+            self.vehicles[id] = Vehicle(id, self._map.grid, cell)
+            self._look_from[cell] = None
 
-    def _enter(self, id: str, cell: int) -> None:
-        self.vehicles[id] = Vehicle(id, self._map.grid, cell)
-        self._look_from[cell] = None
+    def stand_down(self) -> None:
+        """Another process drives the vehicles now."""
+        self.vehicles.clear()
+        self.wishes.clear()
 
     @property
     def places(self) -> list[int]:
-        """The cells that our vehicles hold, request, or will request: the territory has to cover them."""
-        reserved = [cell for id in self.vehicles for cell in (*self.rights.held(id), *self.rights.requested(id))]
-        return [*reserved, *self._unplaced.cells]
+        """The cells that our vehicles hold."""
+        return [cell for id in self.vehicles for cell in self.holdings.path(id)]
 
     # --- driving --------------------------------------------------------------------------------------------
 
@@ -146,12 +140,12 @@ class Agent:
         seconds = min(elapsed_s, _LONGEST_STEP_S) * self._time_scale
         self._left_s = dict.fromkeys(self.vehicles, seconds)
 
-    def drive(self, now_ns: int) -> Findings | None:
+    def drive(self) -> Findings | None:
         """Let vehicles drive until they come to another cell; returns what they find there, to be written into
         the map before they drive on. None when their time is over."""
         for id in list(self._left_s):
             vehicle = self.vehicles[id]
-            left_s = self._drive(vehicle, self._left_s[id], now_ns)
+            left_s = self._drive(vehicle, self._left_s[id])
             if left_s > 0.0:
                 self._left_s[id] = left_s
             else:
@@ -162,23 +156,23 @@ class Agent:
         self._look_from = {}
         return compare(sight, self._map.ground, self._map.prior)
 
-    def _drive(self, vehicle: Vehicle, left_s: float, now_ns: int) -> float:
+    def _drive(self, vehicle: Vehicle, left_s: float) -> float:
         """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
         motion = vehicle.motion
         physics = self._map.physics.reshape(-1)
         while left_s > 0.0:
             if motion.at_rest:
-                cell = self._traffic.next_cell(vehicle, now_ns)
-                if cell is None or self.rights.held(vehicle.id)[1:2] != [cell] or self._traffic.closed(cell):
+                path = self.holdings.path(vehicle.id)
+                if len(path) < 2 or self._steering.closed(path[1]):
                     return 0.0
-                motion.set_out(cell)
+                motion.set_out(path[1])
             before = vehicle.cell
             pace_s_per_m = float(physics[motion.head])
             if self._map.climb is not None:
                 pace_s_per_m *= self._map.climb.of_step(motion.tail, motion.head)
             left_s = motion.advance(left_s, pace_s_per_m)
             if vehicle.cell != before:
-                self.rights.moved(vehicle.id, vehicle.cell)
+                self.holdings.moved(vehicle.id, vehicle.cell)
                 vehicle.route.moved(vehicle.cell)
                 self._look_from[vehicle.cell] = None
                 # Even with no time left it has to look before it drives on.
@@ -186,34 +180,50 @@ class Agent:
         return 0.0
 
     def map_changed(self, now_ns: int, *, look: bool = False) -> None:
-        """End routes before cells that are lethal now.
+        """End routes and paths before cells that are lethal now.
 
         look  another agent changed the map: compare what is in sight with it again
         """
         pace = self._map.pace.reshape(-1)
         for vehicle in self.vehicles.values():
             ahead = vehicle.route.ahead()
-            if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._traffic.closed):
+            if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.closed):
                 vehicle.cut_route(now_ns)
+            self._end_path(vehicle)
             if look:
                 self._look_from[vehicle.cell] = None
+
+    def _end_path(self, vehicle: Vehicle) -> None:
+        """Give back what lies behind a lethal cell, and that cell."""
+        path = self.holdings.path(vehicle.id)
+        for index, cell in enumerate(path):
+            if index and self._steering.closed(cell):
+                if cell == vehicle.motion.entering:
+                    vehicle.motion.turn_back()
+                self.holdings.give_back(vehicle.id, index)
+                return
+
+    def _stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
+        """Give back all but the first cells, and the one that it drives into."""
+        self.holdings.give_back(vehicle.id, max(keep, 1 if vehicle.motion.entering is None else 2))
 
     # --- deciding -------------------------------------------------------------------------------------------
 
     def decide(self, now_ns: int) -> list[AgentAction]:
-        """Reserve what each vehicle needs next; returns the requests to planners."""
-        for id, cell in self._unplaced.settle():
-            self._enter(id, cell)
+        """Say what each vehicle needs next; returns the requests to planners."""
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0
         for vehicle in self.vehicles.values():
             self._check_reach(vehicle)
-            ask = vehicle.route_request(now_ns)
+            path = self.holdings.path(vehicle.id)
+            ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)
             in_reach = partial(self._in_reach, vehicle.target)
-            self.blocked_ticks += self._traffic.steer(vehicle, in_reach, now_ns)
+            pushed = self.holdings.pushed(vehicle.id)
+            self.wishes[vehicle.id] = self._steering.wish(vehicle, path, pushed, in_reach, now_ns)
+            self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
             request = AskRoutes(
@@ -244,6 +254,8 @@ class Agent:
         near = self._in_reach(vehicle.target, vehicle.cell)
         if near != vehicle.in_reach:
             vehicle.set_in_reach(near)
+            if near:
+                self._stop_soon(vehicle)
 
     # --- what is heard --------------------------------------------------------------------------------------
 
@@ -294,7 +306,9 @@ class Agent:
             and self._map.grid.distance_cells(pose.cell, reply.target_cell) > _STALE_CELLS
         )
         for index, id in enumerate(asked.vehicles):
-            vehicle = self.vehicles[id]
+            vehicle = self.vehicles.get(id)
+            if vehicle is None:
+                continue
             if index >= len(reply.routes) or stale:
                 vehicle.no_answer(now_ns)
             else:
@@ -305,7 +319,8 @@ class Agent:
         """No more answers to `AskRoutes` will come."""
         asked = self._route_requests.pop(request, None)
         for id in asked.vehicles if asked is not None else ():
-            self.vehicles[id].no_answer(now_ns)
+            if id in self.vehicles:
+                self.vehicles[id].no_answer(now_ns)
 
     def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[Follow]:
         """A newer route from a planner, unasked; returns it if the vehicle has begun it."""
@@ -326,11 +341,15 @@ class Agent:
             return []
         partial = route.remaining_s > 0.0
         given = GivenRoute(target, cells, route.cost_s, route.lower_bound_s, partial, pushed)
-        begun = vehicle.give_route(given, now_ns)
+        path = self.holdings.path(vehicle.id)
+        begun = vehicle.give_route(given, path, now_ns)
         if begun is None:
             return []
-        if vehicle.route.cut(self._traffic.closed):
+        if vehicle.route.cut(self._steering.closed):
             vehicle.cut_route(now_ns)
+        on_route = set(cells)
+        if path[-1] not in on_route:  # it was granted cells along another route
+            self._stop_soon(vehicle, max(index + 1 for index, cell in enumerate(path) if cell in on_route))
         return [begun]
 
     # --- which target ---------------------------------------------------------------------------------------

@@ -122,7 +122,9 @@ class Assignment:
         self._open = None
         stuck = not self._costs_s
         for index, id in enumerate(asked.vehicles):
-            vehicle = vehicles[id]
+            vehicle = vehicles.get(id)
+            if vehicle is None:
+                continue
             costs_s = {target: float(column[index]) for target, column in self._costs_s.items()}
             self._assign(vehicle, costs_s, planners, now_ns)
             stuck = stuck or vehicle.state in (VehicleState.IDLE, VehicleState.STRANDED)

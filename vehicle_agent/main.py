@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Callable
 
 from shared_map.terrain.terrain import load_terrain, load_truth
@@ -10,6 +11,7 @@ from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
+from vehicle_agent.promise_store import FilePromiseStore, MemoryPromiseStore, PromiseStore
 from vehicle_agent.service import AgentService
 
 
@@ -20,9 +22,14 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """
     terrain = load_terrain(setup)
     truth = load_truth(setup, terrain)
+    store: PromiseStore = (
+        MemoryPromiseStore(secrets.randbits(60))
+        if setup.run_dir is None
+        else FilePromiseStore(setup.run_dir / f"promises-{setup.id}")
+    )
     with open_bus(setup.scenario.network) as bus:
         inbox = Inbox()
-        service = AgentService(setup, terrain, truth, bus, inbox.post)
+        service = AgentService(setup, terrain, truth, bus, inbox.post, store)
         process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz)
         process.stop_on_signals()
         if stop_when is not None:

@@ -160,6 +160,8 @@ def _type(hint: Any) -> str:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         meta = next(note for note in args[1:] if isinstance(note, msgspec.Meta))
+        if meta.max_length is not None:
+            return f"{_type(args[0])}, {meta.min_length or 0} to {meta.max_length}"
         return f"{_type(args[0])} {number(meta.ge)} ... {number(meta.le if meta.lt is None else meta.lt - 1)}"
     if origin in (types.UnionType, typing.Union):
         return " or ".join("nil" if arg is type(None) else _type(arg) for arg in args)

@@ -30,6 +30,7 @@ from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import Scenario
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
+from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
 EPOCH_NS = 1_800_000_000 * NS_PER_S
@@ -76,16 +77,17 @@ class Node:
         self.service: Service | None = None
         self.bus: MemoryBus | None = None
         self.store: KeeperStore | None = None
+        self.promises: MemoryPromiseStore | None = None
         self._simulation = simulation
         self._clock = simulation.scheduler.clock
         self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))
         self._phase_ns = phase_ns % self._tick_ns
-        self._skew_ns = skew_ns
+        self.skew_ns = skew_ns
         self._worker: InlineWorker | None = None
 
     def now_ns(self) -> int:
         """Time of this node's clock, its skew included."""
-        return self._clock.now_ns() + self._skew_ns
+        return self._clock.now_ns() + self.skew_ns
 
     def boot(self) -> None:
         """Start a new incarnation."""
@@ -121,7 +123,8 @@ class Node:
             case "targets":
                 return TargetsService(setup, terrain, truth, bus, post)
             case "agent":
-                return AgentService(setup, terrain, truth, bus, post)
+                self.promises = self.promises or MemoryPromiseStore(self._phase_ns + setup.incarnation)
+                return AgentService(setup, terrain, truth, bus, post, self.promises)
         raise ValueError(f"no simulation of role {self.spec.role}")
 
     def _tick(self, bus: MemoryBus) -> None:

@@ -191,8 +191,7 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     sense_range_m     radius within which the simulated sensor sees the true ground
     capture_range_m   a target this near is captured
     route_cells       steps of a route asked for at a time; 0 is the whole route
-    reserve_cells     cells ahead that a vehicle reserves
-    patience_s        a vehicle that has not moved for this long looks for a way around
+    reserve_cells     cells ahead of itself that a vehicle may be granted
     reassign_s        how often a vehicle asks which target is the cheapest
     """
 
@@ -202,7 +201,6 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     capture_range_m: Positive = 150.0
     route_cells: Annotated[int, Meta(ge=0)] = 0
     reserve_cells: Annotated[int, Meta(ge=1, le=16)] = 3
-    patience_s: Positive = 1.0
     reassign_s: Positive = 5.0
 
 

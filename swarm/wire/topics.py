@@ -24,7 +24,8 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Fleet, Followed, Reservations, TerritoryReply, TerritoryRequest
+from swarm.wire.messages.traffic import Claim, Known, KnownRequest, Standing, Stored, Table
+from swarm.wire.messages.vehicles import Fleet, Followed
 
 
 class Priority(Enum):
@@ -169,18 +170,26 @@ FLEET = Topic(
     "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
     access(put="agent:author", hear="agent planner targets monitor"),
 )  # fmt: skip
-RESERVATIONS = Topic(
-    "reservations", "reservations/{agent}", Reservations,
-    "which cells vehicles hold and request; an agent answers with its own and the newest of those that died",
-    "every tick, on change",
-    access(put="agent:agent", serve="agent", ask="agent", hear="agent"),
-    request=Nothing, priority=Priority.INTERACTIVE,
+STANDING = Topic(
+    "standing", "standing/{plot}/{agent}", Standing,
+    "where a host's vehicles are in a plot and where they would go; for its members", "every tick",
+    access(put="agent:agent", hear="agent"), priority=Priority.INTERACTIVE,
 )  # fmt: skip
-TERRITORY = Topic(
-    "territory", "territory/{agent}", TerritoryReply,
-    "in which plots agents reserve cells: asked of all before one is entered", "on change",
-    access(serve="agent:agent", ask="agent"),
-    request=TerritoryRequest, published=False, priority=Priority.INTERACTIVE,
+TABLE = Topic(
+    "table", "table/{plot}/{agent}", Table,
+    "which cells the warden of a plot has granted; a member that is asked promises an epoch and answers with what "
+    "it has stored", "on change, at least 5 Hz where vehicles are",
+    access(put="agent:agent", serve="agent:agent", ask="agent", hear="agent"),
+    request=Claim, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+STORED = Topic(
+    "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file", "per table",
+    access(put="agent:agent", hear="agent"), priority=Priority.INTERACTIVE,
+)  # fmt: skip
+KNOWN = Topic(
+    "known", "known/{agent}", Known, "what an agent has on file about another, for a new life of that",
+    "asked at a start", access(serve="agent:agent", ask="agent"), request=KnownRequest, published=False,
+    priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
@@ -234,8 +243,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, RESERVATIONS, TERRITORY, FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED,
-    TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, STANDING, TABLE, STORED, KNOWN, FOLLOWED, PUSHED_ROUTE, POSE,
+    SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

@@ -22,7 +22,7 @@ from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Reservations
+from swarm.wire.messages.traffic import Standing, Table
 from swarm.wire.readable import decode_parameters, encode_readable
 from swarm.wire.routes import Route, RouteStatus
 from swarm.wire.topics import TOPICS
@@ -176,8 +176,10 @@ def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(j
         (TargetPose, {"x_m": math.nan}, "x_m"),
         (TargetPose, {"y_m": 1e10}, "y_m"),
         (TargetPose, {"target": "*"}, "target"),
-        (Reservations, {"held": {"v": []}}, "length >= 1"),
-        (Reservations, {"clock": (1 << 64) - 1}, "clock"),
+        (Table, {"grants": {"v": [[], [1, 1]]}}, "length >= 1"),
+        (Table, {"grants": {"a b": [[1], [1, 1]]}}, "vehicle"),
+        (Standing, {"life": (1 << 64) - 1}, "life"),
+        (Standing, {"vehicles": [["v", 1, 1, [1], [], [2] * 9, 9, 0]]}, "length <= 8"),
         (RouteRequest, {"cells": [1 << 40]}, "cells"),
         (RouteRequest, {"cells": [1], "vehicles": ["a", "b"]}, "2 vehicles for 1 cells"),
         (RouteRequest, {"row": 3, "col": None}, "both row and col"),

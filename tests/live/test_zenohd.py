@@ -18,19 +18,16 @@ from launch_scripts.launcher.options import free_ports
 from shared_map.replication.marks import mark_set, statements
 from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.sync import MapSync
-from swarm.bus.bus import Asked, Event, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import MapConfig, NetworkConfig, TlsConfig
 from swarm.errors import BusError
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
-from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import SEQ_STEP, Digest
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.vehicles import Reservations
 from swarm.wire.statements import MarkKind
-from swarm.wire.topics import DIGEST, MARKS, RESERVATIONS, STATS
+from swarm.wire.topics import DIGEST, MARKS, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.zenohd]
 
@@ -169,45 +166,6 @@ def test_with_certificates_an_agent_writes_its_own_marks_only_and_a_stranger_not
             late = Participant(trusted)
             eventually(lambda: late.run(0.2) or late.replica.held.ledger.held(), 10, "the storage's answer")
             assert list(late.replica.held.ledger.held()) == ["blue.a0.1"]
-    finally:
-        router.stop()
-
-
-def test_with_certificates_an_agent_that_starts_again_is_told_where_its_vehicles_stood(tmp_path: Path) -> None:
-    certs = tmp_path / "certs"
-    for name, hosts in (("router.0", ["localhost"]), ("agent.all.a0", []), ("agent.all.a1", [])):
-        issue(certs, name, hosts, 2)
-    endpoint = f"tls/localhost:{free_ports(1)[0]}"
-
-    def network(name: str) -> NetworkConfig:
-        files = (str(certs / file) for file in ("ca.pem", f"{name}.pem", f"{name}.key"))
-        tls = TlsConfig(**dict(zip(("ca", "certificate", "key"), files, strict=True)))
-        admit = ("router.0", "agent.all.a0", "agent.all.a1")
-        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=tls, admit=admit)
-
-    def reservations(agent: str) -> Reservations:
-        return Reservations(
-            agent=agent, incarnation=1, seq=3, clock=0, held={f"{agent}-00": [7]}, requested=[], seen={}
-        )
-
-    def answer(event: Event) -> None:
-        assert isinstance(event, Asked)
-        for agent in ("a0", "a1"):
-            event.answer(reservations(agent), agent=agent)
-        event.end()
-
-    router = Zenohd(tmp_path, network("router.0"), plugins())
-    try:
-        with open_bus(network("agent.all.a0")) as neighbour, open_bus(network("agent.all.a1")) as starting:
-            neighbour.serve(RESERVATIONS, answer)
-            heard: list[Event] = []
-
-            def told() -> list[Reservations]:
-                starting.ask(RESERVATIONS, Nothing(), heard.append, tag="reservations", timeout_s=1.0)
-                time.sleep(0.3)
-                return [event.message for event in heard if isinstance(event, Replied)]
-
-            eventually(lambda: reservations("a1") in told(), 5, "the last words of the agent that starts again")
     finally:
         router.stop()
 

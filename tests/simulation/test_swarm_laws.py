@@ -115,8 +115,8 @@ def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
     laws = Laws(simulation)
     simulation.run_until(4)
     agent = agent_of(simulation, "agent-a1")
-    simulation.run_until(4.2)  # what was echoed before the cut may still be granted
-    held = {id: [*agent.rights.held(id), *agent.rights.requested(id)] for id in agent.vehicles}
+    simulation.run_until(4.2)  # what was on its way before the cut may still be granted
+    held = {id: list(agent.holdings.path(id)) for id in agent.vehicles}
     simulation.run_until(12)
     assert all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
     simulation.run_until(20)

@@ -27,6 +27,7 @@ from swarm.wire.routes import Route, RouteBatch, RouteStatus
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
 
@@ -156,6 +157,7 @@ class AgentWorld(SwarmModel):
         super().__init__(links, terrain_of_pace(prior, resolution_m), parse_scenario(scenario))
         self.truth = np.array(self.terrain.ground_s_per_m if truth is None else truth, np.float32)
         self.agents: dict[str, AgentService] = {}
+        self.stores: dict[str, MemoryPromiseStore] = {}
         self.planners: dict[str, FakePlanner] = {}
         self.poses: dict[str, TargetPose] = {}
         self.fleets: list[Fleet] = []
@@ -198,10 +200,11 @@ class AgentWorld(SwarmModel):
 
     def start_agent(self, id: str) -> AgentService:
         setup = self.setup("agent", id, self.now_ns)
+        self.stores.setdefault(id, MemoryPromiseStore(len(self.stores) + 1))
         hz = self.scenario.vehicles.tick_hz
         self.agents[id] = self.start(
             f"agent-{id}",
-            lambda bus, post: AgentService(setup, self.terrain, self.truth, bus, post),
+            lambda bus, post: AgentService(setup, self.terrain, self.truth, bus, post, self.stores[id]),
             hz,
             int(NS_PER_S / hz) * (2 + len(self.agents)) // 7,  # agents tick at different moments
         )

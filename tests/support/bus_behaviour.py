@@ -15,8 +15,8 @@ from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import MarkSet, MarksRequest
 from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Reservations
-from swarm.wire.topics import MARKS, NOTE, POSE, RESERVATIONS, RUN, Topic
+from swarm.wire.messages.traffic import Claim, Table
+from swarm.wire.topics import MARKS, NOTE, POSE, RUN, TABLE, Topic
 
 
 class World(Protocol):
@@ -295,9 +295,9 @@ def test_a_refusal_reaches_who_asked(world: World):
         event.refuse("not today")
         event.end()
 
-    b.serve(RESERVATIONS, refuse, agent="a0")
+    b.serve(TABLE, refuse, agent="a0")
     world.settle()
-    assert asked(world, a, RESERVATIONS, Nothing(), agent="a0") == [AskEnded("q", RESERVATIONS, 0, "not today")]
+    assert asked(world, a, TABLE, Claim(epoch=1), agent="a0") == [AskEnded("q", TABLE, 0, "not today")]
 
 
 def test_a_query_that_is_never_ended_times_out_with_what_came(world: World):
@@ -356,15 +356,14 @@ def test_an_answer_after_the_end_is_a_bug_that_raises(world: World):
 
 def test_one_that_hears_a_topic_may_serve_it_too(world: World):
     a, b, heard = world.bus("a"), world.bus("b"), Box()
-    reservations = Reservations(agent="a0", incarnation=1, seq=1, clock=1, held={"v": [3]}, requested=[], seen={})
-    b.subscribe(RESERVATIONS, heard)
-    b.serve(RESERVATIONS, answering((reservations, {"agent": "a0"})))
+    table = Table(plot=0, agent="a0", epoch=1, seq=1, hosts={}, grants={})
+    b.subscribe(TABLE, heard)
+    b.serve(TABLE, answering((table, {"plot": 0, "agent": "a0"})))
     world.settle()
-    a.publish(RESERVATIONS, reservations, agent="a0")
+    a.publish(TABLE, table, plot=0, agent="a0")
     world.until(lambda: heard)
-    assert [event.message for event in asked(world, a, RESERVATIONS, Nothing(), agent="a0").of(Replied)] == [
-        reservations
-    ]
+    claim = Claim(epoch=1)
+    assert [event.message for event in asked(world, a, TABLE, claim, plot=0, agent="a0").of(Replied)] == [table]
 
 
 # --- tokens and links ---------------------------------------------------------------------------------------

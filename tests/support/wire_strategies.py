@@ -23,14 +23,11 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
+from swarm.wire.messages.traffic import Claim, Grant, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
 from swarm.wire.messages.vehicles import (
     NO_TARGET,
     Fleet,
     Followed,
-    RequestedCell,
-    Reservations,
-    TerritoryReply,
-    TerritoryRequest,
     VehicleState,
 )
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
@@ -145,11 +142,12 @@ def route_requests(draw: st.DrawFn) -> RouteRequest:
     )
 
 
-reservations = st.builds(
-    Reservations, agent=ids, incarnation=naturals, seq=naturals, clock=naturals,
-    held=st.dictionaries(ids, st.lists(cells, min_size=1, max_size=4), max_size=3),
-    requested=st.lists(st.builds(RequestedCell, vehicle=ids, cell=cells, ticket=naturals), max_size=3),
-    seen=st.dictionaries(ids, st.tuples(naturals, naturals), max_size=3),
+few_cells = st.lists(cells, max_size=4)
+stamps = st.tuples(naturals, naturals)
+milliseconds = st.integers(0, (1 << 32) - 1)
+stands = st.builds(
+    Stand, vehicle=ids, cell=cells, end=cells, holds=few_cells, ahead=few_cells, wants=few_cells,
+    better=st.integers(0, 8), age_ms=milliseconds,
 )  # fmt: skip
 
 MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
@@ -171,15 +169,23 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     BaseMapRequest: st.builds(BaseMapRequest, layers=st.lists(texts, max_size=3), regions=st.lists(regions)),
     BaseMapTile: st.builds(BaseMapTile, layer=texts, region=regions, data=st.binary(max_size=50)),
     Fleet: fleets(),
-    Reservations: reservations,
-    TerritoryRequest: st.builds(
-        TerritoryRequest, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(plots, max_size=3),
-        silent=st.lists(ids, max_size=2),
+    Standing: st.builds(
+        Standing, plot=naturals, agent=ids, life=naturals, seq=naturals, knows=stamps,
+        vehicles=st.lists(stands, max_size=3), dead=st.lists(naturals, max_size=2), ended=st.booleans(),
     ),
-    TerritoryReply: st.builds(
-        TerritoryReply, agent=ids, incarnation=naturals, seq=naturals, plots=st.lists(plots, max_size=3),
-        reservations=st.lists(reservations, max_size=2),
+    Table: st.builds(
+        Table, plot=naturals, agent=ids, epoch=naturals, seq=naturals,
+        hosts=st.dictionaries(ids, st.tuples(naturals, naturals), max_size=3),
+        grants=st.dictionaries(
+            ids, st.builds(Grant, cells=st.lists(cells, min_size=1, max_size=4), stamp=stamps), max_size=3
+        ),
+        shut=st.lists(st.builds(Shut, agent=ids, life=naturals, cells=few_cells), max_size=2),
+        pushed=st.dictionaries(ids, milliseconds, max_size=2),
     ),
+    Stored: st.builds(Stored, plot=naturals, agent=ids, epoch=naturals, seq=naturals),
+    Claim: st.builds(Claim, epoch=naturals),
+    KnownRequest: st.builds(KnownRequest, agent=ids, disk=naturals),
+    Known: st.builds(Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(naturals, max_size=3)),
     Followed: st.builds(
         Followed,
         vehicle=ids,
@@ -260,17 +266,18 @@ EXAMPLES: tuple[Message, ...] = (
         south_m=pack_column([1.0, 2.0], "<f4"), heading_rad=pack_column([0.0, 3.0], "<f4"), states=bytes([2, 0]),
         targets=bytes([0, NO_TARGET]),
     ),
-    Reservations(
-        agent="a0", incarnation=7, seq=3, clock=4, held={"a0-00": [4, 5]},
-        requested=[RequestedCell(vehicle="a0-00", cell=6, ticket=3)], seen={"a1": (7, 2)},
+    Standing(
+        plot=0, agent="a0", life=1 << 32, seq=9, knows=(3, 17), dead=[5],
+        vehicles=[Stand("a0-00", 4, 5, [4, 5], [6], [], 0, 1200)],
     ),
-    TerritoryRequest(agent="a0", incarnation=7, seq=2, plots=[0, 3], silent=["a1"]),
-    TerritoryReply(
-        agent="a0", incarnation=7, seq=2, plots=[0, 3],
-        reservations=[
-            Reservations(agent="a1", incarnation=7, seq=2, clock=1, held={"a1-00": [9]}, requested=[], seen={})
-        ],
+    Table(
+        plot=0, agent="a1", epoch=3, seq=17, hosts={"a0": (1 << 32, 8)}, grants={"a0-00": Grant([4, 5], (3, 16))},
+        shut=[Shut("a2", 1 << 32, [9])], pushed={"a0-00": 900},
     ),
+    Stored(plot=0, agent="a2", epoch=3, seq=17),
+    Claim(epoch=4),
+    KnownRequest(agent="a0", disk=77),
+    Known(agent="a1", disk=77, life=1 << 32, plots=[0, 3]),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
     Sighted(

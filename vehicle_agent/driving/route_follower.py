@@ -10,6 +10,8 @@ from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 _STEP_ROW = np.array(STEP_ROW, np.int64)
 _STEP_COL = np.array(STEP_COL, np.int64)
+_SKIPPED_CELLS = 24
+"""A vehicle that others push may come back to its route so far on."""
 
 
 class Follower:
@@ -23,11 +25,11 @@ class Follower:
         self.partial = False
         """Whether the route ends before its target, because the planner gave a part of it."""
 
-    def begin(self, cells: Sequence[int], here: int, partial: bool = False) -> bool:
-        """Follow a route from the cell `here` on. False if it does not pass there; then nothing changes."""
-        try:
-            at = cells.index(here)
-        except ValueError:
+    def begin(self, cells: Sequence[int], path: Sequence[int], partial: bool = False) -> bool:
+        """Follow a route from the first cell of a vehicle's path that it passes. False if it passes none; then
+        nothing changes."""
+        at = next((cells.index(cell) for cell in path if cell in cells), None)
+        if at is None:
             return False
         self._cells = list(cells)
         self._at = at
@@ -40,9 +42,20 @@ class Follower:
         self.partial = False
 
     def moved(self, cell: int) -> None:
-        """The vehicle has entered a cell; on its route if it is the next one."""
-        if self._at + 1 < len(self._cells) and self._cells[self._at + 1] == cell:
-            self._at += 1
+        """The vehicle has entered a cell: the next one of its route, or one further on, or none."""
+        if cell in self._cells[self._at : self._at + _SKIPPED_CELLS]:
+            self._at = self._cells.index(cell, self._at)
+
+    def after(self, cell: int, count: int) -> list[int]:
+        """The next `count` cells behind a cell of the route; none if the cell is not on it."""
+        if cell not in self._cells[self._at : self._at + _SKIPPED_CELLS]:
+            return []
+        first = self._cells.index(cell, self._at) + 1
+        return self._cells[first : first + max(count, 0)]
+
+    def near(self, count: int) -> list[int]:
+        """The cell of the route that the vehicle passed last, and the next ones."""
+        return self._cells[self._at : self._at + count]
 
     def ahead(self, count: int | None = None) -> list[int]:
         """The next `count` cells, or all that are left, without the one on which the vehicle is."""
@@ -62,22 +75,6 @@ class Follower:
                 self.partial = False
                 return True
         return False
-
-    def splice(self, detour: Sequence[int]) -> bool:
-        """Put a detour before the rest of the route, which goes on behind the last cell of the detour.
-
-        False if that cell is not ahead on the route; then nothing changes.
-        """
-        if not detour or not self._cells:
-            return False
-        try:
-            rejoin = self._cells.index(detour[-1], self._at + 1)
-        except ValueError:
-            return False
-        here = self._cells[self._at]
-        self._cells = [here, *detour, *self._cells[rejoin + 1 :]]
-        self._at = 0
-        return True
 
 
 def route_cells(grid: GridSpec, start: int, directions: bytes) -> tuple[int, ...] | None:

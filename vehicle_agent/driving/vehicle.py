@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
@@ -105,16 +106,10 @@ class Vehicle:
         self._retry_ns = _RETRY_NS
         """Doubles with each request that nobody answers, until a route comes."""
         self._ask_due_ns = 0
-        self._rest_until_ns = 0
-        self._making_way = False
 
     @property
     def cell(self) -> int:
         return self.motion.cell
-
-    def resting(self, now_ns: int) -> bool:
-        """Whether it stays off its route so that another can pass."""
-        return self._making_way or now_ns < self._rest_until_ns
 
     # --- targets and planners -------------------------------------------------------------------------------
 
@@ -163,9 +158,12 @@ class Vehicle:
 
     # --- routes ---------------------------------------------------------------------------------------------
 
-    def route_request(self, now_ns: int) -> AskRoute | None:
-        """The request for a route, if one is needed and the time for it has come."""
-        if self.target is None or self.in_reach or self.planner_gone or self.resting(now_ns):
+    def route_request(self, now_ns: int, cell: int) -> AskRoute | None:
+        """The request for a route, if one is needed and the time for it has come.
+
+        cell  where its path ends, and the route has to begin
+        """
+        if self.target is None or self.in_reach or self.planner_gone:
             return None
         if self._need is None and self.state is not VehicleState.STRANDED:
             if self.route.left == 0 and self.motion.at_rest:
@@ -178,20 +176,19 @@ class Vehicle:
         self.asked = self.target
         self._ask_due_ns = now_ns + self._retry_ns
         force = self._need is Reason.RAN_OUT
-        return AskRoute(self.id, self.target, self.cell, force, self._need)
+        return AskRoute(self.id, self.target, cell, force, self._need)
 
-    def give_route(self, given: GivenRoute, now_ns: int) -> Follow | None:
-        """Begin the route, if it leads to the target and passes the vehicle's cell."""
+    def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Follow | None:
+        """Begin the route, if it leads to the target and passes a cell of the vehicle's path."""
         if not given.pushed:
             self.asked = None
         begun = None
-        if given.target == self.target and not self.resting(now_ns):
-            if self.route.begin(given.cells, self.cell, given.partial):
-                begun = self._begin(given)
+        if given.target == self.target:
+            if self.route.begin(given.cells, path, given.partial):
+                begun = self._begin(given, path)
             else:
                 # It has driven on to where the new route does not pass: stop, so that the next answer fits.
                 self.route.drop()
-                self._turn_back()
                 self._need_route(Reason.ASSIGNED, now_ns)
         self._settle()
         return begun
@@ -216,36 +213,22 @@ class Vehicle:
 
     def cut_route(self, now_ns: int) -> None:
         """A cell ahead is closed, and the route now ends before it."""
-        self._turn_back()
         self._need_route(Reason.CUT, now_ns)
 
-    # --- making way -----------------------------------------------------------------------------------------
-
-    def make_way(self) -> None:
-        """Leave the route for a neighbouring cell, and do not return before `made_way`."""
-        self.route.drop()
-        self._making_way = True
-        self._settle()
-
-    def made_way(self, rest_until_ns: int, now_ns: int) -> None:
-        """Stand aside until then, and ask for a route from here."""
-        self._making_way = False
-        self._rest_until_ns = rest_until_ns
-        self._need_route(Reason.BLOCKED, now_ns)
-
     def blocked_for_long(self, now_ns: int) -> None:
-        """The next cell has been occupied for long: the planner may know another route."""
-        self._need_route(Reason.BLOCKED, now_ns)
+        """It was pushed off its route, or has stood for long: the planner may know another route."""
+        if self._need is None:
+            self._need_route(Reason.BLOCKED, now_ns)
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _begin(self, given: GivenRoute) -> Follow:
-        self._turn_back()
+    def _begin(self, given: GivenRoute, path: Sequence[int]) -> Follow:
         self._need = None
         self._retry_ns = _RETRY_NS
         if self.state is VehicleState.STRANDED:
             self.state = VehicleState.FOLLOWING
-        driven = (self.cell, *self.route.ahead())
+        (start,) = self.route.near(1)
+        driven = (*path[: path.index(start)], start, *self.route.ahead())
         return Follow(self.id, given.target, driven, given.cost_s, given.lower_bound_s)
 
     def _need_route(self, reason: Reason, now_ns: int) -> None:
@@ -257,12 +240,6 @@ class Vehicle:
         if self._need is not None:
             self._ask_due_ns = now_ns + self._retry_ns
             self._retry_ns = min(2 * self._retry_ns, _LONGEST_RETRY_NS)
-
-    def _turn_back(self) -> None:
-        """Turn back from a cell that is not entered yet and no longer next on the route."""
-        entering = self.motion.entering
-        if entering is not None and self.route.ahead(1) != [entering]:
-            self.motion.turn_back()
 
     def _settle(self) -> None:
         """Derive the state from what is known."""

@@ -1,4 +1,4 @@
-"""Messages about vehicles: positions, right of way, followed routes."""
+"""Messages about vehicles: positions and followed routes."""
 
 from __future__ import annotations
 
@@ -9,17 +9,13 @@ from typing import Annotated
 from msgspec import Meta
 
 from swarm.wire.fields import (
-    IDS,
     SMALL,
-    Bounded,
     Cell,
     Column,
     Directions,
     FiniteCost,
     Id,
-    Incarnation,
     Natural,
-    Plot,
     Region,
     StampNs,
     VehicleId,
@@ -83,69 +79,6 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
     def relate(self) -> None:
         if any(t != NO_TARGET and t >= len(self.target_ids) for t in set(self.targets)):
             raise ValueError("a target index points past target_ids")
-
-
-MOST_CELLS = 1 << 16
-"""Held by a vehicle or requested by an agent: more than any scenario's reserve."""
-
-
-class RequestedCell(Bounded, frozen=True, kw_only=True):
-    """A cell that a vehicle requests. Of rival requests the lowest (ticket, agent, vehicle) goes first.
-
-    ticket  Lamport time of the request
-    """
-
-    vehicle: VehicleId
-    cell: Cell
-    ticket: Natural
-
-
-class Reservations(Message, frozen=True, kw_only=True, tag=schema_of("reservations")):
-    """The cells that an agent's vehicles hold and request, and the newest reservations that it has seen of others.
-
-    seq        grows with each message within an incarnation; 0 while the agent has not placed its vehicles
-    clock      the sender's Lamport clock
-    held       vehicle -> the cells that it occupies or may enter, the one on which it stands first
-    requested  in the order in which each vehicle enters them
-    seen       agent -> [incarnation, seq] of the newest reservations heard of it
-    """
-
-    agent: Id
-    incarnation: Incarnation
-    seq: Natural
-    clock: Natural
-    held: Annotated[dict[VehicleId, Annotated[list[Cell], Meta(min_length=1, max_length=MOST_CELLS)]], SMALL]
-    requested: Annotated[list[RequestedCell], Meta(max_length=MOST_CELLS)]
-    seen: Annotated[dict[Id, tuple[Incarnation, Natural]], IDS]
-
-
-class TerritoryRequest(Message, frozen=True, kw_only=True, tag=schema_of("territory-request")):
-    """Tells all agents in which plots the sender may reserve cells, and asks each for its own.
-
-    seq     grows with each change within an incarnation; 0 while the agent has not placed its vehicles
-    plots   squares of 64 x 64 cells, numbered row by row as regions are
-    silent  dead agents whose newest reservations the sender needs
-    """
-
-    agent: Id
-    incarnation: Incarnation
-    seq: Natural
-    plots: Annotated[list[Plot], _PLOTS]
-    silent: Annotated[list[Id], IDS] = []
-
-
-class TerritoryReply(Message, frozen=True, kw_only=True, tag=schema_of("territory")):
-    """The plots in which an agent may reserve cells: its answer to a `TerritoryRequest`.
-
-    seq, plots    as in the request
-    reservations  the newest that it has heard of the agents named as silent
-    """
-
-    agent: Id
-    incarnation: Incarnation
-    seq: Natural
-    plots: Annotated[list[Plot], _PLOTS]
-    reservations: Annotated[list[Reservations], IDS] = []
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from vehicle_agent.traffic.resumption import Resumption
 
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
@@ -26,7 +27,6 @@ from vehicle_agent.agent import Agent, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.traffic.resumption import Resumption
 
 RES = 10.0
 

@@ -137,7 +137,6 @@ walk = "still"
 per_agent = 1
 sense_range_m = 30.0
 capture_range_m = 10.0
-patience_s = 5.0
 """
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.wire.topics import FLEET, MARKS, POSE, RESERVATIONS, TOPICS
+from swarm.wire.topics import FLEET, KNOWN, MARKS, POSE, TOPICS
 
 chunks = st.text("abzAZ09_.-", min_size=1, max_size=12)
 topics = st.sampled_from(TOPICS)
@@ -66,15 +66,15 @@ def test_the_key_of_one_value_needs_every_field_and_no_other():
     [
         "swarm",
         "swarm/",
-        "other/reservations/a0",
-        "swarm/reservations/a0/x",
-        "swarm/reservations/",
-        "swarmreservations/a0",
+        "other/known/a0",
+        "swarm/known/a0/x",
+        "swarm/known/",
+        "swarmknown/a0",
         "swarm/marks/1/2",
     ],
 )
 def test_a_key_of_something_else_has_no_fields(key):
-    assert RESERVATIONS.parse("swarm", key) is None
+    assert KNOWN.parse("swarm", key) is None
     assert MARKS.parse("swarm", key) is None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import random
 
@@ -17,7 +18,8 @@ from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Reservations, VehicleState
+from swarm.wire.messages.traffic import Grant, Table
+from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes, LocalMap
 from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
@@ -25,7 +27,8 @@ from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.fleet import FleetReport
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.traffic.resumption import Resumption, nearest_free
+from vehicle_agent.traffic.holdings import Holdings
+from vehicle_agent.traffic.plots import Plots
 
 GRID = GridSpec(12, 12, 10.0)
 LEVEL = np.full((12, 12), 0.1, np.float32)
@@ -44,19 +47,26 @@ S = 1_000_000_000
 
 
 def agent_of(scenario: Scenario, index: int = 0) -> Agent:
-    spawns = spawn_cells(scenario, GRID, LEVEL, LEVEL)
     ground = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
-    return Agent(plan_agents(scenario)[index], scenario, ground, TruthSensor(GRID, LEVEL, 20.0), spawns, 1)
+    plan = plan_agents(scenario)[index]
+    holdings = Holdings(Plots(GRID, ["a0", "a1"]), plan.id, plan.vehicle_ids)
+    holdings.begin(1, [])
+    return Agent(plan, scenario, ground, TruthSensor(GRID, LEVEL, 20.0), holdings)
 
 
-def resumption_of(scenario: Scenario) -> Resumption:
-    return Resumption("a0", spawn_cells(scenario, GRID, LEVEL, LEVEL), GRID.cells)
+def grant(agent: Agent, seq: int, **cells: list[int]) -> None:
+    """The table of a plot's only member grants cells to a0-00 and a0-01, named by their last digit."""
+    plots = Plots(GRID, ["a0", "a1"])
+    grants = {f"a0-0{name[1:]}": Grant(each, (1, seq)) for name, each in cells.items()}
+    hosts = {"a0": (1, seq)}
+    table = Table(plot=0, agent=plots.warden(0, 1), epoch=1, seq=seq, hosts=hosts, grants=grants)
+    agent.place(agent.holdings.hear_table(table, lambda vehicle, found: found[0]))
 
 
 @pytest.fixture
 def agent() -> Agent:
     agent = agent_of(parse_scenario(TEXT))
-    agent.place(resumption_of(parse_scenario(TEXT)).placement({}))
+    grant(agent, 1, v0=[GRID.cell(5, 5)], v1=[GRID.cell(5, 7)])
     agent.set_planners({"t0": 1, "t1": 1}, 0)
     return agent
 
@@ -140,31 +150,24 @@ def test_a_target_outside_the_terrain_is_not_believed(agent: Agent) -> None:
     agent.decide(0)
 
 
-def test_vehicles_go_on_where_they_last_stood_and_not_where_somebody_else_is() -> None:
+def test_a_vehicle_drives_what_it_is_granted_and_gives_back_what_is_found_lethal() -> None:
     scenario = parse_scenario(TEXT)
     agent = agent_of(scenario)
-    known = resumption_of(scenario)
-    last = Reservations(
-        agent="a0",
-        incarnation=0,
-        seq=9,
-        clock=3,
-        held={"a0-00": [17, 18], "a0-01": [40]},
-        requested=[],
-        seen={},
-    )
-    other = Reservations(agent="a1", incarnation=1, seq=4, clock=8, held={"a1-00": [40]}, requested=[], seen={})
-    for reservations in (last, other):
-        known.answered(reservations)
-    agent.place(known.placement({"a1": 1}))
-    assert {id: vehicle.cell for id, vehicle in agent.vehicles.items()} == {"a0-00": 17}
-    # The other one asks for a free cell nearby, and stands there once it is granted.
-    agent.rights.set_alive({})
-    agent.decide(0)
-    agent.rights.next_message()
-    agent.rights.grant()
-    agent.decide(S)
-    assert GRID.distance_cells(agent.vehicles["a0-01"].cell, 40) == 1
+    here = GRID.cell(5, 5)
+    grant(agent, 1, v0=[here], v1=[GRID.cell(8, 8)])
+    grant(agent, 2, v0=[here, here + 1, here + 2, here + 3], v1=[GRID.cell(8, 8)])
+    agent.begin_drive(0)
+    agent.begin_drive(S // 2)
+    while agent.drive() is not None:
+        pass
+    assert agent.vehicles["a0-00"].motion.head == here + 1
+    agent._map = dataclasses.replace(agent._map, pace=LEVEL.copy())
+    agent._steering._pace = agent._map.pace.reshape(-1)
+    agent._map.pace.reshape(-1)[here + 2] = np.inf
+    agent.map_changed(S)
+    assert here + 2 not in agent.holdings.path("a0-00")
+    assert agent.holdings.path("a0-00")[-1] == here + 1
+    assert [vehicle.cell for vehicle in agent.vehicles.values()][1] == GRID.cell(8, 8)
 
 
 # --- assignment ---------------------------------------------------------------------------------------------
@@ -230,11 +233,6 @@ def test_explicit_places_come_first_and_are_left_free_by_all_others() -> None:
     spawns = spawn_cells(scenario, GRID, LEVEL, LEVEL)
     assert spawns["a0"] == {"a0-00": GRID.cell(5, 5), "a0-01": GRID.cell(5, 7)}
     assert not set(spawns["a1"].values()) & set(spawns["a0"].values())
-
-
-def test_the_nearest_free_cell_is_searched_ring_by_ring() -> None:
-    assert nearest_free(GRID, 0, {2, 30}.__contains__) == 2
-    assert nearest_free(GRID, 0, lambda cell: False) is None
 
 
 # --- what is told of them -----------------------------------------------------------------------------------

@@ -393,7 +393,7 @@ def test_crashes_and_bad_links_bring_no_two_vehicles_together(seed: int) -> None
 
 
 def test_an_agent_that_is_cut_off_stays_on_the_cells_that_it_holds() -> None:
-    world = AgentWorld(scenario(2, [(10, 2), (0, 0)], per_agent=1), pace_of(OPEN))
+    world = AgentWorld(scenario(3, [(10, 2), (0, 0), (19, 0)], per_agent=1), pace_of(OPEN))
     world.put_target("t", 10, 18)
     world.start_all()
     world.run(4.0)

@@ -18,7 +18,7 @@ GRID = GridSpec(10, 10, 10.0)
 
 def following(*cells: int, here: int | None = None) -> Follower:
     route = Follower()
-    assert route.begin(cells, cells[0] if here is None else here)
+    assert route.begin(cells, [cells[0] if here is None else here])
     return route
 
 
@@ -30,16 +30,26 @@ def test_a_route_is_joined_where_the_vehicle_stands_on_it() -> None:
 
 def test_a_route_that_does_not_pass_here_changes_nothing() -> None:
     route = following(11, 12, 13)
-    assert not route.begin([44, 45], 11)
+    assert not route.begin([44, 45], [11])
     assert route.ahead() == [12, 13]
 
 
-def test_cells_are_passed_one_by_one_and_others_are_ignored() -> None:
+def test_a_vehicle_that_was_pushed_comes_back_to_its_route_further_on() -> None:
     route = following(11, 12, 13, 14)
-    route.moved(13)
-    assert route.ahead(2) == [12, 13]
     route.moved(12)
     assert route.ahead(2) == [13, 14]
+    route.moved(23)
+    assert route.ahead(2) == [13, 14]
+    assert route.after(23, 2) == []
+    route.moved(14)
+    assert route.ahead() == []
+
+
+def test_what_comes_after_a_cell_of_the_route_is_known_before_the_vehicle_is_there() -> None:
+    route = following(11, 12, 13, 14)
+    assert route.after(12, 1) == [13]
+    assert route.after(14, 3) == []
+    assert route.near(2) == [11, 12]
 
 
 def test_a_route_ends_before_the_first_closed_cell_ahead() -> None:
@@ -47,14 +57,6 @@ def test_a_route_ends_before_the_first_closed_cell_ahead() -> None:
     assert not route.cut({11}.__contains__)
     assert route.cut({14}.__contains__)
     assert route.ahead() == [13]
-
-
-def test_a_detour_rejoins_the_route_where_it_ends() -> None:
-    route = following(11, 12, 13, 14, 15)
-    assert route.splice([22, 23, 14])
-    assert route.ahead() == [22, 23, 14, 15]
-    assert not route.splice([77])
-    assert route.ahead() == [22, 23, 14, 15]
 
 
 def test_a_dropped_route_has_nothing_ahead() -> None:

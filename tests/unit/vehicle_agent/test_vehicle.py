@@ -28,8 +28,8 @@ def vehicle() -> Vehicle:
 @pytest.fixture
 def follower(vehicle: Vehicle) -> Vehicle:
     vehicle.assign("t0", S)
-    vehicle.route_request(S)
-    vehicle.give_route(ROUTE, S)
+    vehicle.route_request(S, vehicle.cell)
+    vehicle.give_route(ROUTE, [vehicle.cell], S)
     return vehicle
 
 
@@ -41,21 +41,21 @@ def run_out(vehicle: Vehicle) -> None:
 
 
 def test_without_a_target_it_is_idle_and_asks_nobody(vehicle: Vehicle) -> None:
-    assert vehicle.route_request(S) is None
+    assert vehicle.route_request(S, vehicle.cell) is None
     assert vehicle.state is VehicleState.IDLE
 
 
 def test_given_a_target_it_asks_once_and_waits(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    assert vehicle.route_request(S) == AskRoute("v", "t0", 11, False, Reason.ASSIGNED)
-    assert vehicle.route_request(2 * S) is None
+    assert vehicle.route_request(S, vehicle.cell) == AskRoute("v", "t0", 11, False, Reason.ASSIGNED)
+    assert vehicle.route_request(2 * S, vehicle.cell) is None
     assert vehicle.state is VehicleState.WAITING
 
 
 def test_given_a_route_it_follows_it_and_says_so(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    vehicle.route_request(S)
-    assert vehicle.give_route(ROUTE, S) == Follow("v", "t0", (11, 12, 13, 14), 3.0, 2.5)
+    vehicle.route_request(S, vehicle.cell)
+    assert vehicle.give_route(ROUTE, [vehicle.cell], S) == Follow("v", "t0", (11, 12, 13, 14), 3.0, 2.5)
     assert vehicle.state is VehicleState.FOLLOWING
 
 
@@ -64,7 +64,7 @@ def test_without_an_answer_it_asks_again_later_and_later(vehicle: Vehicle) -> No
     asked_at = []
     for tick in range(200):
         now_ns = tick * S // 10
-        if vehicle.route_request(now_ns):
+        if vehicle.route_request(now_ns, vehicle.cell):
             asked_at.append(tick)
             vehicle.no_answer(now_ns)
     waits = [after - before for before, after in pairwise(asked_at)]
@@ -73,27 +73,27 @@ def test_without_an_answer_it_asks_again_later_and_later(vehicle: Vehicle) -> No
 
 def test_a_route_that_ran_out_is_asked_for_by_force(follower: Vehicle) -> None:
     run_out(follower)
-    assert follower.route_request(2 * S) == AskRoute("v", "t0", 14, True, Reason.RAN_OUT)
+    assert follower.route_request(2 * S, follower.cell) == AskRoute("v", "t0", 14, True, Reason.RAN_OUT)
     assert follower.state is VehicleState.WAITING
 
 
 def test_with_its_target_in_reach_it_has_arrived_and_asks_nothing(follower: Vehicle) -> None:
     run_out(follower)
     follower.set_in_reach(True)
-    assert follower.route_request(3 * S) is None
+    assert follower.route_request(3 * S, follower.cell) is None
     assert follower.state is VehicleState.ARRIVED
     follower.set_in_reach(False)
     assert follower.state is VehicleState.WAITING
-    request = follower.route_request(4 * S)
+    request = follower.route_request(4 * S, follower.cell)
     assert request is not None
     assert request.force
 
 
 def test_a_route_given_in_parts_is_asked_for_before_it_ends(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    vehicle.route_request(S)
-    vehicle.give_route(GivenRoute("t0", (11, 12, 13), 9.0, 9.0, partial=True), S)
-    assert vehicle.route_request(2 * S) == AskRoute("v", "t0", 11, False, Reason.CONTINUED)
+    vehicle.route_request(S, vehicle.cell)
+    vehicle.give_route(GivenRoute("t0", (11, 12, 13), 9.0, 9.0, partial=True), [vehicle.cell], S)
+    assert vehicle.route_request(2 * S, vehicle.cell) == AskRoute("v", "t0", 11, False, Reason.CONTINUED)
     assert not Reason.CONTINUED.is_reroute
 
 
@@ -102,32 +102,35 @@ def test_a_pushed_route_replaces_the_old_one_from_here_on(follower: Vehicle) -> 
     follower.motion.advance(100.0, 0.1)
     follower.route.moved(12)
     pushed = GivenRoute("t0", (11, 12, 22, 32), 3.0, 3.0, partial=False, pushed=True)
-    assert follower.give_route(pushed, 2 * S) == Follow("v", "t0", (12, 22, 32), 3.0, 3.0)
+    assert follower.give_route(pushed, [follower.cell], 2 * S) == Follow("v", "t0", (12, 22, 32), 3.0, 3.0)
 
 
 def test_a_pushed_route_that_does_not_pass_here_makes_it_stop_and_ask(follower: Vehicle) -> None:
     pushed = GivenRoute("t0", (44, 45), 3.0, 3.0, partial=False, pushed=True)
-    assert follower.give_route(pushed, 2 * S) is None
-    assert follower.route_request(3 * S) == AskRoute("v", "t0", 11, False, Reason.ASSIGNED)
+    assert follower.give_route(pushed, [follower.cell], 2 * S) is None
+    assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.ASSIGNED)
 
 
 def test_a_route_to_another_target_is_ignored(follower: Vehicle) -> None:
-    assert follower.give_route(GivenRoute("t1", (11, 21), 1.0, 1.0, partial=False, pushed=True), 2 * S) is None
+    assert (
+        follower.give_route(
+            GivenRoute("t1", (11, 21), 1.0, 1.0, partial=False, pushed=True), [follower.cell], 2 * S
+        )
+        is None
+    )
     assert follower.route.ahead() == [12, 13, 14]
 
 
-def test_a_cell_not_yet_entered_is_given_up_when_the_new_route_does_not_want_it(follower: Vehicle) -> None:
-    follower.motion.set_out(12)
-    follower.motion.advance(0.2, 0.1)
-    follower.give_route(GivenRoute("t0", (11, 21, 31), 1.0, 1.0, partial=False, pushed=True), 2 * S)
-    assert follower.motion.entering is None
-    assert follower.motion.head == 11
+def test_a_route_may_begin_where_the_path_ends_that_it_still_drives(follower: Vehicle) -> None:
+    given = GivenRoute("t0", (13, 23, 33), 1.0, 1.0, partial=False)
+    assert follower.give_route(given, [11, 12, 13], 2 * S) == Follow("v", "t0", (11, 12, 13, 23, 33), 1.0, 1.0)
+    assert follower.route.after(13, 9) == [23, 33]
 
 
 def test_a_closure_ahead_makes_it_ask_for_another_way(follower: Vehicle) -> None:
     follower.route.cut({14}.__contains__)
     follower.cut_route(2 * S)
-    assert follower.route_request(3 * S) == AskRoute("v", "t0", 11, False, Reason.CUT)
+    assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.CUT)
     assert follower.state is VehicleState.FOLLOWING
 
 
@@ -136,57 +139,47 @@ def test_its_planner_gone_it_keeps_its_route_and_is_lost_until_the_planner_is_ba
     assert follower.state is VehicleState.LOST
     assert follower.route.ahead() == [12, 13, 14]
     run_out(follower)
-    assert follower.route_request(3 * S) is None
+    assert follower.route_request(3 * S, follower.cell) is None
     assert follower.state is VehicleState.LOST
     follower.regain_planner(4 * S)
-    assert follower.route_request(4 * S) == AskRoute("v", "t0", 14, False, Reason.PLANNER_BACK)
+    assert follower.route_request(4 * S, follower.cell) == AskRoute("v", "t0", 14, False, Reason.PLANNER_BACK)
 
 
 def test_no_way_to_its_target_leaves_it_stranded_and_it_tries_again(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    vehicle.route_request(S)
+    vehicle.route_request(S, vehicle.cell)
     vehicle.refuse_route("t0", RouteStatus.UNREACHABLE, S)
     assert vehicle.state is VehicleState.STRANDED
-    assert vehicle.route_request(2 * S) is None
-    assert vehicle.route_request(5 * S) is not None
+    assert vehicle.route_request(2 * S, vehicle.cell) is None
+    assert vehicle.route_request(5 * S, vehicle.cell) is not None
     assert vehicle.state is VehicleState.STRANDED
-    vehicle.give_route(ROUTE, 5 * S)
+    vehicle.give_route(ROUTE, [vehicle.cell], 5 * S)
     assert vehicle.state is VehicleState.FOLLOWING
 
 
 def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
-    vehicle.route_request(S)
+    vehicle.route_request(S, vehicle.cell)
     vehicle.refuse_route("t0", RouteStatus.NO_TARGET, S)
     assert vehicle.state is VehicleState.WAITING
-    assert vehicle.route_request(2 * S) is not None
+    assert vehicle.route_request(2 * S, vehicle.cell) is not None
 
 
 def test_no_way_to_any_target_is_stranded_even_before_it_had_one(vehicle: Vehicle) -> None:
     vehicle.no_way()
     assert vehicle.state is VehicleState.STRANDED
     vehicle.assign("t1", 2 * S)
-    assert vehicle.route_request(2 * S) == AskRoute("v", "t1", 11, False, Reason.ASSIGNED)
+    assert vehicle.route_request(2 * S, vehicle.cell) == AskRoute("v", "t1", 11, False, Reason.ASSIGNED)
 
 
 def test_a_jump_of_its_target_makes_it_ask_at_once(follower: Vehicle) -> None:
     follower.target_jumped(2 * S)
-    assert follower.route_request(3 * S) == AskRoute("v", "t0", 11, False, Reason.JUMPED)
-
-
-def test_whoever_makes_way_leaves_its_route_and_rests_before_it_asks(follower: Vehicle) -> None:
-    follower.make_way()
-    assert follower.resting(100 * S)
-    assert follower.give_route(ROUTE, 2 * S) is None
-    follower.made_way(5 * S, 3 * S)
-    assert follower.route_request(4 * S) is None
-    assert follower.route_request(5 * S) == AskRoute("v", "t0", 11, False, Reason.BLOCKED)
-    assert Reason.BLOCKED.is_reroute
+    assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.JUMPED)
 
 
 def test_whoever_is_blocked_for_long_asks_but_keeps_its_route(follower: Vehicle) -> None:
     follower.blocked_for_long(2 * S)
-    assert follower.route_request(3 * S) == AskRoute("v", "t0", 11, False, Reason.BLOCKED)
+    assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.BLOCKED)
     assert follower.route.left == 3
 
 
@@ -196,12 +189,12 @@ happenings: st.SearchStrategy[Happening] = st.sampled_from(
         lambda vehicle, now_ns: vehicle.assign("t0", now_ns),
         lambda vehicle, now_ns: vehicle.assign("t1", now_ns),
         lambda vehicle, now_ns: vehicle.no_way(),
-        lambda vehicle, now_ns: vehicle.give_route(ROUTE, now_ns),
+        lambda vehicle, now_ns: vehicle.give_route(ROUTE, [vehicle.cell], now_ns),
         lambda vehicle, now_ns: vehicle.give_route(
-            GivenRoute("t1", (11, 21), 1.0, 1.0, partial=True, pushed=True), now_ns
+            GivenRoute("t1", (11, 21), 1.0, 1.0, partial=True, pushed=True), [vehicle.cell], now_ns
         ),
         lambda vehicle, now_ns: vehicle.give_route(
-            GivenRoute("t0", (77,), 1.0, 1.0, partial=False, pushed=True), now_ns
+            GivenRoute("t0", (77,), 1.0, 1.0, partial=False, pushed=True), [vehicle.cell], now_ns
         ),
         lambda vehicle, now_ns: vehicle.refuse_route("t0", RouteStatus.UNREACHABLE, now_ns),
         lambda vehicle, now_ns: vehicle.refuse_route("t1", RouteStatus.NO_TARGET, now_ns),
@@ -212,8 +205,6 @@ happenings: st.SearchStrategy[Happening] = st.sampled_from(
         lambda vehicle, now_ns: vehicle.set_in_reach(False),
         lambda vehicle, now_ns: vehicle.target_jumped(now_ns),
         lambda vehicle, now_ns: vehicle.cut_route(now_ns),
-        lambda vehicle, now_ns: vehicle.make_way(),
-        lambda vehicle, now_ns: vehicle.made_way(3 * S, now_ns),
         lambda vehicle, now_ns: vehicle.blocked_for_long(now_ns),
     ]
 )
@@ -224,7 +215,7 @@ def test_whatever_happens_the_state_tells_what_is_so_and_it_never_gives_up(happe
     vehicle = Vehicle("v", GRID, 11)
     for second, happening in enumerate(happened):
         happening(vehicle, second * S)
-        vehicle.route_request(second * S)
+        vehicle.route_request(second * S, vehicle.cell)
         if vehicle.target is not None:
             assert (vehicle.state is VehicleState.ARRIVED) == vehicle.in_reach
             assert (vehicle.state is VehicleState.LOST) == (vehicle.planner_gone and not vehicle.in_reach)
@@ -237,5 +228,4 @@ def test_whatever_happens_the_state_tells_what_is_so_and_it_never_gives_up(happe
     vehicle.no_answer(end_ns)
     vehicle.regain_planner(end_ns)
     vehicle.set_in_reach(False)
-    vehicle.made_way(0, end_ns)
-    assert any(vehicle.route_request(end_ns + wait * S) for wait in range(10))
+    assert any(vehicle.route_request(end_ns + wait * S, vehicle.cell) for wait in range(10))

@@ -1,0 +1,136 @@
+"""Messages about right of way: what hosts say of their vehicles, and what wardens grant (decision 25)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Plot, VehicleId
+from swarm.wire.messages.base import Message, schema_of
+
+Stamp = tuple[Natural, Natural]
+"""(epoch, seq): which table of a plot. Later ones compare greater."""
+Held = Annotated[list[Cell], Meta(max_length=64)]
+"""Cells of one vehicle in driving order."""
+Milliseconds = Annotated[int, Meta(ge=0, lt=1 << 32)]
+
+
+class Stand(Bounded, frozen=True, array_like=True):
+    """One vehicle, as its host tells it to the members of one plot.
+
+    cell    where it stands, and `end` where what it holds ends; both may lie in another plot
+    holds   the cells of this plot that it holds, in driving order
+    ahead   its next cells after `end`
+    wants   where else it could go from its cell, the best first; only while it stands
+    better  how many of those are better than to stay; the others serve to make way
+    age_ms  how long it has been on its way: who has been so for longest goes first
+    """
+
+    vehicle: VehicleId
+    cell: Cell
+    end: Cell
+    holds: Held
+    ahead: Annotated[list[Cell], Meta(max_length=16)]
+    wants: Annotated[list[Cell], Meta(max_length=8)]
+    better: Annotated[int, Meta(ge=0, le=8)]
+    age_ms: Milliseconds
+
+
+class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
+    """All vehicles of a host that hold or want a cell of one plot. The newest replaces the older.
+
+    life   which life of the host speaks; a later one is greater
+    knows  the newest table that the host acts on: of what that granted, it holds no more than it lists here
+    dead   earlier lives of this host that are proved to have ended: they ran on the file that this one has locked
+    ended  this life drives no more, and never will again
+    """
+
+    plot: Plot
+    agent: Id
+    life: Natural
+    seq: Natural
+    knows: Stamp
+    vehicles: Annotated[list[Stand], SMALL]
+    dead: Annotated[list[Natural], Meta(max_length=32)] = []
+    ended: bool = False
+
+
+class Grant(Bounded, frozen=True, array_like=True):
+    """The cells that one vehicle may stand on or enter, in driving order.
+
+    stamp  of the table that last added one
+    """
+
+    cells: Annotated[list[Cell], Meta(min_length=1, max_length=64)]
+    stamp: Stamp
+
+
+class Shut(Bounded, frozen=True, array_like=True):
+    """Cells on which vehicles of an earlier life of a host may still stand."""
+
+    agent: Id
+    life: Natural
+    cells: Annotated[list[Cell], LARGE]
+
+
+class Table(Message, frozen=True, kw_only=True, tag=schema_of("table")):
+    """Who may be where in one plot. In a publication its author is the plot's warden; in a reply, a member which
+    tells what it has stored.
+
+    hosts   agent -> [life, seq] of the newest standing that counts in this table
+    grants  vehicle -> its cells
+    shut    what nobody may enter
+    pushed  vehicle -> the age with which it is to make way into another plot
+    """
+
+    plot: Plot
+    agent: Id
+    epoch: Natural
+    seq: Natural
+    hosts: Annotated[dict[Id, tuple[Natural, Natural]], IDS]
+    grants: Annotated[dict[VehicleId, Grant], LARGE]
+    shut: Annotated[list[Shut], IDS] = []
+    pushed: Annotated[dict[VehicleId, Milliseconds], LARGE] = {}
+
+    @property
+    def stamp(self) -> Stamp:
+        return self.epoch, self.seq
+
+
+class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):
+    """A member of a plot has the table of this stamp on file."""
+
+    plot: Plot
+    agent: Id
+    epoch: Natural
+    seq: Natural
+
+
+class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
+    """A member wants to be warden in this epoch: whoever answers with its stored table promises to store nothing of
+    a lower one."""
+
+    epoch: Natural
+
+
+class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
+    """A new life of an agent asks all others what they know of it. `disk` names the file that it keeps."""
+
+    agent: Id
+    disk: Natural
+
+
+class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
+    """What one agent has on file about another.
+
+    agent  who answers
+    disk   the file that it takes to be the other's: the first that it was told of
+    life   the greatest life in any table
+    plots  those whose tables grant cells to its vehicles
+    """
+
+    agent: Id
+    disk: Natural
+    life: Natural
+    plots: Annotated[list[Plot], LARGE]

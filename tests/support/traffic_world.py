@@ -1,0 +1,392 @@
+"""Agents, their members and wardens, and the bodies of their vehicles, on a network that may do anything."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.wire.messages.traffic import Known, KnownRequest, Standing, Stored, Table
+from vehicle_agent.traffic.holdings import Wish
+from vehicle_agent.traffic.member import AskPromises, Refused, Save
+from vehicle_agent.traffic.plots import Plots
+from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
+
+MS = NS_PER_S // 1000
+TICK_NS = 100 * MS
+LOOK_AHEAD = 3
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong until `quiet_s`: shares of messages, and events a second in the whole swarm."""
+
+    loss: float = 0.0
+    repeat: float = 0.0
+    late: float = 0.0
+    delay_ms: float = 5.0
+    crashes: float = 0.0
+    hangs: float = 0.0
+    cuts: float = 0.0
+    leaps: float = 0.0
+    twins: float = 0.0
+    quiet_s: float = 0.0
+
+
+@dataclass
+class Disk:
+    """What survives a process: promises, tables, and the lives that ran on it."""
+
+    own: OwnRecord
+    saved: dict[int, tuple[int, Table]] = field(default_factory=dict)
+    bodies: dict[str, int] = field(default_factory=dict)
+
+
+class Process:
+    """One life of one agent. Its vehicles' bodies are on `disk`: they stand where they are when it dies."""
+
+    def __init__(self, world: TrafficWorld, agent: str, disk: Disk) -> None:
+        self.world, self.agent, self.disk = world, agent, disk
+        self.alive = True
+        self.hung: list[Callable[[], None]] | None = None
+        self.rights = RightOfWay(agent, world.plots, world.spawns, disk.own, disk.saved, self.find_body)
+        # A clock of its own: it may be years off, and leaps.
+        self.offset_ns = world.chance.randrange(60 * 60 * NS_PER_S)
+        self.ages: dict[str, int] = {}
+
+    @property
+    def now_ns(self) -> int:
+        return self.world.now_ns + self.offset_ns
+
+    def find_body(self, vehicle: str, cells: list[int]) -> int:
+        known = self.disk.bodies.get(vehicle)
+        return known if known in cells else cells[0]
+
+    def begin(self) -> None:
+        if self.world.last_disk.setdefault(self.agent, self.disk) is not self.disk:
+            self.disk.bodies.clear()  # they have been driven from elsewhere since
+        self.world.last_disk[self.agent] = self.disk
+        self.perform(self.rights.begin(self.world.chance.getrandbits(32)))
+
+    def perform(self, actions: list[Action]) -> None:
+        for action in actions:
+            match action:
+                case Save(promised, table):
+                    self.disk.saved[table.plot] = (promised, table)
+                case AskPromises():
+                    for member in action.members:
+                        self.world.claim(self, action, member)
+                case Standing():
+                    for member in self.world.plots.members(action.plot):
+                        self.world.send(self, member, lambda to, s=action: to.rights.hear_standing(s, to.now_ns))
+                case Table():
+                    self.world.send(self, None, lambda to, t=action: to.hear_table(t))
+                case Stored():
+                    self.world.send(self, None, lambda to, s=action: to.hear_stored(s))
+                case OwnRecord():
+                    self.disk.own = action
+                case Refused():
+                    self.world.refused.append(action.text)
+
+    def hear_table(self, table: Table) -> None:
+        actions, placed = self.rights.hear_table(table, self.now_ns)
+        self.perform(actions)
+        self.place(placed)
+
+    def hear_stored(self, stored: Stored) -> None:
+        self.place(self.rights.hear_stored(stored, self.now_ns))
+
+    def place(self, placed: list[str]) -> None:
+        for vehicle in placed:
+            self.disk.bodies[vehicle] = self.rights.holdings.path(vehicle)[0]
+            self.world.unmoved.pop(vehicle, None)
+            self.world.placed += 1
+        self.world.look()
+
+    def tick(self) -> None:
+        holdings = self.rights.holdings
+        wishes = {}
+        if holdings.life and not holdings.replaced:
+            for vehicle in self.world.spawns[self.agent]:
+                if holdings.path(vehicle):
+                    self.drive(vehicle)
+                    wishes[vehicle] = self.wish(vehicle)
+        self.perform(self.rights.tick(wishes, self.now_ns))
+        if holdings.replaced:
+            self.world.ended(self)
+
+    def drive(self, vehicle: str) -> None:
+        holdings, chance = self.rights.holdings, self.world.chance
+        if chance.random() < 0.05:
+            holdings.give_back(vehicle)
+        while len(holdings.path(vehicle)) > 1 and chance.random() < 0.7:
+            cell = holdings.path(vehicle)[1]
+            holdings.moved(vehicle, cell)
+            self.disk.bodies[vehicle] = cell
+            self.world.moves[vehicle] = self.world.moves.get(vehicle, 0) + 1
+            self.world.look()
+
+    def wish(self, vehicle: str) -> Wish:
+        world = self.world
+        path = holdings_path = self.rights.holdings.path(vehicle)
+        goal = world.goals[vehicle]
+        if path[0] == goal:
+            goal = world.new_goal(vehicle)
+            self.ages[vehicle] = 0
+        self.ages[vehicle] = self.ages.get(vehicle, 0) + 100
+        cost = world.costs(goal)
+        ahead, at = [], holdings_path[-1]
+        while len(ahead) + len(path) <= LOOK_AHEAD and cost[at]:
+            at = min(world.next_to(at), key=cost.__getitem__)
+            ahead.append(at)
+        here = path[0]
+        wants = sorted(world.next_to(here), key=lambda cell: (cost[cell], cell))[:8]
+        better = sum(cost[cell] < cost[here] for cell in wants)
+        pushed = self.rights.holdings.pushed(vehicle)
+        if pushed:
+            better = len(wants)
+        return Wish(ahead, wants, better, max(self.ages[vehicle], pushed))
+
+
+class TrafficWorld:
+    """`collisions` are pairs of different vehicles that were on one cell, also of the dead and the replaced."""
+
+    def __init__(
+        self, seed: int, agents: int, per_agent: int, size: int, side: int, faults: Faults, walls: float = 0.0
+    ) -> None:
+        self.chance = random.Random(seed)
+        self.faults = faults
+        self.now_ns = 0
+        self.grid = GridSpec(size, size, 1.0)
+        names = [f"a{k}" for k in range(agents)]
+        self.plots = Plots(self.grid, names, side)
+        # Pillars on every fourth cell at most, so that the rest hangs together.
+        pillars = {
+            row * size + col
+            for row in range(1, size, 2)
+            for col in range(1, size, 2)
+            if self.chance.random() < walls
+        }
+        self.free = [cell for cell in range(self.grid.cells) if cell not in pillars]
+        self._open = frozenset(self.free)
+        homes = iter(self.chance.sample(self.free, agents * per_agent))
+        self.spawns = {name: {f"{name}-{k:02d}": next(homes) for k in range(per_agent)} for name in names}
+        self.goals = {vehicle: self.chance.choice(self.free) for each in self.spawns.values() for vehicle in each}
+        self.reached: dict[str, int] = {}
+        self.moves: dict[str, int] = {}
+        self.collisions: list[tuple[int, str, str]] = []
+        self.refused: list[str] = []
+        self.last_disk: dict[str, Disk] = {}
+        self.placed = self.crashes = self.takeovers = self.twins = self.messages = 0
+        self.cut: set[tuple[str, str]] = set()
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._count = 0
+        self.disks: dict[str, list[Disk]] = {name: [self.new_disk()] for name in names}
+        self.unmoved = {vehicle: cell for each in self.spawns.values() for vehicle, cell in each.items()}
+        self.processes: list[Process] = []
+        for name in names:
+            self.at(self.chance.randrange(300 * MS), lambda name=name: self.start(name, self.disks[name][0]))
+        self.at(0, self.disturb)
+
+    # --- the ground -----------------------------------------------------------------------------------------
+
+    @cache  # noqa: B019
+    def next_to(self, cell: int) -> tuple[int, ...]:
+        return tuple(other for _, other in self.grid.neighbours(cell) if other in self._open)
+
+    @cache  # noqa: B019
+    def costs(self, goal: int) -> dict[int, int]:
+        cost, queue = {goal: 0}, deque([goal])
+        while queue:
+            cell = queue.popleft()
+            for other in self.next_to(cell):
+                if other not in cost:
+                    cost[other] = cost[cell] + 1
+                    queue.append(other)
+        return cost
+
+    def new_goal(self, vehicle: str) -> int:
+        self.reached[vehicle] = self.reached.get(vehicle, 0) + 1
+        self.goals[vehicle] = self.chance.choice(self.free)
+        return self.goals[vehicle]
+
+    def look(self) -> None:
+        """The law: different vehicles are on different cells, whoever commands them."""
+        on = {cell: vehicle for vehicle, cell in self.unmoved.items()}
+        for disks in self.disks.values():
+            for disk in disks:
+                for vehicle, cell in disk.bodies.items():
+                    other = on.setdefault(cell, vehicle)
+                    if other != vehicle:
+                        self.collisions.append((self.now_ns // MS, other, vehicle))
+
+    # --- time, and the network ------------------------------------------------------------------------------
+
+    def at(self, delay_ns: int, action: Callable[[], None]) -> None:
+        self._count += 1
+        heapq.heappush(self._events, (self.now_ns + delay_ns, self._count, action))
+
+    def run(self, seconds: float) -> None:
+        end_ns = self.now_ns + int(seconds * NS_PER_S)
+        while self._events and self._events[0][0] <= end_ns and not self.collisions:
+            self.now_ns, _, action = heapq.heappop(self._events)
+            action()
+        self.now_ns = end_ns
+
+    @property
+    def quiet(self) -> bool:
+        return self.now_ns >= self.faults.quiet_s * NS_PER_S
+
+    def send(self, source: Process, agent: str | None, deliver: Callable[[Process], None]) -> None:
+        """To every life of an agent, or of all."""
+        for process in self.processes:
+            if agent in (None, process.agent):
+                self.carry(source, process, lambda to=process: deliver(to))
+
+    def carry(self, source: Process, to: Process, deliver: Callable[[], None]) -> None:
+        chance, faults = self.chance, self.faults
+        self.messages += 1
+        delay_ms = 0.0
+        if source is not to:
+            if (source.agent, to.agent) in self.cut or (source.disk is not to.disk and self.is_cut(source, to)):
+                return
+            if not self.quiet and chance.random() < faults.loss:
+                return
+            delay_ms = chance.random() * faults.delay_ms
+            if not self.quiet and chance.random() < faults.late:
+                delay_ms += chance.random() * 3000
+            if not self.quiet and chance.random() < faults.repeat:
+                self.at(int((delay_ms + chance.random() * 2000) * MS), lambda: self.arrive(to, deliver))
+        self.at(int(delay_ms * MS), lambda: self.arrive(to, deliver))
+
+    def is_cut(self, source: Process, to: Process) -> bool:
+        return (f"{id(source.disk)}", "") in self.cut or (f"{id(to.disk)}", "") in self.cut
+
+    def arrive(self, to: Process, deliver: Callable[[], None]) -> None:
+        if to.hung is not None:
+            to.hung.append(deliver)
+        elif to.alive:
+            deliver()
+
+    def claim(self, source: Process, claim: AskPromises, member: str) -> None:
+        def ask(to: Process) -> None:
+            actions = to.rights.hear_claim(claim.plot, claim.epoch, to.now_ns)
+            to.perform([action for action in actions if not isinstance(action, Table)])
+            for table in actions:
+                if isinstance(table, Table):
+                    self.carry(to, source, lambda table=table: answer(table))
+
+        def answer(table: Table) -> None:
+            source.rights.hear_promise(member, claim.epoch, table, source.now_ns)
+            self.takeovers += 1
+
+        self.send(source, member, ask)
+
+    def ask_known(self, source: Process, first: bool = False) -> None:
+        """Ask everybody what they know of us, again and again until all have noted our file."""
+
+        def answer(to: Process) -> None:
+            for action in to.rights.answer_known(KnownRequest(agent=source.agent, disk=source.disk.own.disk)):
+                if isinstance(action, Known):
+                    self.carry(to, source, lambda known=action: source.perform(source.rights.hear_known(known)))
+                else:
+                    to.perform([action])
+
+        if source.alive and (first or not source.rights.settled):
+            for process in self.processes:
+                if process.agent != source.agent:
+                    self.carry(source, process, lambda to=process: answer(to))
+            self.at(NS_PER_S, lambda: self.ask_known(source))
+
+    def new_disk(self) -> Disk:
+        return Disk(OwnRecord(disk=self.chance.getrandbits(60)))
+
+    # --- what goes wrong ------------------------------------------------------------------------------------
+
+    def start(self, agent: str, disk: Disk) -> None:
+        """A new life asks everybody who can be reached where it is known, then begins."""
+        process = Process(self, agent, disk)
+        self.processes.append(process)
+        self.ask_known(process, first=True)
+        self.at(200 * MS, lambda: process.begin() if process.alive else None)
+
+        def tick() -> None:
+            if process.alive:
+                if process.hung is None:
+                    process.tick()
+                self.at(TICK_NS, tick)
+
+        self.at(self.chance.randrange(TICK_NS), tick)
+
+    def crash(self, process: Process) -> None:
+        process.alive = False
+        self.processes.remove(process)
+        self.crashes += 1
+        self.at(int(self.chance.random() * 2 * NS_PER_S), lambda: self.restart(process))
+
+    def restart(self, process: Process) -> None:
+        if not any(other.disk is process.disk for other in self.processes):
+            self.start(process.agent, process.disk)
+
+    def ended(self, process: Process) -> None:
+        """A life that has been replaced drives no more, and its bodies are gone. It goes on as a member."""
+        process.disk.bodies.clear()
+
+    def twin(self, process: Process) -> None:
+        """Cut a process off, alone or one way, and start another life of its agent on another machine."""
+        if len(self.spawns) < 3 or len(self.disks[process.agent]) > 2:
+            return
+        self.twins += 1
+        cut = (f"{id(process.disk)}", "")
+        self.cut.add(cut)
+        disk = self.new_disk()
+        self.disks[process.agent].append(disk)
+        self.at(int(self.chance.random() * NS_PER_S), lambda: self.start(process.agent, disk))
+        self.at(int(self.chance.uniform(1, 5) * NS_PER_S), lambda: self.cut.discard(cut))
+
+    def disturb(self) -> None:
+        """Ten times a second: what goes wrong now."""
+        if self.quiet:
+            self.cut.clear()
+            return
+        chance, faults = self.chance, self.faults
+        self.at(TICK_NS, self.disturb)
+        if not self.processes:
+            return
+        somebody = chance.choice(self.processes)
+        if chance.random() < faults.crashes / 10:
+            self.crash(somebody)
+        elif chance.random() < faults.hangs / 10 and somebody.hung is None:
+            somebody.hung = []
+            self.at(int(chance.random() * 4 * NS_PER_S), lambda: self.wake(somebody))
+        elif chance.random() < faults.twins / 10:
+            self.twin(somebody)
+        if chance.random() < faults.leaps / 10:
+            # One machine's clock leaps, or all but one: then they take a warden for silent that is not.
+            alone = chance.random() < 0.5
+            for process in self.processes:
+                if (process is somebody) == alone:
+                    process.offset_ns += chance.randrange(5 * NS_PER_S)
+        if chance.random() < faults.cuts / 10:
+            names = list(self.spawns)
+            side = set(chance.sample(names, chance.randint(1, -(-len(names) // 2))))
+            one_way = chance.random() < 0.4
+            pairs = {
+                (a, b)
+                for a in names
+                for b in names
+                if a != b and ((a in side) != (b in side)) and (not one_way or a in side)
+            }
+            self.cut |= pairs
+            self.at(int(chance.random() * 4 * NS_PER_S), lambda: self.cut.difference_update(pairs))
+
+    def wake(self, process: Process) -> None:
+        waiting, process.hung = process.hung or [], None
+        for deliver in waiting:
+            if process.alive:
+                deliver()

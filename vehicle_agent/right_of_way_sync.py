@@ -1,0 +1,175 @@
+"""Right of way on the bus: messages to calls of its core, and what that decides to the bus and to the file."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from hashlib import blake2s
+
+from msgspec.structs import replace
+
+from shared_map.replication.interest import Interest
+from swarm.bus.bus import Asked, AskEnded, Bus, Event, Heard, Post, Replied
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.traffic import Claim, Known, KnownRequest, Standing, Stored, Table
+from swarm.wire.topics import KNOWN, STANDING, STORED, TABLE
+from vehicle_agent.promise_store import PromiseStore
+from vehicle_agent.traffic.holdings import Wish
+from vehicle_agent.traffic.member import AskPromises, Refused, Save
+from vehicle_agent.traffic.plots import PLOT_CELLS, Plots
+from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
+
+log = logging.getLogger(__name__)
+
+_LEAD_CELLS = 8
+"""Tables of a plot are listened to so far ahead of the vehicles."""
+_FIRST_ANSWERS_S = 0.3
+"""A new life waits so long for the others' answers before it begins."""
+_ASK_AGAIN_NS = NS_PER_S
+_ASK_RARELY_NS = 30 * NS_PER_S
+_PROMISE_TIMEOUT_S = 0.5
+_MOST_REFUSALS_TOLD = 100
+
+
+class RightOfWaySync:
+    """Carries an agent's right of way.
+
+    placed  called with the vehicles that have found their places
+    warn    called with a sentence about what was refused
+    """
+
+    def __init__(
+        self,
+        setup: RoleSetup,
+        grid: GridSpec,
+        spawns: Mapping[str, Mapping[str, int]],
+        store: PromiseStore,
+        bus: Bus,
+        post: Post,
+        placed: Callable[[Sequence[str]], None],
+        warn: Callable[[str], None],
+    ) -> None:
+        plots = Plots(grid, list(spawns))
+        self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
+        self._id = setup.id
+        self._store = store
+        self._bus = bus
+        self._post = post
+        self._placed = placed
+        self._warn = warn
+        seed = f"{store.own.disk}/{setup.incarnation}".encode()
+        self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
+        self._near = Interest(grid, _LEAD_CELLS, square_cells=PLOT_CELLS)
+        self._seats = frozenset(plot for plot in range(plots.count) if setup.id in plots.members(plot))
+        self._listens_to: frozenset[int] = frozenset()
+        self._ask_due_ns: int | None = None
+        self._ask_wait_ns = _ASK_AGAIN_NS
+        self._refused: set[str] = set()
+
+    def start(self, now_ns: int) -> None:
+        self._bus.serve(KNOWN, self._post, agent=self._id)
+        self._bus.serve(TABLE, self._post, agent=self._id)
+        for plot in sorted(self._seats):
+            self._bus.subscribe(STANDING, self._post, plot=plot)
+        self._listen(self._seats)
+        self._ask_known()
+
+    def handle(self, event: Event, now_ns: int) -> bool:
+        """True if the event was about right of way."""
+        core = self.core
+        match event:
+            case Heard(message=Standing() as standing):
+                core.hear_standing(standing, now_ns)
+            case Heard(message=Table() as table):
+                actions, placed = core.hear_table(table, now_ns)
+                self._perform(actions)
+                self._placed(placed)
+            case Heard(message=Stored() as stored):
+                self._placed(core.hear_stored(stored, now_ns))
+            case Asked(topic=topic, request=Claim() as claim) if topic is TABLE:
+                if event.fields["plot"].isdecimal():
+                    self._answer(event, core.hear_claim(int(event.fields["plot"]), claim.epoch, now_ns))
+                event.end()
+            case Asked(topic=topic, request=KnownRequest() as request) if topic is KNOWN:
+                self._answer(event, core.answer_known(request))
+                event.end()
+            case Replied(topic=topic, fields=fields, tag=tag, message=Table() as table) if topic is TABLE:
+                core.hear_promise(fields["agent"], int(tag.rpartition("-")[2]), table, now_ns)
+            case Replied(message=Known() as known):
+                self._perform(core.hear_known(known))
+            case AskEnded(topic=topic) if topic is KNOWN:
+                self._known_ended(now_ns)
+            case AskEnded(topic=topic) if topic is TABLE:
+                pass
+            case _:
+                return False
+        return True
+
+    def tick(self, wishes: Mapping[str, Wish], places: Sequence[int], now_ns: int) -> None:
+        if self._ask_due_ns is not None and now_ns >= self._ask_due_ns:
+            self._ask_due_ns = None
+            self._ask_known()
+        holdings = self.core.holdings
+        if places:
+            holdings.watch(sorted(self._near.update(places)))
+        self._listen(self._seats.union(holdings.plots))
+        self._perform(self.core.tick(wishes, now_ns))
+
+    def _ask_known(self) -> None:
+        request = KnownRequest(agent=self._id, disk=self._store.own.disk)
+        self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
+
+    def _known_ended(self, now_ns: int) -> None:
+        """Begin, once all who could be asked have answered; ask on until everybody has noted our file."""
+        if not self.core.holdings.life:
+            self._perform(self.core.begin(self._chance))
+        if not self.core.settled:
+            self._ask_due_ns = now_ns + self._ask_wait_ns
+            self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
+
+    def _listen(self, plots: frozenset[int]) -> None:
+        for plot in sorted(plots - self._listens_to):
+            self._bus.subscribe(TABLE, self._post, plot=plot)
+            self._bus.subscribe(STORED, self._post, plot=plot)
+        for plot in sorted(self._listens_to - plots):
+            self._bus.unsubscribe(TABLE, plot=plot)
+            self._bus.unsubscribe(STORED, plot=plot)
+        self._listens_to = plots
+
+    def _answer(self, asked: Asked, actions: Sequence[Action]) -> None:
+        """Perform what has to be done first, and answer with the last."""
+        for action in actions:
+            match action:
+                case Table():
+                    asked.answer(replace(action, agent=self._id), plot=action.plot, agent=self._id)
+                case Known():
+                    asked.answer(action, agent=self._id)
+                case _:
+                    self._perform([action])
+
+    def _perform(self, actions: Sequence[Action]) -> None:
+        for action in actions:
+            match action:
+                case Save(promised, table):
+                    self._store.save(promised, table)
+                case OwnRecord():
+                    self._store.save_own(action)
+                case Standing():
+                    self._bus.publish(STANDING, action, plot=action.plot, agent=self._id)
+                case Table():
+                    self._bus.publish(TABLE, action, plot=action.plot, agent=self._id)
+                case Stored():
+                    self._bus.publish(STORED, action, plot=action.plot, agent=self._id)
+                case AskPromises(plot, epoch, members):
+                    for member in members:
+                        tag = f"promise-{plot}-{epoch}"
+                        claim = Claim(epoch=epoch)
+                        self._bus.ask(
+                            TABLE, claim, self._post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, plot=plot, agent=member
+                        )
+                case Refused(text):
+                    if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:
+                        self._refused.add(text)
+                        self._warn(text)

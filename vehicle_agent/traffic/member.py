@@ -1,0 +1,187 @@
+"""A member of a plot: it promises, stores tables, and becomes the plot's warden when the last one is silent.
+
+The rules are those of a Paxos acceptor (Lamport, 1998) with the whole table as the value. What is promised or
+stored must be on file before anybody is told. No clock decides anything but when a member tries to become warden.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
+from swarm.wire.messages.traffic import Standing, Stored, Table
+from vehicle_agent.traffic.plots import Plots
+from vehicle_agent.traffic.warden import BEAT_NS, Warden
+
+LEASE_NS = 3 * BEAT_NS
+"""A warden that is silent for so long may be replaced. Until then its members refuse every claim."""
+_RANK_NS = NS_PER_S // 5
+_START_NS = 3 * NS_PER_S // 10
+_WANTED_NS = NS_PER_S
+"""Where no host has spoken for so long, nobody needs a warden."""
+_FURTHEST_EPOCH = 3 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Save:
+    """Put this on file before what follows is said."""
+
+    promised: int
+    table: Table
+
+
+@dataclass(frozen=True, slots=True)
+class AskPromises:
+    """Ask the other members of a plot to promise this epoch."""
+
+    plot: int
+    epoch: int
+    members: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """Something was said that cannot be true."""
+
+    text: str
+
+
+MemberAction = Save | AskPromises | Refused | Table | Stored
+
+
+class Member:
+    """One agent's seat among the members of one plot.
+
+    promised  no table of a lower epoch is stored any more
+    stored    the newest table on file; the table of the run's start until there is another
+    warden    the warden itself, while this member is in charge
+    """
+
+    def __init__(
+        self, plots: Plots, me: str, promised: int, stored: Table, vehicles: Container[str], now_ns: int
+    ) -> None:
+        self.plot = stored.plot
+        self.promised = promised
+        self.stored = stored
+        self.warden: Warden | None = None
+        self._plots = plots
+        self._me = me
+        self._vehicles = vehicles
+        self._members = plots.members(self.plot)
+        self._others = tuple(member for member in self._members if member != me)
+        self._rank = self._members.index(me)
+        self._claimed = 0
+        self._promises: dict[str, Table] = {}
+        self._claim_above = 0
+        self._leader = ""
+        self._led_until_ns = now_ns  # the warden that we know of is in charge at least so long
+        self._due_ns = now_ns
+        self._wanted_ns: int | None = None
+        self._acked_ns = now_ns
+
+    # --- what hosts say -------------------------------------------------------------------------------------
+
+    def hear_standing(self, standing: Standing, now_ns: int) -> None:
+        if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
+            wait_ns = _START_NS if self.promised else 0  # nobody can be in charge of a plot that is new
+            self._due_ns = max(self._due_ns, now_ns + wait_ns + self._rank * _RANK_NS)
+            self._acked_ns = now_ns
+        self._wanted_ns = now_ns
+        if self.warden is not None:
+            self.warden.hear(standing, now_ns)
+
+    # --- what members say -----------------------------------------------------------------------------------
+
+    def hear_table(self, table: Table, now_ns: int) -> list[MemberAction]:
+        if table.agent != self._plots.warden(self.plot, table.epoch):
+            return []
+        if table.epoch < self.promised:
+            # A claim of ours or of another came to nothing: let the warden claim again, so that we can follow it.
+            return [Stored(plot=self.plot, agent=self._me, epoch=self.promised, seq=0)]
+        if table.epoch > self.promised + _FURTHEST_EPOCH:
+            return [Refused(f"{table.agent} names an epoch that is implausibly far ahead: {table.epoch}")]
+        if self.warden is not None and table.epoch > self.warden.epoch:
+            self.warden = None
+        self._led(now_ns, table.agent)
+        actions: list[MemberAction] = []
+        if table.stamp > self.stored.stamp:
+            self.promised, self.stored = table.epoch, table
+            actions.append(Save(self.promised, self.stored))
+        if table.stamp == self.stored.stamp:
+            actions.append(Stored(plot=self.plot, agent=self._me, epoch=table.epoch, seq=table.seq))
+        return actions
+
+    def hear_claim(self, epoch: int, now_ns: int) -> list[MemberAction]:
+        """Promise, or say nothing. The last action is the table to answer with."""
+        claimant = self._plots.warden(self.plot, epoch)
+        led = now_ns < self._led_until_ns and claimant != self._leader
+        if epoch <= self.promised or self.warden is not None or led:
+            return []
+        if epoch > self.promised + _FURTHEST_EPOCH:
+            return [Refused(f"a claim names an epoch that is implausibly far ahead: {epoch}")]
+        self._promise(epoch)
+        self._led(now_ns, claimant)  # time for the claimant to begin
+        return [Save(self.promised, self.stored), self.stored]
+
+    def hear_promise(self, member: str, epoch: int, table: Table, now_ns: int) -> None:
+        if epoch == self._claimed and epoch == self.promised and member in self._others:
+            self._promises[member] = table
+            self._take_charge(now_ns)
+
+    def hear_stored(self, stored: Stored, now_ns: int) -> None:
+        if self.warden is None or stored.agent not in self._others:
+            return
+        if stored.epoch == self.warden.epoch:
+            self._acked_ns = now_ns
+        elif self.promised < stored.epoch <= self.promised + _FURTHEST_EPOCH:
+            self._claim_above = stored.epoch
+
+    # --- being warden ---------------------------------------------------------------------------------------
+
+    def tick(self, now_ns: int) -> list[MemberAction]:
+        if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
+            return []
+        if self.warden is not None and self._claim_above <= self.warden.epoch:
+            return self._lead(self.warden, now_ns)
+        if self.warden is None and now_ns < self._due_ns:
+            return []
+        members = len(self._members)
+        self._promise((max(self.promised, self._claim_above) // members + 1) * members + self._rank)
+        self._claimed = self.promised
+        self._promises = {self._me: self.stored}
+        self._due_ns = now_ns + LEASE_NS + self._rank * _RANK_NS
+        actions: list[MemberAction] = [Save(self.promised, self.stored)]
+        if self._others:
+            actions.append(AskPromises(self.plot, self._claimed, self._others))
+        self._take_charge(now_ns)
+        return actions
+
+    def _lead(self, warden: Warden, now_ns: int) -> list[MemberAction]:
+        if self._others and now_ns - self._acked_ns > LEASE_NS:
+            self.warden = None  # nobody hears us, or we hear nobody: leave it to the others
+            self._led(now_ns, self._me)
+            return []
+        actions: list[MemberAction] = [Refused(text) for text in warden.refused]
+        warden.refused.clear()
+        table = warden.tick(now_ns)
+        if table is not None:
+            self.stored = table
+            actions += [Save(self.promised, table), table]
+        return actions
+
+    def _take_charge(self, now_ns: int) -> None:
+        if self.warden is None and len(self._promises) >= self._plots.majority:
+            newest = max(self._promises.values(), key=lambda table: table.stamp)
+            self.warden = Warden(self._plots, self._me, self._claimed, newest, self._vehicles)
+            self._acked_ns = now_ns
+
+    def _promise(self, epoch: int) -> None:
+        self.promised = epoch
+        self._promises = {}
+        self.warden = None
+
+    def _led(self, now_ns: int, leader: str) -> None:
+        self._leader = leader
+        self._led_until_ns = now_ns + LEASE_NS
+        self._due_ns = self._led_until_ns + self._rank * _RANK_NS

@@ -1,0 +1,91 @@
+"""Who moves where: priority inheritance with backtracking (Okumura et al., 2019 and 2022), for vehicles that need
+different times for their steps.
+
+The vehicle of the highest priority takes the best cell that it can get. Where another stands there, that one is
+planned next, with the priority that it inherits, and must go anywhere else; if it cannot, the first takes its
+second best. Here no vehicle enters a cell before the one that stands there has left it, so no two exchange places
+and none go around in a ring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+_DEEPEST = 200
+"""Vehicles that one can push at once: within the interpreter's depth of recursion."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mover:
+    """A vehicle at rest.
+
+    wants   the cells that it could go to, the best first; the first `better` of them are better than to stay
+    guest   it stands in another plot and asks to come in
+    """
+
+    id: str
+    cell: int
+    wants: Sequence[int]
+    better: int
+    age: int
+    guest: bool = False
+
+
+class Round:
+    """One round of planning in one plot.
+
+    movers  all that are at rest
+    closed  cells that stay occupied, whatever is planned
+    inside  whether a cell belongs to the plot
+
+    to      vehicle -> the cell that it is to go to; its own if it stays
+    taken   cell -> the vehicle that is to go there
+    pushed  vehicle -> the age of the one that it could not make way for within the plot
+    """
+
+    def __init__(self, movers: Sequence[Mover], closed: Collection[int], inside: Callable[[int], bool]) -> None:
+        self.to: dict[str, int] = {}
+        self.taken: dict[int, str] = {}
+        self.pushed: dict[str, int] = {}
+        self._standing = {mover.cell: mover for mover in movers if not mover.guest}
+        self._closed = closed
+        self._inside = inside
+        self._chain: set[int] = set()
+
+    def plan(self, mover: Mover) -> None:
+        if mover.id not in self.to:
+            self._plan(mover, mover.age, pushed=False)
+
+    def _plan(self, mover: Mover, age: int, pushed: bool) -> bool:
+        """Whether the mover leaves its cell, or may stay."""
+        self._chain.add(mover.cell)
+        found = self._take_one(mover, age, pushed)
+        self._chain.discard(mover.cell)
+        if found:
+            return True
+        self.to[mover.id] = mover.cell
+        if not mover.guest:
+            self.taken[mover.cell] = mover.id
+        if pushed and any(not self._inside(cell) for cell in mover.wants):
+            self.pushed[mover.id] = age
+        return not pushed
+
+    def _take_one(self, mover: Mover, age: int, pushed: bool) -> bool:
+        for rank, cell in enumerate(mover.wants):
+            if rank >= mover.better and not pushed:
+                return False
+            if not self._inside(cell):
+                if pushed or mover.guest:
+                    continue
+                return False  # it waits for the other plot's warden
+            if cell in self.taken or cell in self._closed or cell in self._chain:
+                continue
+            other = self._standing.get(cell)
+            if other is not None and (self.to.get(other.id) == mover.cell or len(self._chain) >= _DEEPEST):
+                continue
+            self.to[mover.id] = cell
+            self.taken[cell] = mover.id
+            if other is None or other.id in self.to or self._plan(other, age, pushed=True):
+                return True
+        return False

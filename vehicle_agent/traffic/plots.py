@@ -1,0 +1,53 @@
+"""Plots, the squares of the map in which right of way is decided, and the agents that decide it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from hashlib import blake2s
+
+from swarm.grid import GridSpec
+
+PLOT_CELLS = 64
+_MEMBERS = 3
+
+
+class Plots:
+    """The plots of a grid and their members: fixed for a run, and the same in every process.
+
+    The members of a plot are the first three agents by rendezvous hashing (Thaler and Ravishankar, 1998); of fewer
+    than three agents one, because two of two are harder to keep alive than one.
+    """
+
+    def __init__(self, grid: GridSpec, agents: Sequence[str], side: int = PLOT_CELLS) -> None:
+        self.grid = grid
+        self._agents = list(agents)
+        self._side = side
+        self._across = -(-grid.cols // side)
+        self._members: dict[int, tuple[str, ...]] = {}
+        self.count = self._across * -(-grid.rows // side)
+        self.majority = 2 if len(self._agents) >= _MEMBERS else 1
+
+    def of(self, cell: int) -> int:
+        """The plot of a cell; -1 of a cell outside the grid."""
+        if not 0 <= cell < self.grid.cells:
+            return -1
+        row, col = divmod(cell, self.grid.cols)
+        return row // self._side * self._across + col // self._side
+
+    def members(self, plot: int) -> tuple[str, ...]:
+        members = self._members.get(plot)
+        if members is None:
+            by_hash = sorted(self._agents, key=lambda agent: blake2s(f"{plot}/{agent}".encode()).digest())
+            members = self._members[plot] = tuple(by_hash[: _MEMBERS if self.majority > 1 else 1])
+        return members
+
+    def warden(self, plot: int, epoch: int) -> str:
+        """The only member that may be warden in an epoch."""
+        members = self.members(plot)
+        return members[epoch % len(members)]
+
+    def adjacent(self, one: int, other: int) -> bool:
+        """Whether one step leads from one cell to the other."""
+        rows = one // self.grid.cols - other // self.grid.cols
+        cols = one % self.grid.cols - other % self.grid.cols
+        return max(abs(rows), abs(cols)) == 1

@@ -1,0 +1,141 @@
+"""Where each vehicle would go next: what a host asks of wardens for it."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec
+from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.traffic.holdings import Wish
+
+_NEAR_CELLS = 8
+"""Cells of the route to which a vehicle that was pushed off it may return."""
+_OFF_ROUTE = 4.0
+_OCCUPIED = 0.9
+"""What it costs to push another vehicle, in cells: less than a step, so that one without another way pushes."""
+_BLOCKED_NS = 3 * NS_PER_S
+"""A vehicle that has stood for so long on its way asks its planner for another route."""
+_MS = NS_PER_S // 1000
+_OLDEST_MS = 1 << 31
+
+
+class Steering:
+    """Ranks the cells around vehicles by their routes.
+
+    A planner's route is the cost-to-go along one line. A cell beside it costs the step back to the route and the
+    rest from there; so a host needs no tree of the planner, and one that is pushed aside finds back by itself.
+
+    pace         float32 (rows, cols), s/m; inf is lethal; read at each call
+    reserve      cells ahead of itself that a vehicle may be granted
+    occupied     whether another vehicle holds a cell
+    """
+
+    def __init__(
+        self,
+        grid: GridSpec,
+        pace: NDArray[np.float32],
+        planner: PlannerConfig,
+        reserve: int,
+        chance: random.Random,
+        occupied: Callable[[int], bool],
+    ) -> None:
+        self._grid = grid
+        self._pace = pace.reshape(-1)
+        self._diagonal = planner.neighbours == 8
+        self._corner_cutting = planner.corner_cutting
+        self._reserve = reserve
+        self._chance = chance
+        self._occupied = occupied
+        self._since_ns: dict[str, int] = {}
+        """Vehicle -> since when it has been on its way to a target."""
+        self._stood_ns: dict[str, tuple[int, int]] = {}
+        """Vehicle -> the cell on which it waits, and since when."""
+
+    def closed(self, cell: int) -> bool:
+        """Whether a cell is lethal."""
+        return not math.isfinite(self._pace[cell])
+
+    def wish(
+        self, vehicle: Vehicle, path: Sequence[int], pushed_ms: int, in_reach: Callable[[int], bool], now_ns: int
+    ) -> Wish:
+        """What to ask for a vehicle that holds these cells.
+
+        pushed_ms  the age with which it is to make way into another plot; 0 if it is not
+        in_reach   whether the target is within capture range of a cell
+        """
+        still = len(path) == 1
+        if vehicle.in_reach or vehicle.target is None:
+            self._since_ns[vehicle.id] = now_ns
+            steps = self.steps(path[0]) if still else []
+            wants = sorted(
+                steps, key=lambda cell: (not in_reach(cell), self._occupied(cell), self._chance.random())
+            )
+            return Wish((), wants, len(wants) if pushed_ms else 0, pushed_ms)
+        age_ms = (now_ns - self._since_ns.setdefault(vehicle.id, now_ns)) // _MS
+        age_ms = max(1, min(age_ms, _OLDEST_MS), pushed_ms)
+        ahead = self._ahead(vehicle, path)
+        if not still:
+            return Wish(ahead, (), 0, age_ms)
+        near = vehicle.route.near(_NEAR_CELLS)
+        cost = {cell: self._cost(cell, near) + _OCCUPIED * self._occupied(cell) for cell in self.steps(path[0])}
+        wants = sorted(cost, key=lambda cell: (cost[cell], self._chance.random()))
+        here = self._cost(path[0], near)
+        better = len(wants) if pushed_ms else sum(each < here for each in cost.values())
+        return Wish(ahead, wants, better, age_ms)
+
+    def blocked(self, vehicle: Vehicle, path: Sequence[int], now_ns: int) -> bool:
+        """Whether it stands though its route goes on. Asks for another route after a while."""
+        if len(path) > 1 or vehicle.in_reach or not vehicle.route.left or not vehicle.motion.at_rest:
+            self._stood_ns.pop(vehicle.id, None)
+            return False
+        cell, since_ns = self._stood_ns.setdefault(vehicle.id, (vehicle.cell, now_ns))
+        if cell != vehicle.cell or now_ns - since_ns > _BLOCKED_NS:
+            del self._stood_ns[vehicle.id]
+            if cell == vehicle.cell:
+                vehicle.blocked_for_long(now_ns)
+        return True
+
+    def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:
+        """The next cells of the route after what it holds; none if that ends beside the route."""
+        ahead = vehicle.route.after(path[-1], self._reserve - len(path) + 1)
+        for index, cell in enumerate(ahead):
+            if self.closed(cell):
+                return ahead[:index]
+        return ahead
+
+    def steps(self, cell: int) -> list[int]:
+        """The neighbours that the map allows to drive to."""
+        around: list[int | None] = [None] * 8
+        for direction, neighbour in self._grid.neighbours(cell):
+            if not self.closed(neighbour):
+                around[direction] = neighbour
+        steps = []
+        for direction, found in enumerate(around):
+            if found is None:
+                continue
+            sides = around[direction - 1] is not None and around[(direction + 1) % 8] is not None
+            if direction % 2 == 0 or (self._diagonal and (sides or self._corner_cutting)):
+                steps.append(found)
+        return steps
+
+    def _cost(self, cell: int, route: Sequence[int]) -> float:
+        """Cost-to-go of a cell by the route near it, in cells: back onto the route in one step, then along it."""
+        best = math.inf
+        length = len(route)
+        for index, there in enumerate(route):
+            apart = self._octile(cell, there)
+            rest = float(length - index)
+            best = min(best, rest + apart if apart < 2.0 else rest + _OFF_ROUTE + 2.0 * apart)
+        return best
+
+    def _octile(self, one: int, other: int) -> float:
+        cols = self._grid.cols
+        south, east = abs(one // cols - other // cols), abs(one % cols - other % cols)
+        return max(south, east) + (math.sqrt(2.0) - 1.0) * min(south, east)

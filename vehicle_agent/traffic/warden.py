@@ -1,0 +1,220 @@
+"""The warden of a plot: it grants cells to vehicles, and frees them only by their host's own word.
+
+No cell is in two vehicles' grants; a grant is never revoked. So whoever obeys a table that a majority has stored is
+alone on its cells (see decision 25 for the proof).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
+from swarm.wire.messages.traffic import Grant, Shut, Stamp, Stand, Standing, Table
+from vehicle_agent.traffic.pibt import Mover, Round
+from vehicle_agent.traffic.plots import Plots
+
+BEAT_NS = NS_PER_S // 5
+"""A table is told so often though nothing has changed, so that the other members know of a warden."""
+SILENT_NS = NS_PER_S
+"""Vehicles of a host that has not spoken for so long are obstacles: nobody waits for them or pushes them."""
+_AGE_BITS = 12
+"""Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is
+the older most of the time, or each lets its own wait for the other."""
+_LIFE_BITS = 32
+_FURTHEST_LIFE = 1 << 16
+
+
+def first_life(after: int, chance: int) -> int:
+    """A new life's number: greater than all that are known. Of two that begin at once, chance decides."""
+    return ((after >> _LIFE_BITS) + 1 << _LIFE_BITS) | (chance & 0xFFFF_FFFF)
+
+
+def is_far_ahead(life: int, known: int) -> bool:
+    """Whether a number is further ahead than a host can have been restarted."""
+    return life >> _LIFE_BITS > (known >> _LIFE_BITS) + _FURTHEST_LIFE
+
+
+@dataclass(slots=True)
+class _Host:
+    standing: Standing
+    heard_ns: int
+
+
+class Warden:
+    """Holds one plot's table in one epoch. Every `tick` may make a new one, which counts once a majority stored it.
+
+    vehicles  all of the run
+    """
+
+    def __init__(self, plots: Plots, me: str, epoch: int, table: Table, vehicles: Container[str]) -> None:
+        self.epoch = epoch
+        self.seq = 0
+        self.refused: list[str] = []
+        self._plots = plots
+        self._plot = table.plot
+        self._me = me
+        self._vehicles = vehicles
+        self._lives = dict(table.hosts)  # agent -> (life, seq) of the newest standing that counts
+        self._grants: dict[str, tuple[list[int], Stamp]] = {
+            vehicle: (list(grant.cells), grant.stamp) for vehicle, grant in table.grants.items()
+        }
+        self._shut = {(each.agent, each.life): list(each.cells) for each in table.shut}
+        self._hosts: dict[str, _Host] = {}
+        self._pushed: dict[str, int] = {}
+        self._changed = True
+        self._told_ns = 0
+
+    @property
+    def _next_stamp(self) -> Stamp:
+        return self.epoch, self.seq + 1
+
+    # --- what hosts say -------------------------------------------------------------------------------------
+
+    def hear(self, standing: Standing, now_ns: int) -> None:
+        host = standing.agent
+        for dead in standing.dead:
+            if self._shut.pop((host, dead), None) is not None:
+                self._changed = True
+        life, seq = self._lives.get(host, (0, 0))
+        if standing.ended:
+            self._ended(host, standing.life, life)
+            return
+        if (standing.life, standing.seq) <= (life, seq):
+            return
+        if is_far_ahead(standing.life, life):
+            self.refused.append(f"{host} names a life that is implausibly far ahead: {standing.life}")
+            return
+        if standing.life != life:
+            self._succeed(host, life)
+        self._lives[host] = (standing.life, standing.seq)
+        holds = {stand.vehicle: stand.holds for stand in standing.vehicles}
+        for vehicle in [vehicle for vehicle in self._grants if agent_of(vehicle) == host]:
+            self._free(vehicle, holds.get(vehicle, []), standing.knows)
+        self._hosts[host] = _Host(standing, now_ns)
+
+    def _ended(self, host: str, ended: int, life: int) -> None:
+        """A life's own word that it drives no more."""
+        if (host, ended) in self._shut:
+            self._changed = self._changed or bool(self._shut[host, ended])
+            if ended == life:
+                return
+            del self._shut[host, ended]
+        elif ended == life:
+            self._shut[host, ended] = []  # its successor need not wait for it
+            self._changed = True
+
+    def _succeed(self, host: str, before: int) -> None:
+        """A new life of a host speaks. What the one before it was granted stays shut until that is known to have
+        ended; the new one is granted the same cells, and has to see that before it can give any back."""
+        mine = [vehicle for vehicle in self._grants if agent_of(vehicle) == host]
+        if (host, before) in self._shut:
+            del self._shut[host, before]
+        elif before and mine:
+            self._shut[host, before] = [cell for vehicle in mine for cell in self._grants[vehicle][0]]
+        for vehicle in mine:
+            self._grants[vehicle] = (self._grants[vehicle][0], self._next_stamp)
+        self._hosts.pop(host, None)
+        self._changed = True
+
+    def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
+        """Drop what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
+        cells, stamp = self._grants[vehicle]
+        if knows >= stamp:
+            kept = [cell for cell in cells if cell in holds]
+        elif holds and holds[0] in cells:
+            kept = cells[cells.index(holds[0]) :]
+        else:
+            return
+        if len(kept) < len(cells):
+            self._changed = True
+            if kept:
+                self._grants[vehicle] = (kept, stamp)
+            else:
+                del self._grants[vehicle]
+
+    # --- what is granted ------------------------------------------------------------------------------------
+
+    def tick(self, now_ns: int) -> Table | None:
+        """Grant what can be granted. Returns the table if it changed, or if it is time to tell it again."""
+        self._plan(now_ns)
+        if not self._changed and now_ns - self._told_ns < BEAT_NS:
+            return None
+        self._changed = False
+        self._told_ns = now_ns
+        self.seq += 1
+        return Table(
+            plot=self._plot,
+            agent=self._me,
+            epoch=self.epoch,
+            seq=self.seq,
+            hosts=dict(self._lives),
+            grants={vehicle: Grant(list(cells), stamp) for vehicle, (cells, stamp) in self._grants.items()},
+            shut=[Shut(host, life, list(cells)) for (host, life), cells in self._shut.items()],
+            pushed=dict(self._pushed),
+        )
+
+    def _plan(self, now_ns: int) -> None:
+        stands = self._stands(now_ns)
+        held = {cell for cells, _ in self._grants.values() for cell in cells}
+        held.update(cell for cells in self._shut.values() for cell in cells)
+        closed = set(held)
+        movers: dict[str, Mover] = {}
+        for stand in stands:
+            cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+            if stand.cell != stand.end or (cells and cells != [stand.cell]):
+                # It is under way: whoever wants a cell that it will leave may wait for it.
+                closed.difference_update(cells[:-1] if stand.end in cells else cells)
+                continue
+            closed.difference_update(cells)
+            movers[stand.vehicle] = Mover(
+                stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, guest=not cells
+            )
+        for cells in self._shut.values():
+            closed.update(cells)
+        round = Round(list(movers.values()), closed, lambda cell: self._plots.of(cell) == self._plot)
+        for stand in stands:
+            mover = movers.get(stand.vehicle)
+            if mover is not None:
+                round.plan(mover)
+            else:
+                self._grant(stand, self._next_ahead(stand), held, round.taken)
+        for stand in stands:
+            to = round.to.get(stand.vehicle)
+            if to is not None and to != stand.cell:
+                ahead = stand.ahead if stand.ahead[:1] == [to] else [to]
+                self._grant(stand, ahead, held, round.taken)
+        if round.pushed != self._pushed:
+            self._pushed = round.pushed
+            self._changed = True
+
+    def _stands(self, now_ns: int) -> list[Stand]:
+        """The vehicles of all who have spoken lately, whoever has been on its way for longest first."""
+        stands = [
+            stand
+            for name, host in self._hosts.items()
+            if now_ns - host.heard_ns <= SILENT_NS
+            for stand in host.standing.vehicles
+            if stand.vehicle in self._vehicles and agent_of(stand.vehicle) == name
+        ]
+        return sorted(stands, key=lambda stand: (-(stand.age_ms >> _AGE_BITS), stand.vehicle))
+
+    def _next_ahead(self, stand: Stand) -> Sequence[int]:
+        """The cells ahead of one that is under way, from where all that it has been granted ends."""
+        cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+        if not cells or cells[-1] == stand.end or stand.end not in cells:
+            return stand.ahead if not cells or stand.end in cells else []
+        last = cells[-1]
+        return stand.ahead[stand.ahead.index(last) + 1 :] if last in stand.ahead else []
+
+    def _grant(self, stand: Stand, ahead: Sequence[int], held: set[int], taken: dict[int, str]) -> None:
+        """Append free cells, up to the first that is not."""
+        for cell in ahead:
+            mine = taken.setdefault(cell, stand.vehicle) == stand.vehicle
+            if not mine or cell in held or self._plots.of(cell) != self._plot:
+                return
+            held.add(cell)
+            cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+            self._grants[stand.vehicle] = ([*cells, cell], self._next_stamp)
+            self._changed = True
