@@ -68,6 +68,8 @@ class Holdings:
         self._agent = agent
         self._vehicles = list(vehicles)
         self._paths: dict[str, list[int]] = {}
+        self._cells: set[int] | None = None
+        """All cells of our paths; None when they have changed."""
         self._views: dict[int, _View] = {}
         self._seq = 0
 
@@ -88,18 +90,20 @@ class Holdings:
 
     def occupied(self, cell: int) -> bool:
         """Whether another vehicle holds a cell, as far as the tables in use tell."""
-        view = self._views.get(self._plots.of(cell))
-        mine = any(cell in path for path in self._paths.values())
-        return mine or (view is not None and cell in view.others)
+        if self._cells is None:
+            self._cells = {cell for path in self._paths.values() for cell in path}
+        return cell in self._cells or any(cell in self._views[plot].others for plot in self.plots)
 
     def moved(self, vehicle: str, cell: int) -> None:
         """It has come to the next cell of its path."""
         path = self._paths[vehicle]
         self._paths[vehicle] = path[path.index(cell) :]
+        self._cells = None
 
     def give_back(self, vehicle: str, keep: int = 1) -> None:
         """Keep only the first cells of the path. The rest must not be entered any more."""
         self._paths[vehicle] = self._paths[vehicle][: max(keep, 1)]
+        self._cells = None
 
     # --- what members say -----------------------------------------------------------------------------------
 
@@ -144,6 +148,7 @@ class Holdings:
         if life != self.life:
             return []  # what it grants was granted to another life
         view.knows, view.heard = stamp, heard
+        self._cells = None
         view.pushed = {id: age for id, age in table.pushed.items() if id in self._paths}
         view.others = frozenset(
             cell

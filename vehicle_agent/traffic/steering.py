@@ -18,6 +18,7 @@ from vehicle_agent.traffic.holdings import Wish
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
 _OFF_ROUTE = 4.0
+_DIAGONAL = math.sqrt(2.0) - 1.0
 _OCCUPIED = 0.9
 """What it costs to push another vehicle, in cells: less than a step, so that one without another way pushes."""
 _BLOCKED_NS = 3 * NS_PER_S
@@ -83,7 +84,7 @@ class Steering:
         ahead = self._ahead(vehicle, path)
         if not still:
             return Wish(ahead, (), 0, age_ms)
-        near = vehicle.route.near(_NEAR_CELLS)
+        near = self._places(vehicle.route.near(_NEAR_CELLS))
         cost = {cell: self._cost(cell, near) + _OCCUPIED * self._occupied(cell) for cell in self.steps(path[0])}
         wants = sorted(cost, key=lambda cell: (cost[cell], self._chance.random()))
         here = self._cost(path[0], near)
@@ -125,17 +126,19 @@ class Steering:
                 steps.append(found)
         return steps
 
-    def _cost(self, cell: int, route: Sequence[int]) -> float:
-        """Cost-to-go of a cell by the route near it, in cells: back onto the route in one step, then along it."""
-        best = math.inf
+    def _places(self, route: Sequence[int]) -> list[tuple[int, int, float]]:
+        """(row, column, cells of the route from there on) of each cell of a route."""
         length = len(route)
-        for index, there in enumerate(route):
-            apart = self._octile(cell, there)
-            rest = float(length - index)
-            best = min(best, rest + apart if apart < 2.0 else rest + _OFF_ROUTE + 2.0 * apart)
-        return best
+        return [(*divmod(cell, self._grid.cols), float(length - index)) for index, cell in enumerate(route)]
 
-    def _octile(self, one: int, other: int) -> float:
-        cols = self._grid.cols
-        south, east = abs(one // cols - other // cols), abs(one % cols - other % cols)
-        return max(south, east) + (math.sqrt(2.0) - 1.0) * min(south, east)
+    def _cost(self, cell: int, route: Sequence[tuple[int, int, float]]) -> float:
+        """Cost-to-go of a cell by the route near it, in cells: back onto the route in one step, then along it."""
+        row, col = divmod(cell, self._grid.cols)
+        best = math.inf
+        for there_row, there_col, rest in route:
+            south, east = abs(row - there_row), abs(col - there_col)
+            apart = south + _DIAGONAL * east if south > east else east + _DIAGONAL * south
+            cost = rest + apart if apart < 2.0 else rest + _OFF_ROUTE + 2.0 * apart
+            if cost < best:
+                best = cost
+        return best
