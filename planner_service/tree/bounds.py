@@ -49,10 +49,12 @@ class LowerBounds:
         if tree.exact:
             kernels.bound_by_exact_cost(tree.cost, starts, lowest, most, bound)
         else:
-            window = NO_WINDOW if tree.window_bound is None else tree.window_bound
+            part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)
-            kernels.bound_by_heuristic(heuristic, root, grid.stride, window, starts, lowest, most, bound)
+            kernels.bound_by_heuristic(
+                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, lowest, most, bound
+            )
         if grid.length_weight_s:
             # Of the optimum only the share that is travel time counts: at least 1 - lambda / lowest cell cost.
             bound *= 1.0 - grid.length_weight_s / lowest

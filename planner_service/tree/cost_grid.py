@@ -229,8 +229,7 @@ class CostGrid:
         """
         if not 0 <= root < self.size:
             raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
-        padded = (cell_cost, self.stride, self.rule, self.corners)
-        return Walks(*walk_routes(padded, parent, root, starts, most, self.grid.cells))
+        return Walks(*walk_routes(cell_cost, parent, self.stride, self.rule, root, starts, most, self.grid.cells))
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""
