@@ -20,6 +20,7 @@ from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import ROLES, ProcessSpec, processes_of
+from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
@@ -143,6 +144,7 @@ class _Run:
         self._stop_asked = _StopAsked()
         specs = list(options.table or processes_of(self._scenario, options.roles))
         self._swarm = LocalSwarm(specs, self._setup_of, run_dir)
+        self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
 
     def run(self) -> int:
@@ -276,6 +278,8 @@ class _Run:
         return [spec.name for spec in specs if (spec.role, spec.id) not in watcher.ever_up]
 
     def _tell(self, watcher: Watcher) -> None:
+        if (sentence := self._disk.look(time.monotonic())) is not None:
+            self._terminal.say(sentence, "red")
         for note in watcher.take_notes():
             if note.kind == "live_view":
                 self._terminal.say(f"live view: {note.text}", "bold")

@@ -13,6 +13,7 @@ import numpy as np
 import rerun as rr
 
 from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, Ground, MeshTile, Points
+from launch_scripts.monitor.sinks import Streams
 from launch_scripts.report import palette
 from launch_scripts.report.recorder import Sample
 from swarm.wire.messages.vehicles import VehicleState
@@ -34,7 +35,7 @@ _PLOT_COLOURS = [
 class Drawing:
     """Logs the scene to one recording stream."""
 
-    def __init__(self, rec: rr.RecordingStream, ground: Ground, target_ids: Sequence[str]) -> None:
+    def __init__(self, rec: rr.RecordingStream | Streams, ground: Ground, target_ids: Sequence[str]) -> None:
         self._rec = rec
         self._ground = ground
         self._target_ids = list(target_ids)

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable
 
 from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.recording_watch import RecordingWatch
 from launch_scripts.monitor.scene import Ground
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.sinks import Sinks, new_recording_path
@@ -32,7 +33,16 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
         sinks = Sinks(recording_id, path, config, make_blueprint(ground))
         stack.callback(sinks.close)
-        service = MonitorService(setup, terrain, bus, inbox.post, sinks.rec, ground=ground, live_url=sinks.live_url)
+        service = MonitorService(
+            setup,
+            terrain,
+            bus,
+            inbox.post,
+            sinks.streams,
+            ground=ground,
+            live_url=sinks.live_url,
+            recording=None if path is None else RecordingWatch(path, sinks.begin_file),
+        )
         process = Process(service, inbox, MonotonicClock(), _FRAME_HZ)
         process.stop_on_signals()
         if stop_when is not None:

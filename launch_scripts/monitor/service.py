@@ -5,6 +5,7 @@ It only listens. It may be late, stalled, killed or absent; nobody waits for it.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 
 import numpy as np
@@ -12,6 +13,7 @@ import rerun as rr
 
 from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
+from launch_scripts.monitor.recording_watch import RecordingWatch
 from launch_scripts.monitor.scene import (
     Ground,
     RouteNow,
@@ -25,6 +27,7 @@ from launch_scripts.monitor.scene import (
     vehicle_points,
     window_outline,
 )
+from launch_scripts.monitor.sinks import Streams
 from launch_scripts.report.latest_state import VehicleNow
 from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder, messages_per_s
 from shared_map.cost_map import CostMap
@@ -45,6 +48,8 @@ from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import MARKS, SIGHTED
 
+log = logging.getLogger(__name__)
+
 _TRAILS_NS = NS_PER_S // 2
 _ROUTES_NS = 3 * NS_PER_S // 2
 """Period in which the routes to every target are drawn once."""
@@ -57,8 +62,9 @@ _ANNOUNCE_NS = NS_PER_S // 2
 class MonitorService:
     """Shows a run on a recording stream.
 
-    rec       a recording stream whose sinks are set
-    live_url  address of the live view; published once
+    rec        a recording stream whose sinks are set
+    live_url   address of the live view; published once
+    recording  watches the file of the recording, if there is one
     """
 
     def __init__(
@@ -67,10 +73,11 @@ class MonitorService:
         terrain: Terrain,
         bus: Bus,
         post: Post,
-        rec: rr.RecordingStream,
+        rec: rr.RecordingStream | Streams,
         *,
         ground: Ground | None = None,
         live_url: str | None = None,
+        recording: RecordingWatch | None = None,
     ) -> None:
         self.recorder = Recorder(setup.scenario, terrain.grid)
         self._setup = setup
@@ -85,6 +92,8 @@ class MonitorService:
         self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role)
         self._ground = ground or Ground(terrain)
         self._target_ids = setup.scenario.target_ids
+        self._rec = rec
+        self._recording = recording
         self._drawing = Drawing(rec, self._ground, self._target_ids)
         scale = setup.scenario.time_scale
         quickest_m = 4 * scale * max(setup.scenario.cost.road_speed_m_per_s, 1.0)
@@ -112,9 +121,7 @@ class MonitorService:
         self._bus.watch_alive(self._post)
         self._sync.start(now_ns)
         self._drawing.set_time(0, 0.0)
-        self._drawing.begin()
-        self._stale_tiles = dict.fromkeys(range(self._ground.tile_rows * self._ground.tile_cols))
-        self._draw_textures(len(self._stale_tiles))
+        self._begin_drawing()
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, Appeared | Disappeared):
@@ -148,6 +155,7 @@ class MonitorService:
         self._announce(now_ns)
         self._frame += 1
         self._drawing.set_time(self._frame, self._seconds())
+        self._watch_recording(now_ns)
         for window in self._cost_map.take_dirty():
             self._stale_tiles.update(dict.fromkeys(self._ground.tiles_touching(window)))
         if not self._stale_tiles and now_ns >= self._refresh_due_ns:
@@ -180,6 +188,23 @@ class MonitorService:
         if self._live_url is not None and now_ns - self._started_ns >= _ANNOUNCE_NS:
             self._member.note(now_ns, "live_view", self._live_url)
             self._live_url = None
+
+    def _watch_recording(self, now_ns: int) -> None:
+        if self._recording is None:
+            return
+        sentence, begun = self._recording.look(now_ns)
+        if begun:
+            self._drawing = Drawing(self._rec, self._ground, self._target_ids)
+            self._begin_drawing()
+        if sentence is not None:
+            log.warning("%s", sentence)
+            self._member.note(now_ns, "recording", sentence)
+
+    def _begin_drawing(self) -> None:
+        """Draws all that does not move."""
+        self._drawing.begin()
+        self._stale_tiles = dict.fromkeys(range(self._ground.tile_rows * self._ground.tile_cols))
+        self._draw_textures(len(self._stale_tiles))
 
     def _seconds(self) -> float:
         return max(self._newest_stamp_ns - self._setup.started_ns, 0) / NS_PER_S

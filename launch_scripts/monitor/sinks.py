@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -42,15 +42,32 @@ def new_recording_path(folder: Path) -> Path:
     raise StoreError(f"{folder} is full of recordings")
 
 
+class Streams:
+    """Recording streams to which the same is logged."""
+
+    def __init__(self, *streams: rr.RecordingStream) -> None:
+        self.streams = streams
+
+    def log(self, path: str, what: Any, *, static: bool = False) -> None:
+        for stream in self.streams:
+            stream.log(path, what, static=static)
+
+    def set_time(self, timeline: str, **when: Any) -> None:
+        for stream in self.streams:
+            stream.set_time(timeline, **when)
+
+
 class Sinks:
     """A recording stream and its sinks. `close` takes seconds at most, even if a disk or a viewer hangs."""
 
     def __init__(
         self, recording_id: str, path: Path | None, config: MonitorConfig, blueprint: rrb.Blueprint
     ) -> None:
-        self.rec = rr.RecordingStream(
-            APPLICATION, recording_id=recording_id, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.1)
-        )
+        self._recording_id = recording_id
+        self._blueprint = blueprint
+        self.rec = self._stream()
+        self.streams = Streams(self.rec)
+        """Where to log: `rec`, and the file that was begun last, if the first has ended."""
         self.stream_url: str | None = None
         """Address for a native viewer."""
         self._page: ViewerPage | None = None
@@ -70,6 +87,21 @@ class Sinks:
         """Address for a browser on this machine."""
         return None if self._page is None else self._page.url
 
+    def begin_file(self, path: Path) -> None:
+        """Let what is logged to `streams` go to this file, too. On a stream of its own: new sinks for `rec` would
+        close the live view's port."""
+        _, *earlier = self.streams.streams
+        stream = self._stream()
+        stream.set_sinks(rr.FileSink(path, write_footer=True), default_blueprint=self._blueprint)
+        self.streams.streams = (self.rec, stream)
+        for each in earlier:
+            each.disconnect()
+
+    def _stream(self) -> rr.RecordingStream:
+        return rr.RecordingStream(
+            APPLICATION, recording_id=self._recording_id, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.1)
+        )
+
     def close(self, within_s: float = 3.0) -> None:
         closing = threading.Thread(target=self._flush, args=(within_s,), name="flush", daemon=True)
         closing.start()
@@ -80,9 +112,10 @@ class Sinks:
             self._page.close()
 
     def _flush(self, within_s: float) -> None:
-        with contextlib.suppress(Exception):  # a viewer that is gone must not keep the file from its end
-            self.rec.flush(timeout_sec=within_s * 0.8)
-        self.rec.disconnect()
+        for stream in reversed(self.streams.streams):
+            with contextlib.suppress(Exception):  # a viewer that is gone must not keep the file from its end
+                stream.flush(timeout_sec=within_s * 0.8)
+            stream.disconnect()
 
 
 def _when_free(listen: Callable[[int], T], port: int, name: str) -> T:

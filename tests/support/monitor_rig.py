@@ -71,7 +71,7 @@ class Rig(SwarmModel):
         self.service = self.start(
             "monitor",
             lambda bus, post: MonitorService(
-                setup, terrain, bus, post, self.sinks.rec, ground=ground, live_url=live_url
+                setup, terrain, bus, post, self.sinks.streams, ground=ground, live_url=live_url
             ),
         )
 

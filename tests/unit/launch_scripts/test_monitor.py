@@ -24,6 +24,7 @@ from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little
 
 from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.recording_watch import RecordingWatch
 from launch_scripts.monitor.scene import Ground
 from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
@@ -58,6 +59,13 @@ def rows_by_entity(path: Path) -> dict[str, int]:
             if not chunk.is_static:
                 counts[str(chunk.entity_path)] = counts.get(str(chunk.entity_path), 0) + chunk.num_rows
     return counts
+
+
+def still_entities(path: Path) -> set[str]:
+    """Entities with something static."""
+    from rerun.chunk import RrdReader
+
+    return {str(chunk.entity_path) for chunk in RrdReader(str(path)).stream() if chunk.is_static}
 
 
 def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
@@ -249,6 +257,67 @@ time.sleep(60)
         assert monitor.stdout.readline() == "written\n"
         monitor.send_signal(signal.SIGKILL)
     assert rows_by_entity(path)["/a"] == 100
+
+
+def test_a_recording_that_finds_no_space_is_told_and_goes_on_in_a_new_file(tmp_path: Path) -> None:
+    """A limit of the size of files stands for the full disk: Rerun's sink ends at the first error all the same."""
+    script = f"""
+import resource, pathlib, time, numpy
+import rerun as rr
+from launch_scripts.monitor import recording_watch
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.recording_watch import RecordingWatch
+from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.sinks import Sinks, new_recording_path
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.scenario import MonitorConfig
+
+path = new_recording_path(pathlib.Path({str(tmp_path)!r}))
+ground = Ground(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
+sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(ground))
+watch = RecordingWatch(path, sinks.begin_file)
+_, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, hard))
+for second in range(110):
+    if second == 90:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    sinks.streams.set_time("tick", sequence=second)
+    sinks.streams.log("a", rr.Points3D(numpy.random.rand(2000, 3)))
+    time.sleep(0.12)  # in which what is logged is written
+    sentence, begun = watch.look(second * 10**9)
+    if sentence:
+        print(second, begun, sentence, flush=True)
+sinks.close()
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=True
+    ).stdout.splitlines()
+    ended = f"the recording {tmp_path / 'run.rrd'} has ended: File too large; another begins when there is space"
+    first = int(told[0].split()[0])
+    assert 5 < first < 29
+    assert told[:2] == [f"{first} False {ended}", f"{first + 60} False {ended}"]
+    begun = int(told[2].split()[0])
+    assert 90 <= begun <= 100
+    assert told[2:] == [f"{begun} True the recording goes on in {tmp_path / 'run-2.rrd'}"]
+    assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 109 - begun
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["run-2.rrd", "run.rrd"]
+
+
+def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, tmp_path / "run.rrd")
+    watch = RecordingWatch(tmp_path / "run.rrd", rig.sinks.begin_file)
+    told = iter([(None, False), ("it goes on", True)])
+    watch.look = lambda now_ns: next(told, (None, False))  # type: ignore[method-assign]
+    rig.service._recording = watch
+    rig.run(0.15)
+    rig.sinks.begin_file(tmp_path / "run-2.rrd")
+    rig.run(1.0)
+    rig.close()
+    first, second = still_entities(tmp_path / "run.rrd"), still_entities(tmp_path / "run-2.rrd")
+    assert {"/world", "/world/windows", "/world/ground/0", "/plots/gap"} <= first == second
+    assert rows_by_entity(tmp_path / "run-2.rrd")["/world/ground/0"] > 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems cannot tie a child to its parent's end")
