@@ -42,8 +42,8 @@ class Where:
         from swarm.config.scenario import Scenario
 
         chosen = with_network(Scenario(), connect=self.connect, namespace=self.namespace, tls=tls.config())
-        chosen = as_process(chosen, LAUNCHER, "0").network
-        return msgspec.structs.replace(chosen, connect_timeout_s=_CONNECT_S)
+        network = as_process(chosen, LAUNCHER, "0").network
+        return msgspec.structs.replace(network, connect_timeout_s=_CONNECT_S)
 
     def __str__(self) -> str:
         return f"in namespace {self.namespace!r} at {self.connect}"
