@@ -23,7 +23,7 @@ from swarm.liveness import Peer
 from swarm.wire.codec import decode, decode_either, decode_many, encode
 from swarm.wire.messages.base import Message
 from swarm.wire.readable import decode_parameters, encode_readable
-from swarm.wire.topics import ALIVE_KEY, Priority, Topic
+from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
 log = logging.getLogger(__name__)
 
@@ -243,7 +243,7 @@ class ZenohBus:
     def watch_alive(self, post: Post, role: str = "*") -> None:
         def arrive(sample: zenoh.Sample) -> None:
             try:
-                peer = _peer(str(sample.key_expr))
+                peer = peer_of(str(sample.key_expr))
             except ProtocolError as error:
                 self._drop(str(sample.key_expr), error)
                 return
@@ -335,13 +335,6 @@ def _waiting(channel: Any) -> list[Any]:
     while len(items) < _TOGETHER and (item := channel.try_recv()) is not None:
         items.append(item)
     return items
-
-
-def _peer(key: str) -> Peer:
-    *_, role, id, incarnation = key.split("/")
-    if not incarnation.isdecimal():
-        raise ProtocolError(f"incarnation {incarnation!r} of {key} is not a number")
-    return Peer(role, id, int(incarnation))
 
 
 class _ZenohAnswerer:

@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.liveness import Leases, Peer, Roster
+from swarm.liveness import SILENCE_NS, Leases, Newest, Peer, Roster
 
 
 def test_a_new_incarnation_may_appear_before_the_old_one_is_gone():
@@ -61,3 +61,21 @@ def test_a_lease_runs_out_once_and_a_word_renews_it():
     assert leases.expired(11) == ["b"]
     assert leases.expired(30) == ["a"]
     assert leases.expired(99) == []
+
+
+def test_no_single_message_outweighs_those_that_follow_for_longer_than_the_silence() -> None:
+    newest = Newest()
+    assert newest.is_news("t0", (7, 1), 0)
+    assert not newest.is_news("t0", (7, 1), 1)
+    assert newest.is_news("t0", (1 << 61, 5), 2)
+    assert not newest.is_news("t0", (7, 2), 1 + SILENCE_NS)
+    assert newest.is_news("t1", (7, 2), 3)
+    assert newest.is_news("t0", (7, 3), 2 + SILENCE_NS)
+    assert not newest.is_news("t0", (7, 2), 3 + SILENCE_NS)
+    assert newest.is_news("t0", (7, 4), 4 + SILENCE_NS)
+
+
+def test_streams_beyond_the_most_are_always_news_and_take_no_memory() -> None:
+    newest = Newest(most=1)
+    assert newest.is_news("a", (1, 1), 0)
+    assert all(newest.is_news("b", (1, 1), 0) for _ in range(3))
