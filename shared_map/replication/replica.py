@@ -35,7 +35,7 @@ from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec
 from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
 
 
 class CostSink(Protocol):
@@ -276,7 +276,8 @@ class MapReplica:
 
         cells       int (cells,)      flat indices in the grid; OutsideGridError if one is not in it
         kinds       uint8 (cells,)    MarkKind, or one for all
-        paces       float32 (cells,)  s/m, or one for all; read where the kind is PACE
+        paces       float32 (cells,)  s/m, or one for all; read where the kind is PACE, and kept within the bounds
+                    of marks (`swarm.wire.statements`)
         lifetime_s  the statements expire so long after their stamps, by the reader's clock; None: never
 
         Raises RuntimeError if the replica has no author.
@@ -286,7 +287,8 @@ class MapReplica:
             raise OutsideGridError(f"a cell of {flat.min()}..{flat.max()} is not in {self.grid.cells} cells")
         new_kinds = np.broadcast_to(np.asarray(kinds, np.uint8), flat.shape)
         new_paces = np.broadcast_to(np.asarray(paces, np.float32), flat.shape)
-        new_paces = np.where(new_kinds == MarkKind.PACE, new_paces, np.float32(0))
+        bounded = np.clip(new_paces, PACE_LEAST, PACE_MOST)
+        new_paces = np.where(new_kinds == MarkKind.PACE, bounded, np.float32(0))
         tiles, inner = tile_cells(self.grid, flat)
         for tile in np.unique(tiles).tolist():
             here = tiles == tile

@@ -11,6 +11,7 @@ from swarm.clock import NS_PER_S
 from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
 from swarm.runtime.stats import Counters
+from swarm.wire.fields import MOST_TEXT
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS
@@ -113,7 +114,7 @@ class Member:
     def note(self, now_ns: int, kind: str, text: str, cell: int | None = None) -> None:
         """Publish a sentence for people who watch the run."""
         info = self.info
-        note = Note(role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text, cell=cell)
+        note = Note(role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text[:MOST_TEXT], cell=cell)
         self._bus.publish(NOTE, note, role=info.role, id=info.id)
 
     def _compare(self, other: RunInfo) -> None:

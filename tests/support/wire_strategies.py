@@ -181,12 +181,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         reservations=st.lists(reservations, max_size=2),
     ),
     Followed: st.builds(
-        Followed,
-        vehicle=ids,
-        target=ids,
-        start=cells,
-        directions=directions,
-        cost_s=finite_costs,
+        Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite_costs,
         lower_bound_s=finite_costs,
     ),
     TargetPose: st.builds(
