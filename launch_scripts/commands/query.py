@@ -127,7 +127,7 @@ def _print_route(reply: RouteReply, took_ms: float) -> None:
         meaning = {
             RouteStatus.UNREACHABLE: "there is no way from there",
             RouteStatus.OUTSIDE: f"the cell is outside the terrain of {reply.rows} x {reply.cols} cells",
-            RouteStatus.LETHAL_START: "the cell is lethal, nobody could stand on it",
+            RouteStatus.LETHAL_START: "the cell is lethal, no vehicle can stand on it",
             RouteStatus.NO_TARGET: "the planner does not know where its target is",
         }[found.status]
         typer.echo(f"{found.status.value}: {meaning}")
@@ -181,8 +181,8 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
                 case Heard(message=PlannerStatus() as message):
                     planners[message.target] = message
     if not found:
-        raise BusError(f"nobody answers {where}: is the swarm running?")
-    # The run is that of most; routers belong to none; whoever answers with another is a stranger.
+        raise BusError(f"no process answers {where}: is the swarm running?")
+    # The run is that of most; routers belong to none; a process that answers with another is a stranger.
     runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
     run = runs.most_common(1)[0][0] if runs else ("", "")
     found.sort(key=lambda info: (not info.run_id, info.role, info.id))
@@ -254,7 +254,7 @@ def _print_status(
         crew.add_row(f"{info.role}-{info.id}", f"{up_s:.0f}", *("-" if n is None else str(n) for n in numbers))
     console.print(crew)
     for author in _throttled(stats):
-        console.print(f"author {author} marks more than its share: it is heard with delay", style="yellow")
+        console.print(f"author {author} exceeds its quota; its marks are delayed", style="yellow")
     if planners:
         trees = Table(
             "target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap", pad_edge=False

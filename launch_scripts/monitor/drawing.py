@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, Ground, MeshTile, Points
+from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, MeshTile, Points, TerrainMesh
 from launch_scripts.report import palette
 from launch_scripts.report.recorder import Sample
 from swarm.wire.messages.vehicles import VehicleState
@@ -34,9 +34,9 @@ _PLOT_COLOURS = [
 class Drawing:
     """Logs the scene to one recording stream."""
 
-    def __init__(self, rec: rr.RecordingStream, ground: Ground, target_ids: Sequence[str]) -> None:
+    def __init__(self, rec: rr.RecordingStream, mesh: TerrainMesh, target_ids: Sequence[str]) -> None:
         self._rec = rec
-        self._ground = ground
+        self._mesh = mesh
         self._target_ids = list(target_ids)
         self._vehicle_ids: list[str] = []
         self._vehicle_colours: Bytes = np.empty((0, 3), np.uint8)
@@ -49,9 +49,9 @@ class Drawing:
 
     def begin(self) -> None:
         """Logs what never changes: the terrain's mesh and the styles."""
-        rec, ground = self._rec, self._ground
+        rec, mesh = self._rec, self._mesh
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for tile in ground.mesh_tiles():
+        for tile in mesh.mesh_tiles():
             self._tile(tile)
         thin, line, thick = _screen_points(0.5), _screen_points(1.3), _screen_points(2.2)
         rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [_TRAIL_COLOUR], [line]), static=True)
@@ -67,8 +67,8 @@ class Drawing:
         states = [state.name.lower() for state in VehicleState]
         self._series("states", states, list(STATE_COLOURS.values()))
         self._series("captures_and_marks", ["captures", "marks / 100"], [(255, 210, 31), (170, 110, 240)])
-        for plot in ("gap", "growth_ms"):
-            self._series(plot, self._target_ids, self._colours())
+        for chart in ("gap", "growth_ms"):
+            self._series(chart, self._target_ids, self._colours())
         self._series("messages", ["all processes"], [(86, 180, 233)])
 
     def _colours(self) -> list[tuple[int, ...]]:
@@ -85,8 +85,8 @@ class Drawing:
             static=True,
         )
 
-    def _series(self, plot: str, names: list[str], colours: Sequence[tuple[int, ...]]) -> None:
-        self._rec.log(f"plots/{plot}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
+    def _series(self, chart: str, names: list[str], colours: Sequence[tuple[int, ...]]) -> None:
+        self._rec.log(f"plots/{chart}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
 
     def texture(self, tile: int, image: Bytes) -> None:
         """Logs the photo of a tile, with its marks. Not static: a viewer which joins late gets only recent data."""
@@ -157,10 +157,10 @@ class Drawing:
         log("growth_ms", [sample.growth_ms.get(id) for id in self._target_ids])
         log("messages", [messages_per_s])
 
-    def _scalars(self, plot: str, values: Sequence[float | None]) -> None:
+    def _scalars(self, chart: str, values: Sequence[float | None]) -> None:
         if any(value is not None for value in values):
             numbers = np.array([math.nan if value is None else value for value in values])
-            self._rec.log(f"plots/{plot}", rr.Scalars(numbers))
+            self._rec.log(f"plots/{chart}", rr.Scalars(numbers))
 
     def summary(self, markdown: str) -> None:
         self._rec.log("summary", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))

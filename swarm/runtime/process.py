@@ -105,7 +105,7 @@ class Process:
         dropped. Raises what the service or a worker's job raised, after stopping the service.
 
         Ticks and events share the thread: while events wait, they get at least as long as the last tick took before
-        the next one is taken. So a tick that takes its whole period halves its rate and starves nobody.
+        the next one is taken. So a tick that takes its whole period halves its rate and starves no event.
         """
         counters = self._service.counters
         counters.count("ticks_dropped", 0)

@@ -35,10 +35,10 @@ class _Bench:
         self.pace = pace
         self.field = Field(pace)
         self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
-        self.ground = CostGrid(self.grid, PlannerConfig())
-        self.ground.load(pace)
-        self.tree = CostToGoTree(self.ground)
-        self.bounds = LowerBounds(self.ground)
+        self.cost_grid = CostGrid(self.grid, PlannerConfig())
+        self.cost_grid.load(pace)
+        self.tree = CostToGoTree(self.cost_grid)
+        self.bounds = LowerBounds(self.cost_grid)
         self.took: dict[str, list[float]] = {}
 
     def time(self, name: str, what: Callable[[], Any]) -> float:
@@ -62,9 +62,9 @@ class _Bench:
             starts = self.draw(many)
             took_us = self.time("", partial(read_routes, self.tree, self.bounds, starts, 0))
             self.took.setdefault(f"route of {many}", []).append(took_us / many)
-        padded = self.ground.pad_all(self.draw(100))
-        root = self.ground.pad(self.root)
-        walk = partial(self.ground.walk, self.tree.parent, root, padded, 0, self.ground.cell_cost)
+        padded = self.cost_grid.pad_all(self.draw(100))
+        root = self.cost_grid.pad(self.root)
+        walk = partial(self.cost_grid.walk, self.tree.parent, root, padded, 0, self.cost_grid.cell_cost)
         steps = int(walk().ends[-1])
         self.took.setdefault("walk", []).append(self.time("", walk) / max(steps, 1) * STEPS)
 
@@ -74,7 +74,7 @@ class _Bench:
         for row_step, col_step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
             if self.grid.inside(row + row_step, col + col_step):
                 cell = self.grid.cell(row + row_step, col + col_step)
-                if self.ground.passable(cell):
+                if self.cost_grid.passable(cell):
                     self.time("window", partial(self.tree.move, cell, self.grid.around(cell, _HALF)))
                     self.tree.grow(self.root)
 
@@ -102,7 +102,7 @@ class _Bench:
         grown = []
 
         def mend() -> None:
-            if self.tree.repair(self.ground.apply(self.pace, [window])) < 0:
+            if self.tree.repair(self.cost_grid.apply(self.pace, [window])) < 0:
                 self.tree.grow(self.root)
                 grown.append(self.root)
 
