@@ -39,7 +39,7 @@ def certs(
 
     swarm agent my.toml --id a0 --connect tls/10.0.0.1:7447 --tls-ca ca.pem --tls-cert car1.pem --tls-key car1.key
 
-    Copy ca.pem and its own two files to each machine. ca.key stays where it is: with it, anyone can join.
+    Copy ca.pem and its own two files to each machine. ca.key stays where it is: who has it can let anybody in.
     """
     from launch_scripts.deploy.certificates import issue
 

@@ -181,8 +181,8 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
                 case Heard(message=PlannerStatus() as message):
                     planners[message.target] = message
     if not found:
-        raise BusError(f"no process answers {where}: is the swarm running?")
-    # The run is that of most; routers belong to none; a process that answers with another is a stranger.
+        raise BusError(f"nobody answers {where}: is the swarm running?")
+    # The run is that of most; routers belong to none; whoever answers with another is a stranger.
     runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
     run = runs.most_common(1)[0][0] if runs else ("", "")
     found.sort(key=lambda info: (not info.run_id, info.role, info.id))

@@ -45,7 +45,7 @@ def router(
     tls: Tls,
     listen: Annotated[str | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447.")] = None,
 ) -> None:
-    """Pass on all messages: the process that all others connect to. --connect names another router."""
+    """Pass everybody's messages on: the process that all others connect to. --connect names another router."""
     _run("router", "0", part, tls, listen=listen)
 
 

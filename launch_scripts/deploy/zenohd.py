@@ -40,7 +40,7 @@ def zenohd_config(
     agents   certificate names of agents, each its group and id (all.a0): may write only what is their own
     plugins  folder of `libzenoh_plugin_storage_manager.so`; without one marks are passed on, not stored
     volume   of the storage: "memory", or one whose backend is installed
-    With names given, a client with another name, or none, may do nothing. Without, every client may do everything.
+    With names given, whoever has another one, or none, may do nothing. Without, all that connect may do all.
     """
     config: dict[str, Any] = {
         "mode": "router",

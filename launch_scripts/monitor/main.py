@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable
 
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.scene import TerrainMesh
+from launch_scripts.monitor.scene import Ground
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import load_terrain
@@ -24,15 +24,15 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Records and shows the run until SIGTERM, SIGINT or the end of the launcher."""
     config = setup.scenario.monitor
     terrain = load_terrain(setup)
-    mesh = TerrainMesh(terrain)
+    ground = Ground(terrain)
     path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
     inbox = Inbox()
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_bus(setup.scenario.network))
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
-        sinks = Sinks(recording_id, path, config, make_blueprint(mesh))
+        sinks = Sinks(recording_id, path, config, make_blueprint(ground))
         stack.callback(sinks.close)
-        service = MonitorService(setup, terrain, bus, inbox.post, sinks.rec, mesh=mesh, live_url=sinks.live_url)
+        service = MonitorService(setup, terrain, bus, inbox.post, sinks.rec, ground=ground, live_url=sinks.live_url)
         process = Process(service, inbox, MonotonicClock(), _FRAME_HZ)
         process.stop_on_signals()
         if stop_when is not None:

@@ -24,7 +24,7 @@ from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little
 
 from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.scene import TerrainMesh
+from launch_scripts.monitor.scene import Ground
 from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event
@@ -203,7 +203,7 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
     home.mkdir()
     monkeypatch.setenv("HOME", str(home))
     before = children(os.getpid())
-    sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(TerrainMesh(terrain)))
+    sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(Ground(terrain)))
     assert sinks.live_url is not None
     try:
         with urllib.request.urlopen(sinks.live_url, timeout=30) as reply:
@@ -231,12 +231,12 @@ def test_a_killed_monitor_leaves_a_readable_file(tmp_path: Path) -> None:
 import time, numpy, pathlib
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.sinks import Sinks
-from launch_scripts.monitor.scene import TerrainMesh
+from launch_scripts.monitor.scene import Ground
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 import rerun as rr
-mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
-sinks = Sinks("r", pathlib.Path({str(path)!r}), MonitorConfig(live=False), make_blueprint(mesh))
+ground = Ground(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
+sinks = Sinks("r", pathlib.Path({str(path)!r}), MonitorConfig(live=False), make_blueprint(ground))
 for n in range(100):
     sinks.rec.set_time("tick", sequence=n)
     sinks.rec.log("a", rr.Scalars(n))
@@ -278,14 +278,14 @@ def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytes
         with pytest.raises(
             BusError, match=rf"live view on port {port}: Address already in use; .*monitor\.web_port"
         ):
-            Sinks("r", None, config, make_blueprint(TerrainMesh(terrain)))
+            Sinks("r", None, config, make_blueprint(Ground(terrain)))
 
 
 @pytest.mark.network
 def test_logging_does_not_wait_for_a_viewer_that_reads_nothing(terrain: Terrain) -> None:
     import rerun as rr
 
-    sinks = Sinks("r", None, LIVE, make_blueprint(TerrainMesh(terrain)))
+    sinks = Sinks("r", None, LIVE, make_blueprint(Ground(terrain)))
     try:
         assert sinks.live_url is not None
         port = stream_port(sinks.live_url)
