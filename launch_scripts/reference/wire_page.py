@@ -62,7 +62,7 @@ def document() -> str:
 
 def _keys() -> Iterator[str]:
     yield "## Keys\n"
-    yield "`put` is published and never waited for; `get` is answered by whoever serves the key.\n"
+    yield "`put` is published and never waited for; `get` is answered by the processes that serve the key.\n"
     yield "| key | how | message | rate | priority | what |"
     yield "|---|---|---|---|---|---|"
     for topic in TOPICS:

@@ -74,7 +74,7 @@ class MapReplica:
     counts         totals since the start: sets_merged, sets_repeated, sets_refused, sets_without_room (beyond the
                    capacity), sets_foreign (of a group which is not read), sets_elsewhere (about tiles of no
                    interest), marks_merged (cells whose winner changed), marks_written
-    over_capacity  author of the last set that was refused for lack of capacity; whoever reads it sets it to None
+    over_capacity  author of the last set that was refused for lack of capacity; its reader sets it to None
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class MapReplica:
                 continue
             sets = before[tile] if tile in before else self.held.of_tile(tile)
             if not each.kinds and is_tombstone(each):
-                self.held.bury(each, self._now_ns)
+                self.held.delete(each, self._now_ns)
             elif not self.held.put(each):
                 self.counts["sets_without_room"] += 1
                 self.over_capacity = author
