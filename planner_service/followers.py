@@ -45,7 +45,7 @@ class Follower:
 
 
 CAPACITY = 4096
-"""Followers at most: whoever can ask may name vehicles that do not exist."""
+"""Followers at most: any client may ask for vehicles that do not exist."""
 MOST_PUSHES = 256
 """Routes pushed in one tick at most, so that a tick stays short however many followers a change concerns."""
 
@@ -132,7 +132,7 @@ class Followers:
                 follower.stale = inside or any(_crosses(follower, each) for each in changed)
 
     def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
-        """Those with a stale route who may be pushed another one; of too many, those who have waited longest."""
+        """Followers with a stale route that may be pushed another one; of too many, those that waited longest."""
         due = [(id, each) for id, each in self._by_id.items() if each.stale and now_ns >= each.push_ns]
         if len(due) > MOST_PUSHES:
             due = sorted(due, key=lambda item: item[1].push_ns)[:MOST_PUSHES]

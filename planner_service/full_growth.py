@@ -51,7 +51,7 @@ def growth_job(
     offered: NDArray[np.uint8] | None,
     wants_corridors: bool,
 ) -> Callable[[], GrownTree]:
-    """A pure full growth that releases the interpreter lock. Nobody may write to `pace_snapshot` before it ends.
+    """A pure full growth that releases the interpreter lock. `pace_snapshot` must not change before it ends.
 
     empty  makes a cost grid without costs, of the map's shape and rules
     """

@@ -58,7 +58,7 @@ class GapStatistics:
         self._due_ns = now_ns + _EVERY_NS
         self._held(tree, _some(followers), pace)
 
-    def grown(self, tree: TargetTree, followers: Followers, pace: NDArray[np.float32], now_ns: int) -> None:
+    def record_growth(self, tree: TargetTree, followers: Followers, pace: NDArray[np.float32], now_ns: int) -> None:
         """A tree was grown on this thread: what it offers is read and compared with what it promises."""
         if now_ns < self._due_ns or not len(followers):
             return

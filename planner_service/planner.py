@@ -1,4 +1,4 @@
-"""The planner of one target: when to grow, what to answer, whom to push newer routes to. Pure."""
+"""The planner of one target: when to grow, what to answer, which followers to push newer routes. Pure."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Planner:
 
     Poses and map changes are taken in once per tick, however many there were; at most one full growth is under
     way, and what changes meanwhile is made up for when it is adopted. Before the first tree all routes are
-    NO_TARGET. The cost map is its owner's, who applies marks to it between calls.
+    NO_TARGET. The cost map belongs to the caller, which applies marks to it between calls.
 
     stopwatch       times growths on this thread; without one they take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
@@ -169,7 +169,7 @@ class Planner:
         )
         self._told = news
         self._wants_full = False  # all that happened until now is in what `adopt` says
-        self._grown(took_ns, usual=grown.corridors is None)
+        self._record_growth(took_ns, usual=grown.corridors is None)
         if grown.map_version == news[1] and grown.target_cell == news[0]:
             self._exact_ns = now_ns
         else:
@@ -237,13 +237,13 @@ class Planner:
             took_ns = update.cells * MODEL_NS_PER_CELL
         if update.kind == "full":
             self._exact_ns = now_ns
-            self._grown(took_ns)
-            self._gaps.grown(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
+            self._record_growth(took_ns)
+            self._gaps.record_growth(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
         elif update.kind != "none":
             self.counters.count("window_growths")
             self.counters.observe("window_ms", took_ns / 1e6)
 
-    def _grown(self, took_ns: int, usual: bool = True) -> None:
+    def _record_growth(self, took_ns: int, usual: bool = True) -> None:
         self.counters.count("growths")
         self._growth_ms = took_ns / 1e6
         self.counters.observe("growth_ms", self._growth_ms)
@@ -324,7 +324,7 @@ class Planner:
     # --- what is told unasked -----------------------------------------------------------------------------------
 
     def _pushes(self, now_ns: int) -> list[Action]:
-        """Newer routes for those whom a change concerns and who have not had one for a while."""
+        """Newer routes for followers which a change concerns and which have not had one for a while."""
         target_cell = self.tree.target_cell
         if not self.tree.ready or target_cell is None:
             return []

@@ -140,7 +140,7 @@ class TargetTree:
         return Update(done.kind, done.window, done.cells, self._is_full_due(done))
 
     def full_job(self, pace_snapshot: Floats, target_cell: int, map_version: int) -> Callable[[], GrownTree]:
-        """A full growth for a worker: see `growth_job`. Nobody may write to `pace_snapshot` before it ends."""
+        """A full growth for a worker: see `growth_job`. `pace_snapshot` must not change before it ends."""
         check_pace(self._grid, pace_snapshot)
         leads_there = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
@@ -329,12 +329,12 @@ class TargetTree:
         window = self._grid.around(target_cell, half)
         cells = 0
         while window.cells * 2 < self._grid.cells:
-            grown = tree.move(target_cell, window)
+            connected = tree.move(target_cell, window)
             cells += window.cells
-            if grown and corridors is not None:
+            if connected and corridors is not None:
                 self._schedule.note_grown(target_cell, self._side)
                 return Update("coarse", self._grid.window, cells + tree.grow_corridors(window, corridors))
-            if grown:
+            if connected:
                 self._schedule.note_grown(target_cell, half)
                 return Update("window", window, cells)
             half *= 2

@@ -148,8 +148,8 @@ class CostMap:
         dirty = where[flat[where] != before]
         reach = len(self._halves) - 1
         for window in cluster(flipped, self.grid.cols):
-            inner = self._grown(window, reach)
-            outer = self._grown(inner, reach)
+            inner = self._padded(window, reach)
+            outer = self._padded(inner, reach)
             fresh = inflate(ground[outer.row0 : outer.row1, outer.col0 : outer.col1], self._halves)
             row0, col0 = inner.row0 - outer.row0, inner.col0 - outer.col0
             fresh = fresh[row0 : row0 + inner.row1 - inner.row0, col0 : col0 + inner.col1 - inner.col0]
@@ -160,7 +160,7 @@ class CostMap:
         if len(dirty):
             self._note_dirty(dirty)
 
-    def _grown(self, window: Window, by: int) -> Window:
+    def _padded(self, window: Window, by: int) -> Window:
         return Window(
             max(window.row0 - by, 0),
             max(window.col0 - by, 0),

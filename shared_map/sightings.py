@@ -4,7 +4,7 @@ Of each author's sightings of a target the newest counts, and of all authors' th
 as with marks, merging depends on neither order, grouping nor repetition.
 
 No author's clock is trusted further than the reader's own: what an author dates ahead counts as seen when it was
-heard, and no sighting outlives `LONGEST_NS` from then. So a vehicle with a fast clock outweighs nobody.
+heard, and no sighting outlives `LONGEST_NS` from then. So a vehicle with a fast clock outweighs no other.
 """
 
 from __future__ import annotations

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-from swarm.clock import NS_PER_S
-
 
 @dataclass(frozen=True, slots=True, order=True)
 class Peer:
@@ -52,9 +50,9 @@ class Roster:
         return (role, id) in self._alive
 
 
-SILENCE_NS = 3 * NS_PER_S
+SILENCE_NS = 3_000_000_000
 """A stream that has been silent for so long is heard again from wherever it goes on."""
-POSE_SILENCE_NS = NS_PER_S
+POSE_SILENCE_NS = 1_000_000_000
 """The same of target poses, which come ten times a second."""
 
 

@@ -53,7 +53,7 @@ _LEAD_CELLS = 24
 class AgentService:
     """Drives the vehicles of one agent, marks what they find, and publishes where they are.
 
-    Raises ConfigError if the scenario has no such agent or no room for its vehicles.
+    Raises ConfigError if the scenario has no such agent, or too few free cells for its vehicles.
     """
 
     def __init__(

@@ -298,11 +298,11 @@ def terrain(
 @app.command()
 def wire(
     parts: Annotated[
-        str, typer.Option(help="latency, flood, join, route, positions, replica, codec; several with commas.")
-    ] = "latency,flood,join,route,positions,replica,codec",
+        str, typer.Option(help="latency, throughput, join, route, positions, replica, codec; several with commas.")
+    ] = "latency,throughput,join,route,positions,replica,codec",
     marks: Annotated[int, typer.Option(min=10, help="latency: marks, and as many raw puts.")] = 400,
-    sets: Annotated[int, typer.Option(min=100, help="flood: sets in a round.")] = 20_000,
-    rounds: Annotated[int, typer.Option(min=1, help="flood: rounds of ours and raw, in turn.")] = 3,
+    sets: Annotated[int, typer.Option(min=100, help="throughput: sets in a round.")] = 20_000,
+    rounds: Annotated[int, typer.Option(min=1, help="throughput: rounds of ours and raw, in turn.")] = 3,
     joins: Annotated[int, typer.Option(min=1, help="join: newcomers, one after the other.")] = 7,
     queries: Annotated[int, typer.Option(min=10, help="route: queries, and as many raw ones.")] = 300,
     seconds: Annotated[float, typer.Option(min=1, help="positions: how long, ours and raw each.")] = 5.0,
@@ -312,7 +312,7 @@ def wire(
 
     \b
     swarm bench wire
-    swarm bench wire --parts latency,flood --marks 2000 --json
+    swarm bench wire --parts latency,throughput --marks 2000 --json
 
     A router and the processes that receive and answer are started on free ports of this machine and ended. Ours and
     raw take turns, with the same bytes under keys of the same form: on a busy machine look at the ratios.
@@ -340,7 +340,7 @@ def compaction(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Size of a keeper's store after many lives of an agent, with and without folding of dead authors.
+    """Size of a keeper's store after many lives of an agent, with and without compaction of dead authors.
 
     \b
     swarm bench compaction --lives 1000

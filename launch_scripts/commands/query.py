@@ -129,7 +129,7 @@ def _print_route(reply: RouteReply, took_ms: float) -> None:
         meaning = {
             RouteStatus.UNREACHABLE: "there is no way from there",
             RouteStatus.OUTSIDE: f"the cell is outside the terrain of {reply.rows} x {reply.cols} cells",
-            RouteStatus.LETHAL_START: "the cell is lethal, nobody could stand on it",
+            RouteStatus.LETHAL_START: "the cell is lethal, no vehicle can stand on it",
             RouteStatus.NO_TARGET: "the planner does not know where its target is",
         }[found.status]
         typer.echo(f"{found.status.value}: {meaning}")
@@ -257,7 +257,7 @@ def _print_status(
         crew.add_row(f"{info.role}-{info.id}", f"{up_s:.0f}", *("-" if n is None else str(n) for n in numbers))
     console.print(crew)
     for author in _throttled(stats):
-        console.print(f"author {author} marks more than its share: it is heard with delay", style="yellow")
+        console.print(f"author {author} exceeds its quota; its marks are delayed", style="yellow")
     if planners:
         trees = Table(
             "target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap", pad_edge=False

@@ -172,8 +172,7 @@ def new_run_id() -> str:
 
 
 def common_run_id(scenario: Scenario) -> str:
-    """Names the run that parts of a swarm belong to which are started on several machines, each by itself: the same
-    for the same scenario, wherever it meets."""
+    """Run id derived from the scenario, so that separately started parts agree on it."""
     same = msgspec.structs.replace(scenario, network=NetworkConfig(), monitor=MonitorConfig())
     digest = hashlib.blake2b(msgspec.json.encode(same, order="deterministic"), digest_size=4).hexdigest()
     return f"{scenario.name}-{digest}"

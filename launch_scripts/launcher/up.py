@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from launch_scripts.launcher.disk_watch import DiskWatch
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
 from launch_scripts.launcher.log_file import log_to
@@ -29,6 +28,7 @@ from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
+from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats

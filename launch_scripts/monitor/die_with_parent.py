@@ -1,7 +1,8 @@
-"""Become another program, one that ends with its parent, however that ends. Run as a script, alone: nothing of
-ours is imported.
+"""Replaces itself by another program, which ends when its parent ends, for whatever reason.
 
-    python tied.py PARENT_PID PROGRAM ARGUMENT...
+It runs as a script and imports nothing of ours.
+
+    python die_with_parent.py PARENT_PID PROGRAM ARGUMENT...
 """
 
 import ctypes

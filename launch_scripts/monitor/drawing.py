@@ -68,8 +68,8 @@ class Drawing:
         states = [state.name.lower() for state in VehicleState]
         self._series("states", states, list(STATE_COLOURS.values()))
         self._series("captures_and_marks", ["captures", "marks / 100"], [(255, 210, 31), (170, 110, 240)])
-        for plot in ("gap", "growth_ms"):
-            self._series(plot, self._target_ids, self._colours())
+        for chart in ("gap", "growth_ms"):
+            self._series(chart, self._target_ids, self._colours())
         self._series("messages", ["all processes"], [(86, 180, 233)])
 
     def _colours(self) -> list[tuple[int, ...]]:
@@ -86,8 +86,8 @@ class Drawing:
             static=True,
         )
 
-    def _series(self, plot: str, names: list[str], colours: Sequence[tuple[int, ...]]) -> None:
-        self._rec.log(f"plots/{plot}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
+    def _series(self, chart: str, names: list[str], colours: Sequence[tuple[int, ...]]) -> None:
+        self._rec.log(f"plots/{chart}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
 
     def texture(self, tile: int, image: Bytes) -> None:
         """Logs the photo of a tile, with its marks. Not static: a viewer which joins late gets only recent data."""
@@ -158,10 +158,10 @@ class Drawing:
         log("growth_ms", [sample.growth_ms.get(id) for id in self._target_ids])
         log("messages", [messages_per_s])
 
-    def _scalars(self, plot: str, values: Sequence[float | None]) -> None:
+    def _scalars(self, chart: str, values: Sequence[float | None]) -> None:
         if any(value is not None for value in values):
             numbers = np.array([math.nan if value is None else value for value in values])
-            self._rec.log(f"plots/{plot}", rr.Scalars(numbers))
+            self._rec.log(f"plots/{chart}", rr.Scalars(numbers))
 
     def summary(self, markdown: str) -> None:
         self._rec.log("summary", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))

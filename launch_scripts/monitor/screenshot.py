@@ -51,7 +51,7 @@ def _patiently(connect: Callable[[], T]) -> T:
     while True:
         try:
             return connect()
-        except Exception:  # it says in many ways that nobody listens yet
+        except Exception:  # the client raises various errors until the viewer listens
             if time.monotonic() > deadline_s:
                 raise
             time.sleep(0.2)

@@ -1,6 +1,6 @@
 """The monitor's shell: draws what it hears of the swarm, frame by frame.
 
-It only listens. It may be late, stalled, killed or absent; nobody waits for it.
+It only listens. It may be late, stalled, killed or absent; no process waits for it.
 """
 
 from __future__ import annotations
@@ -171,14 +171,14 @@ class MonitorService:
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         self.recorder.alive(peer, up, now_ns)
-        if now_ns - self._started_ns > 2 * NS_PER_S:  # not everybody who was there before
+        if now_ns - self._started_ns > 2 * NS_PER_S:  # those that were there before are not news
             text = f"{peer.role} {peer.id} is {'up' if up else 'gone'}"
             self._drawing.note(text, "INFO" if up else "WARN")
 
     def _follow(self, followed: Followed) -> None:
         try:
             cells = walk(self._terrain.grid, followed.start, followed.directions)
-        except ValueError:  # also a cell outside: somebody's bug, but no reason to go blind
+        except ValueError:  # a route that leaves the grid is its sender's bug: skip it, and go on drawing
             self.counters.count("routes_unreadable")
             return
         self._routes[followed.vehicle] = RouteNow(followed.target, np.array(cells, np.int64))
@@ -246,7 +246,7 @@ class MonitorService:
                 self._drawing.trails("targets", self._target_trails.advance(targets.ids, places))
         self._sightings.expire(now_ns)
         sighted = self._sightings.best(now_ns)
-        if sighted != self._sighted:  # somebody saw more, or what was seen has ended
+        if sighted != self._sighted:  # a new sighting, or one that expired
             self._sighted = sighted
             self._drawing.sightings(*sighting_points(self._ground, sighted))
         if self._windows_new:

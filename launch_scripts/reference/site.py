@@ -34,29 +34,29 @@ class Listings(griffe.Extension):
             obj.docstring.value = as_markdown(obj.docstring.value)
 
 
-def rooms() -> dict[str, list[str]]:
+def packages() -> dict[str, list[str]]:
     """Modules by the package that holds them; the package itself comes first where it declares names."""
     found: dict[str, list[str]] = {}
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
-            room = ".".join(path.parent.relative_to(ROOT).parts)
+            package = ".".join(path.parent.relative_to(ROOT).parts)
             if path.name != "__init__.py":
-                found.setdefault(room, []).append(f"{room}.{path.stem}")
+                found.setdefault(package, []).append(f"{package}.{path.stem}")
             elif "import" in path.read_text(encoding="utf-8"):
-                found.setdefault(room, []).insert(0, room)
+                found.setdefault(package, []).insert(0, package)
     return dict(sorted(found.items()))
 
 
-def api_page(room: str, modules: list[str]) -> str:
+def api_page(package: str, modules: list[str]) -> str:
     """The Markdown of one page of the API reference."""
-    return "\n\n".join([f"# {room}", *(f"::: {module}" for module in modules)]) + "\n"
+    return "\n\n".join([f"# {package}", *(f"::: {module}" for module in modules)]) + "\n"
 
 
 def on_config(config: Any) -> Any:
     """Puts the generated pages and the decisions where mkdocs.yml names their sections."""
     decisions = sorted(path.name for path in (ROOT / "docs" / "decisions").glob("0*.md"))
     inside = {
-        _API: [{room: _api_path(room)} for room in rooms()],
+        _API: [{package: _api_path(package)} for package in packages()],
         _DECISIONS: ["decisions/index.md", *(f"decisions/{name}" for name in decisions)],
     }
     for section in config.nav:
@@ -69,10 +69,10 @@ def on_config(config: Any) -> Any:
 
 def on_files(files: Any, config: Any) -> Any:
     """Adds the pages of the API."""
-    for room, modules in rooms().items():
-        files.append(File.generated(config, _api_path(room), content=api_page(room, modules)))
+    for package, modules in packages().items():
+        files.append(File.generated(config, _api_path(package), content=api_page(package, modules)))
     return files
 
 
-def _api_path(room: str) -> str:
-    return f"reference/api/{room}.md"
+def _api_path(package: str) -> str:
+    return f"reference/api/{package}.md"

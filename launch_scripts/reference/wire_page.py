@@ -16,6 +16,7 @@ from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
 from swarm.grid import REGION_TILES, TILE_CELLS
 from swarm.wire.access import OPERATOR, Grant
 from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES
+from swarm.wire.fields import Characters, Column, taken_apart
 from swarm.wire.messages.base import WIRE_VERSION, Message
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteStatus
@@ -38,7 +39,8 @@ logged once per key and minute, and dropped; a query is refused with a sentence.
 
 All keys stand below the namespace of the run (`network.namespace`, `swarm` by default). Columns of numbers are
 little-endian bytes, one value after the other. A cell is `row * cols + col`, row 0 in the north. A direction is
-0..7, clockwise from north. A tile is {TILE_CELLS} x {TILE_CELLS} cells, a region {REGION_TILES} x {REGION_TILES}
+0..7, clockwise from north. An id is 1 to 64 of letters, digits, `_`, `.`, `-`. No number is NaN.
+A tile is {TILE_CELLS} x {TILE_CELLS} cells, a region {REGION_TILES} x {REGION_TILES}
 tiles.
 
 Any Zenoh session may ask, with parameters instead of a payload and JSON as the answer:
@@ -60,7 +62,7 @@ def document() -> str:
 
 def _keys() -> Iterator[str]:
     yield "## Keys\n"
-    yield "`put` is published and never waited for; `get` is answered by whoever serves the key.\n"
+    yield "`put` is published and never waited for; `get` is answered by the processes that serve the key.\n"
     yield "| key | how | message | rate | priority | what |"
     yield "|---|---|---|---|---|---|"
     for topic in TOPICS:
@@ -159,10 +161,7 @@ def _default(field: msgspec.structs.FieldInfo) -> str:
 def _type(hint: Any) -> str:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        meta = next(note for note in args[1:] if isinstance(note, msgspec.Meta))
-        if meta.max_length is not None:
-            return f"{_type(args[0])}, {meta.min_length or 0} to {meta.max_length}"
-        return f"{_type(args[0])} {number(meta.ge)} ... {number(meta.le if meta.lt is None else meta.lt - 1)}"
+        return _bounded(*taken_apart(hint))
     if origin in (types.UnionType, typing.Union):
         return " or ".join("nil" if arg is type(None) else _type(arg) for arg in args)
     if origin is list:
@@ -174,13 +173,35 @@ def _type(hint: Any) -> str:
     return str(hint.__name__)
 
 
+def _bounded(bare: Any, notes: tuple[Any, ...]) -> str:
+    """A type with all that its annotation says of bounds."""
+    words = _type(bare)
+    if any(isinstance(note, Characters) for note in notes):
+        return "id"
+    for column in (note for note in notes if isinstance(note, Column)):
+        words = column.describe()
+        if column.least is not None and column.most is not None:
+            words += f", {number(column.least)} ... {number(column.most)}"
+    for meta in (note for note in notes if isinstance(note, msgspec.Meta)):
+        least, most = meta.ge, meta.le if meta.lt is None else meta.lt - 1
+        if least is not None:
+            words += f" {number(least)} ... {'inf' if most is None else number(most)}"
+        if meta.max_length is not None:
+            of = {str: "characters", bytes: "bytes"}.get(bare, "items")
+            few = f"{meta.min_length} to " if meta.min_length else "at most "
+            words += f", {few}{number(meta.max_length)} {of}"
+    return words
+
+
 def number(limit: Any) -> str:
     """A limit as one would write it: 2^62 - 1, -2^31, 1e+09, 0."""
     if isinstance(limit, float) or abs(limit) < 1 << 16:
         return f"{limit:g}"
     sign, rest = ("-", -limit) if limit < 0 else ("", limit)
-    exponent = int(rest).bit_length()
-    return f"{sign}2^{exponent - 1}" if rest == 1 << (exponent - 1) else f"{sign}2^{exponent} - 1"
+    for above, words in ((0, ""), (1, " - 1")):
+        if int(rest + above).bit_count() == 1:
+            return f"{sign}2^{int(rest + above).bit_length() - 1}{words}"
+    return f"{limit}"
 
 
 def _enums() -> Iterator[str]:

@@ -1,6 +1,6 @@
 """Newest message of every sender of a run: positions, counts, marks.
 
-Pure: the launcher, the monitor and the simulation feed it with what they heard on `RECORDED_TOPICS`.
+Pure: the launcher, the monitor and the simulation pass it what they heard on `RECORDED_TOPICS`.
 """
 
 from __future__ import annotations

@@ -82,11 +82,11 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
     for y in (0.918, 0.853):
         figure.add_artist(Line2D([0.033, 0.967], [y, y], color=RULE, linewidth=1))
     widths = [max(len(label), 1.9 * len(value)) + 4 for label, value, _ in tiles]
-    x, room = 0.033, 0.95 / sum(widths)
+    x, unit = 0.033, 0.95 / sum(widths)
     for (label, value, colour), width in zip(tiles, widths, strict=True):
         figure.text(x, 0.896, value, fontsize=15, fontweight="bold", color=colour, va="center")
         figure.text(x, 0.869, label, fontsize=8.5, color=FAINT, va="center")
-        x += room * width
+        x += unit * width
 
 
 def _facts(report: dict[str, Any]) -> list[str]:

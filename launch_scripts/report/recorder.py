@@ -1,6 +1,6 @@
 """Records a run: takes messages, returns numbers. Launcher, monitor and simulation share it.
 
-Pure: time is an argument, and the owner of a bus feeds it with what comes on `RECORDED_TOPICS`.
+Pure: time is an argument, and the owner of a bus passes it what comes on `RECORDED_TOPICS`.
 """
 
 from __future__ import annotations

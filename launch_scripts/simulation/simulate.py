@@ -253,7 +253,7 @@ class Simulation:
             if self.links.noticed(partition):
                 lost_s = partition.from_s + self.scenario.network.lease_s
                 self._at(lost_s, lambda nodes=nodes: self.network.relink(nodes, False))  # type: ignore[misc]
-                # A rounding too early, the links would still be cut, and no second look follows.
+                # A microsecond late: rounding must not put it before the heal, when the links are still cut.
                 found_s = partition.until_s + RELINK_S + 1e-6
                 self._at(found_s, lambda nodes=nodes: self.network.relink(nodes, True))  # type: ignore[misc]
 

@@ -39,7 +39,7 @@ class TrueTerrain:
         self.pace_s_per_m = pace_s_per_m
         self.passable: NDArray[np.bool_] = np.isfinite(pace_s_per_m)
         if not self.passable.any():
-            raise TerrainError("every cell of the terrain is lethal: nobody could stand on it")
+            raise TerrainError("every cell of the terrain is lethal: no target could stand on it")
         # A diagonal step has passable cells beside it, so what is connected by eight-neighbour steps is exactly
         # what is connected by four-neighbour steps.
         regions: NDArray[np.signedinteger[Any]]

@@ -1,1 +1,1 @@
-"""Arrays in, arrays out: all that is compiled. `rules` says how arrays are laid out."""
+"""Arrays in, arrays out: all that is compiled. `layout` says how arrays are laid out."""

@@ -116,7 +116,7 @@ def _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail):
 
 
 @njit
-def tighten(grid, labels, stamp, now, cells):
+def tighten(cell_cost, stride, rule, labels, stamp, now, cells):
     """Lower costs, which are upper bounds, to what is driven along the parents, less the tree's offset: of `cells`
     (int64, padded) and of all on their ways to the root.
 
@@ -124,7 +124,6 @@ def tighten(grid, labels, stamp, now, cells):
     that become so are stamped `now`. Returns cells visited. Raises ValueError where one is no padded cell.
     """
     check_cells(cells, stamp.size)
-    cell_cost, stride, rule, _ = grid
     cost, parent, root = labels
     offsets = step_offsets(stride)
     trail = np.empty(1024, np.int64)

@@ -52,13 +52,13 @@ def bound_by_exact_cost(cost, starts, lowest, most, bound):
 
 
 @njit
-def bound_by_heuristic(heuristic, root, stride, window, starts, lowest, most, bound):
+def bound_by_heuristic(heuristic, root, stride, part, box, rim, rim_cost, starts, lowest, most, bound):
     """bound := the larger of itself and what a heuristic and the window around the padded root prove.
 
-    window  a `WindowBound`
-    lowest, most  lowest cell cost, s, and cells of the grid: they bound the steps of a route, and so its rounding
+    part, box, rim, rim_cost  a `WindowBound`, in parts: a single route feels what a nested tuple takes to read
+    lowest, most              lowest cell cost, s, and cells of the grid: they bound a route's steps, and so its
+                              rounding
     """
-    part, box, rim, rim_cost = window
     if heuristic.size > 0:
         check_cells(starts, heuristic.size)
     row0, col0, row1, col1 = box

@@ -63,10 +63,8 @@ def relabel(grid, labels):
 
 
 @njit
-def _walk_on(cell_cost, parent, moves, lanes, trails, steps):
+def _walk_on(cell_cost, parent, offsets, lengths, cells, sums, trails, fill, steps):
     """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
-    offsets, lengths = moves
-    cells, sums, fill = lanes
     a, b, c, d = np.uint64(cells[0]), np.uint64(cells[1]), np.uint64(cells[2]), np.uint64(cells[3])
     sum_a, sum_b, sum_c, sum_d = sums[0], sums[1], sums[2], sums[3]
     trail_a, trail_b, trail_c, trail_d = trails[0], trails[1], trails[2], trails[3]
@@ -106,16 +104,15 @@ def _moves(stride, rule):
 
 
 @njit
-def walk_routes(grid, parent, root, starts, max_steps, limit):
+def walk_routes(cell_cost, parent, stride, rule, root, starts, max_steps, limit):
     """The routes from `starts` to a padded root, at most `max_steps` long where that is positive.
 
     limit  no route can be longer than so many steps
     Raises ValueError where a start is no padded cell.
     Returns (directions, ends, driven, diagonals, last).
     """
-    cell_cost, stride, rule, _ = grid
     check_cells(starts, parent.size)
-    moves = _moves(stride, rule)
+    offsets, lengths = _moves(stride, rule)
     count = starts.size
     ends = np.empty(count, np.int64)
     driven = np.empty(count, np.float64)
@@ -145,7 +142,7 @@ def walk_routes(grid, parent, root, starts, max_steps, limit):
             break
         if max(max(fill[0], fill[1]), max(fill[2], fill[3])) + steps > trails.shape[1]:
             trails = _longer_trails(trails)
-        _walk_on(cell_cost, parent, moves, (cells, sums, fill), trails, steps)
+        _walk_on(cell_cost, parent, offsets, lengths, cells, sums, trails, fill, steps)
         for j in range(_LANES):
             r = route[j]
             if r == until[j]:
@@ -227,13 +224,14 @@ def find_starts(cell_cost, cost, stride, root, asked, starts, status):
 
 
 @njit
-def price_routes(cost, offset, root, metres, walks, status, prices):
+def price_routes(cost, offset, root, metres, walks, status, bound, prices):
     """What walked routes cost and how long they are.
 
     offset  s; what a tree's stored costs lack
     metres  (resolution, m; length of a diagonal in straight steps; price of length, s/m)
     walks   (ends, driven, diagonals, last) as `walk_routes` returns them
-    prices  in: the proven bounds as its second row; out: all
+    bound   float64 (n,), s; proven lower bound on the cost of each
+    prices  written whole
     Returns False if a route does not end where it should.
     """
     resolution, diagonal, length_weight = metres
@@ -255,7 +253,7 @@ def price_routes(cost, offset, root, metres, walks, status, prices):
             remaining = max(np.float64(cost[last[i]]) + offset, 0.0)
         whole = driven[i] - length * length_weight + remaining
         prices[0, i] = whole
-        prices[1, i] = min(prices[1, i], whole)
+        prices[1, i] = min(bound[i], whole)
         prices[2, i] = length
         prices[3, i] = remaining
     return True

@@ -24,13 +24,19 @@ class LowerBounds:
         """float32, padded, s: the exact cost of an earlier root, lowered where the map became cheaper. A consistent
         heuristic: no step costs less than it falls by. `take` sets it, `learn` lowers it, or drops it (None) where
         that would visit too many cells."""
+        self._lowest = cost_grid.lowest_cell_cost
+        """s: no cell cost was less since the heuristic was exact. It bounds the steps of a route by which the
+        heuristic was made, and so its rounding. `take` sets it, `learn` lowers it."""
 
     def take(self, exact_cost: Floats) -> None:
         """Go by this exact padded cost from now on; nobody may write to it any more."""
         self._heuristic = exact_cost
+        self._lowest = self._grid.lowest_cell_cost
 
     def learn(self, changes: Changes) -> None:
         """The map changed: lower the heuristic where ways became cheaper. Dearer cells leave it consistent."""
+        if changes.cells.size:
+            self._lowest = min(self._lowest, float(changes.before.min()), self._grid.lowest_cell_cost)
         if self._heuristic is None or not changes.any_lower:
             return
         grid = self._grid
@@ -49,10 +55,12 @@ class LowerBounds:
         if tree.exact:
             kernels.bound_by_exact_cost(tree.cost, starts, lowest, most, bound)
         else:
-            window = NO_WINDOW if tree.window_bound is None else tree.window_bound
+            part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)
-            kernels.bound_by_heuristic(heuristic, root, grid.stride, window, starts, lowest, most, bound)
+            kernels.bound_by_heuristic(
+                heuristic, root, grid.stride, part, box, rim, rim_cost, starts, self._lowest, most, bound
+            )
         if grid.length_weight_s:
             # Of the optimum only the share that is travel time counts: at least 1 - lambda / lowest cell cost.
             bound *= 1.0 - grid.length_weight_s / lowest

@@ -102,10 +102,9 @@ class CostGrid:
         """float32 (size,), s: price of a straight step into each cell; inf is lethal, as is the border. Lethal
         everywhere before `load`; `load` and `apply` write it, in place."""
         self.lowest_cell_cost = math.inf
-        """s; no finite cell cost is less. `load` sets it, `apply` only lowers it, so that it need not be reached;
-        inf if all is lethal."""
+        """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
         self.highest_cell_cost = 0.0
-        """s; no finite cell cost is more. `load` sets it, `apply` only raises it; 0 if all is lethal."""
+        """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
         self.padded: PaddedGrid = (self.cell_cost, self.stride, self.rule, self.corners)
         """The same for kernels."""
 
@@ -143,12 +142,16 @@ class CostGrid:
         bad = kernels.pad_cell_costs(pace, self._metres, self.length_weight_s, self.stride, self.cell_cost)
         if bad:
             raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
+        self._find_range()
+
+    def _find_range(self) -> None:
         lowest, highest = kernels.cell_cost_range(self.cell_cost)
         self.lowest_cell_cost, self.highest_cell_cost = float(lowest), float(highest)
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
         """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative."""
         check_pace(self.grid, pace)
+        was = (self.lowest_cell_cost, self.highest_cell_cost)
         found: list[Changes] = []
         for box in self._boxes(dirty):
             row0, col0, row1, col1 = box
@@ -181,6 +184,9 @@ class CostGrid:
                 np.concatenate([part.before for part in found]),
                 np.concatenate([part.after for part in found]),
             )
+        if ((changes.before <= was[0]) | (changes.before == np.float32(was[1]))).any():
+            # An extreme cell is another now: look for the next, or one wrong mark would stay for good.
+            self._find_range()
         return changes
 
     def difference(self, older: Floats, dirty: Sequence[Window]) -> Changes:
@@ -229,8 +235,7 @@ class CostGrid:
         """
         if not 0 <= root < self.size:
             raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
-        padded = (cell_cost, self.stride, self.rule, self.corners)
-        return Walks(*walk_routes(padded, parent, root, starts, most, self.grid.cells))
+        return Walks(*walk_routes(cell_cost, parent, self.stride, self.rule, root, starts, most, self.grid.cells))
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""

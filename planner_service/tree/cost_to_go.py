@@ -182,7 +182,9 @@ class CostToGoTree:
         this is asked. Raises ValueError where one is no padded cell.
         """
         if not self.exact:
-            corridor_growth.tighten(self.cost_grid.padded, self._labels, self._stamps_now(), self._now, cells)
+            grid = self.cost_grid
+            stamps = self._stamps_now()
+            corridor_growth.tighten(grid.cell_cost, grid.stride, grid.rule, self._labels, stamps, self._now, cells)
 
     def _stamps_now(self) -> NDArray[np.uint8]:
         if self._stamps is None:

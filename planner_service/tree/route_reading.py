@@ -21,10 +21,10 @@ def read_routes(tree: CostToGoTree, bounds: LowerBounds, asked: NDArray[np.int64
     walks = grid.walk(tree.parent, root, starts, max_cells, grid.cell_cost)
     if max_cells:
         tree.tighten(walks.last)
+    bound = bounds.at(tree, starts)
     prices = np.empty((4, asked.size), np.float64)
-    prices[1] = bounds.at(tree, starts)
     metres = (grid.grid.resolution_m, grid.diagonal, grid.config.length_weight)
-    whole = price_routes(tree.cost, tree.offset, root, metres, walks[1:], statuses, prices)
+    whole = price_routes(tree.cost, tree.offset, root, metres, walks[1:], statuses, bound, prices)
     if not whole:
         raise AssertionError("a route does not end at the target: the tree is broken")
     return RouteBatch(statuses, asked, walks.directions, walks.ends, *prices)

@@ -24,7 +24,7 @@ from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap, BaseMapTile
 
 REGION_CELLS = REGION_TILES * TILE_CELLS
 MAX_CELLS = 1 << 28
-"""A larger base map than 16384 x 16384 is not taken from anybody."""
+"""A larger base map than 16384 x 16384 is rejected."""
 _LEVEL = 1  # a third smaller than the raw bytes as with level 6, in half the time
 
 
@@ -147,7 +147,7 @@ class BaseMapCopy:
         if tile.region not in self._missing.get(tile.layer, {}):
             if tile.layer in self._missing and tile.region < self.grid.regions:
                 return False
-            raise ProtocolError(f"{self._who}: nobody asked for layer {tile.layer[:40]!r}, region {tile.region}")
+            raise ProtocolError(f"{self._who}: unrequested: layer {tile.layer[:40]!r}, region {tile.region}")
         what = f"{self._who}: layer {tile.layer}, region {tile.region}"
         window, kind = region_window(self.grid, tile.region), LAYERS[tile.layer]
         width = np.dtype(kind.dtype).itemsize
@@ -170,7 +170,7 @@ class BaseMapCopy:
             raise TerrainError(f"{self._who} has class {classes.max()}, at most {int(max(TerrainClass))} exists")
         photo = self._arrays.get("photo")
         if photo is None:
-            photo = np.broadcast_to(np.uint8(0), (*classes.shape, 3))  # black: nobody looks
+            photo = np.broadcast_to(np.uint8(0), (*classes.shape, 3))  # black: it is not shown
         notes = (*self.notes, f"fetched from keeper {self.keeper}, as its files are not on this machine")
         made = finished(self.grid, elevation, photo, classes, ground, cost, notes)
         if made.digest != self._terrain:

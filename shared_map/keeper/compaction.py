@@ -69,7 +69,7 @@ class CompactionPlan:
     def take_due(self, at_most: int, now_ns: int) -> dict[int, bool]:
         """Tiles to compact now, and whether with what was dropped there before."""
         if now_ns - self._started_ns <= self._after_ns:
-            return {}  # we have not listened long enough to know who is dead
+            return {}  # not heard for long enough to know which authors are dead
         return {tile: self._due.pop(tile) for tile in list(self._due)[:at_most]}
 
     def put_off(self, tiles: Mapping[int, bool]) -> None:

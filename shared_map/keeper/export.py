@@ -105,7 +105,7 @@ def to_bands(
     grid: GridSpec, sets: Iterable[MarkSet], now_ns: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """(pace, kind) of the winning marks. The pace is in s/m: inf is lethal, nan is as the prior map says. The kind
-    is a MarkKind, NOTHING_SAID_BAND where nobody says anything."""
+    is a MarkKind, NOTHING_SAID_BAND where no author says anything."""
     replica = MapReplica(grid)
     replica.merge(list(sets))
     replica.tick(now_ns)

@@ -138,7 +138,7 @@ class KeeperService:
         for author in throttled[:_NAME_AT_MOST]:
             if author not in self._named:
                 self._named.append(author)
-                text = f"author {author} marks more than its share: it is heard with delay"
+                text = f"author {author} exceeds its quota; its marks are delayed"
                 self._member.note(now_ns, "quota", text)
         self._named = [author for author in self._named if author in throttled]
 

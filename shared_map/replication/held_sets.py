@@ -80,10 +80,10 @@ class HeldSets:
         return True
 
     def __contains__(self, tile: int) -> bool:
-        """Whether anybody's set of this tile is held."""
+        """Whether a set of this tile is held, of any author."""
         return tile in self._tiles
 
-    def bury(self, tombstone: MarkSet, now_ns: int) -> None:
+    def delete(self, tombstone: MarkSet, now_ns: int) -> None:
         """Delete what its author stated about a tile, and remember under which number."""
         assert is_tombstone(tombstone)
         self.tombstones.add(tombstone, now_ns)

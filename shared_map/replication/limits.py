@@ -99,10 +99,10 @@ class Capacity:
 class Quota:
     """Token buckets of changed marks, for each author and for all of them together. Time is an argument.
 
-    An author whose bucket is empty waits. While the bucket of all is empty, so does an author that has used up its
-    share: of the total rate, an equal part for each author heard in the last ten seconds. An author below its share
-    is never delayed, whatever the others do. Of a waiting author the newest set of each tile is kept, and let in
-    once its buckets have filled: it is late, but not lost.
+    An author whose bucket is empty waits. While the shared bucket is empty, authors above their share wait too:
+    each author heard in the last ten seconds has an equal share of the total rate. An author below its share is
+    never delayed, whatever the others do. Of a waiting author the newest set of each tile is kept, and let in once
+    its buckets have filled: it is late, but not lost.
     """
 
     def __init__(self, author_marks_per_s: float, total_marks_per_s: float = math.inf) -> None:

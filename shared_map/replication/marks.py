@@ -18,7 +18,7 @@ from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.statements import FOREVER, STAMP_LIMIT_NS, TILE_AREA, MarkKind
 
 NO_STATEMENT = -1
-"""In place of a stamp: nobody states anything about the cell."""
+"""In place of a stamp: no author states anything about the cell."""
 
 
 class Statements(NamedTuple):
@@ -100,8 +100,8 @@ def next_seq(seq: int) -> int:
 
 
 MAX_AHEAD_NS = 24 * 3600 * NS_PER_S
-"""A statement stamped further ahead of the reader's clock than this is refused: nobody could overrule one that is
-stamped near the limit. As wide as clocks that are set for another zone."""
+"""A statement stamped further ahead of the reader's clock than this is refused: no author could overrule one
+that is stamped near the limit. As wide as clocks that are set for another zone."""
 _CLOCK_WAS_SET_NS = 1_735_689_600 * NS_PER_S
 """2025: a clock before this was never set, as after a start without a network, and says nothing about stamps."""
 

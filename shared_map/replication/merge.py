@@ -34,9 +34,9 @@ class NewWinners(NamedTuple):
     """Cells whose winning statement has another kind or pace than before. Columns of one length, no cell twice.
 
     cells      uint32   flat index in the grid
-    kinds      uint8    MarkKind; CLEAR where nobody states anything any more
+    kinds      uint8    MarkKind; CLEAR where no author states anything any more
     paces      float32  s/m, 0 where the kind is not PACE
-    stamps_ns  int64    NO_STATEMENT where nobody states anything any more
+    stamps_ns  int64    NO_STATEMENT where no author states anything any more
     counts     list     number of such cells in each `TileChange`
     """
 

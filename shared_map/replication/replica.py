@@ -35,7 +35,7 @@ from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec
 from swarm.wire.messages.marks import MarkSet
-from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
 
 
 class CostSink(Protocol):
@@ -74,7 +74,7 @@ class MapReplica:
     counts         totals since the start: sets_merged, sets_repeated, sets_refused, sets_without_room (beyond the
                    capacity), sets_foreign (of a group which is not read), sets_elsewhere (about tiles of no
                    interest), marks_merged (cells whose winner changed), marks_written
-    over_capacity  author of the last set that was refused for lack of capacity; whoever reads it sets it to None
+    over_capacity  author of the last set that was refused for lack of capacity; its reader sets it to None
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class MapReplica:
                 continue
             sets = before[tile] if tile in before else self.held.of_tile(tile)
             if not each.kinds and is_tombstone(each):
-                self.held.bury(each, self._now_ns)
+                self.held.delete(each, self._now_ns)
             elif not self.held.put(each):
                 self.counts["sets_without_room"] += 1
                 self.over_capacity = author
@@ -276,7 +276,8 @@ class MapReplica:
 
         cells       int (cells,)      flat indices in the grid; OutsideGridError if one is not in it
         kinds       uint8 (cells,)    MarkKind, or one for all
-        paces       float32 (cells,)  s/m, or one for all; read where the kind is PACE
+        paces       float32 (cells,)  s/m, or one for all; read where the kind is PACE, and kept within the bounds
+                    of marks (`swarm.wire.statements`)
         lifetime_s  the statements expire so long after their stamps, by the reader's clock; None: never
 
         Raises RuntimeError if the replica has no author.
@@ -286,7 +287,8 @@ class MapReplica:
             raise OutsideGridError(f"a cell of {flat.min()}..{flat.max()} is not in {self.grid.cells} cells")
         new_kinds = np.broadcast_to(np.asarray(kinds, np.uint8), flat.shape)
         new_paces = np.broadcast_to(np.asarray(paces, np.float32), flat.shape)
-        new_paces = np.where(new_kinds == MarkKind.PACE, new_paces, np.float32(0))
+        bounded = np.clip(new_paces, PACE_LEAST, PACE_MOST)
+        new_paces = np.where(new_kinds == MarkKind.PACE, bounded, np.float32(0))
         tiles, inner = tile_cells(self.grid, flat)
         for tile in np.unique(tiles).tolist():
             here = tiles == tile

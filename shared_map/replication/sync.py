@@ -48,7 +48,7 @@ class MapSync:
     """Keeps a replica equal to the others.
 
     The service calls `handle` and `tick` before its own work, and `publish` with what `replica.write` returns. A
-    replica with an author serves and digests its own sets. A keeper serves everybody's and digests those it has
+    replica with an author serves and digests its own sets. A keeper serves all sets and digests those it has
     committed.
 
     name         sender of digests; default: the replica's author; without one no digests are sent
@@ -56,7 +56,7 @@ class MapSync:
     committed    what whole digests tell; default: the replica's own sets
     on_accepted  called with every set that is merged
     near         hold only regions that `enter` names, instead of the whole map
-    joined       the late join is over: somebody answered, or there was nobody to ask
+    joined       the late join is over: an answer came, or every try failed
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class MapSync:
             self._bus.ask(MARKS, MarksRequest(tiles=tiles, bulk=True), self._post, tag=_ENTER)
 
     def handle(self, event: Event, now_ns: int) -> bool:
-        """True if the event was about the map, and is nobody else's business."""
+        """True if the event concerns the map only, so that no other part needs to handle it."""
         match event:
             case HeardMany(topic=topic, samples=samples) if topic is MARKS:
                 self._hear(samples, now_ns)
@@ -171,7 +171,7 @@ class MapSync:
 
     @property
     def throttled(self) -> list[str]:
-        """Authors that exceed their quota, and are heard with delay now."""
+        """Authors that exceed their quota, whose marks are delayed now."""
         return self._quota.throttled
 
     # --- sets -----------------------------------------------------------------------------------------------
@@ -216,7 +216,7 @@ class MapSync:
                 self._merge_charged(taken, marks, now_ns)
                 taken, marks, stated = [], {}, None
             if stated is None and not self._quota.admits(each, now_ns):
-                self._warn_once(author, "marks more than its share: it is heard with delay", now_ns)
+                self._warn_once(author, "exceeds its quota; its marks are delayed", now_ns)
                 continue
             taken.append(each)
             marks[author] = (stated or 0) + len(each.kinds)
@@ -230,7 +230,9 @@ class MapSync:
         for author, cost in costs.items():
             self._quota.charge(author, cost, now_ns)
         if self.replica.over_capacity is not None:
-            self._warn_once(self.replica.over_capacity, "exceeds the capacity for marks: it is not heard", now_ns)
+            self._warn_once(
+                self.replica.over_capacity, "exceeds the mark capacity; its new sets are rejected", now_ns
+            )
             self.replica.over_capacity = None
 
     def _merge_waiting(self, now_ns: int) -> None:
@@ -278,7 +280,7 @@ class MapSync:
         if (event.replies and event.failure is None) or self._join_tries >= _JOIN_TRIES:
             self.joined = True
             return
-        # Nobody there, a lost link and an empty map look alike. What this misses, digests show later.
+        # No process there, a lost link and an empty map look alike. Digests show later what this missed.
         self._join_due_ns = now_ns + (_JOIN_RETRY_NS << (self._join_tries - 1))
 
     # --- digests --------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@ _ALL_LETHAL = "every cell of the terrain is lethal, no vehicle could stand anywh
 
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """What the map says before anybody has driven. Arrays are (rows, cols) and must not be written to.
+    """The map before any vehicle has driven. Arrays are (rows, cols) and must not be written to.
 
     elevation_m       float32  NaN where there is a void
     photo             uint8    (rows, cols, 3)
@@ -138,7 +138,7 @@ def finished(
     cost: CostConfig,
     notes: tuple[str, ...],
 ) -> Terrain:
-    """A terrain of its ground: inflated, with its digest. Raises TerrainError where nobody could stand."""
+    """A terrain of its ground: inflated, with its digest. Raises TerrainError where every cell is lethal."""
     _check_passable(ground, elevation_m, classes, cost, grid)
     # However wide a vehicle is said to be, wider than the terrain is the same.
     radius_m = min(cost.vehicle_radius_m, 2 * max(grid.rows, grid.cols) * grid.resolution_m)
@@ -266,7 +266,7 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
         (folder / _META).unlink(missing_ok=True)
         for name, array in arrays.items():
             path = folder / f"{name}.npy"
-            path.unlink(missing_ok=True)  # whoever has the old one mapped keeps it
+            path.unlink(missing_ok=True)  # a process that has the old one mapped keeps it
             np.save(path, np.ascontiguousarray(array), allow_pickle=False)
         partial = folder / f"{_META}.part"
         partial.write_text(json.dumps(meta, indent=1), encoding="utf-8")

@@ -217,7 +217,7 @@ class Bus(Protocol):
         timeout_s: float = 2.0,
         **fields: str | int,
     ) -> None:
-        """Query all who serve the key, ourselves included. Posts `Replied` for each reply and then always one
+        """Query all servers of the key, this process included. Posts `Replied` for each reply and then always one
         `AskEnded`, after `timeout_s` at the latest."""
         ...
 

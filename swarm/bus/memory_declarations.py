@@ -1,4 +1,4 @@
-"""Who hears what on the simulated network: the subscriptions and queryables of its nodes, by topic and key."""
+"""What nodes of the simulated network hear: their subscriptions and queryables, by topic and key."""
 
 from __future__ import annotations
 

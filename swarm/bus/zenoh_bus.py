@@ -8,7 +8,6 @@ same link; replies are posted on Zenoh's own thread, because a thread per query 
 from __future__ import annotations
 
 import logging
-import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -35,10 +34,9 @@ from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.codec import decode, decode_either, decode_many, encode
-from swarm.wire.fields import check_id
 from swarm.wire.messages.base import Message
 from swarm.wire.readable import decode_parameters, encode_readable
-from swarm.wire.topics import ALIVE_KEY, Priority, Topic
+from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +53,6 @@ _QUERY_BUFFER = 4096
 """Queries that wait to be answered, per queryable. It takes no more until one is read."""
 _TOKEN_BUFFER = 65_536
 """Changes of tokens that wait to be read: more than processes can start in a second."""
-_INCARNATION = re.compile(r"[0-9]{1,19}")
 _CLOSE_S = 3.0
 """How long `close` waits for a router that does not answer."""
 _TOGETHER = 1024
@@ -262,7 +259,7 @@ class ZenohBus:
     def watch_alive(self, post: Post, role: str = "*") -> None:
         def arrive(sample: zenoh.Sample) -> None:
             try:
-                peer = _peer(str(sample.key_expr))
+                peer = peer_of(str(sample.key_expr))
             except ProtocolError as error:
                 self._drop(str(sample.key_expr), error)
                 return
@@ -367,19 +364,6 @@ def _guarded(callback: Callable[..., None]) -> Callable[..., None]:
             threading.excepthook(threading.ExceptHookArgs(what))
 
     return guarded
-
-
-def _peer(key: str) -> Peer:
-    """The process of a token. Raises ProtocolError on a key that is none: anybody may raise a token."""
-    *_, role, id, incarnation = key.split("/")
-    try:
-        check_id("role", role)
-        check_id("id", id)
-    except ValueError as error:
-        raise ProtocolError(f"token {key[:200]!r}: {error}") from error
-    if _INCARNATION.fullmatch(incarnation) is None or int(incarnation) >= 1 << 62:
-        raise ProtocolError(f"token {key[:200]!r}: incarnation is not a number below 2^62")
-    return Peer(role, id, int(incarnation))
 
 
 def _timeout_s(said: str) -> float:

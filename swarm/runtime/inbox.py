@@ -70,25 +70,24 @@ class Inbox:
         With a `HeardMany` it blocks the caller while more than two batches are unread. The bus then drops its
         oldest samples instead of this inbox growing.
         """
-        match event:
-            case HeardMany():
-                with self._lock:
-                    self._unread_batches += 1
-                    self._put(event, _KEPT)
-                while True:
-                    self._batch_taken.clear()
-                    if self._unread_batches <= _UNREAD_BATCHES or self._closed:
-                        break
-                    self._batch_taken.wait()
-            case Heard(topic=topic, fields=fields):
-                newest = tuple(fields.values()) if topic.newest else None
-                self._put(event, topic.name, newest)
-            case Asked(topic=topic):
-                dropped = self._put(event, f"? {topic.name}")
-                if isinstance(dropped, Asked):
-                    _refuse(dropped, "too many questions wait")
-            case _:
+        if isinstance(event, Heard):
+            newest = tuple(event.fields.values()) if event.topic.newest else None
+            self._put(event, event.topic.name, newest)
+        elif isinstance(event, Asked):
+            dropped = self._put(event, f"? {event.topic.name}")
+            if isinstance(dropped, Asked):
+                _refuse(dropped, "too many questions wait")
+        elif isinstance(event, HeardMany):
+            with self._lock:
+                self._unread_batches += 1
                 self._put(event, _KEPT)
+            while True:
+                self._batch_taken.clear()
+                if self._unread_batches <= _UNREAD_BATCHES or self._closed:
+                    break
+                self._batch_taken.wait()
+        else:
+            self._put(event, _KEPT)
 
     def fail(self, error: BaseException) -> None:
         """Make the owner raise: how another thread ends its process."""
@@ -103,7 +102,9 @@ class Inbox:
         """
         dropped = None
         with self._lock:
-            queue = self._queues.setdefault(name, OrderedDict())
+            queue = self._queues.get(name)
+            if queue is None:
+                queue = self._queues[name] = OrderedDict()
             if newest is not None and newest in queue:
                 queue[newest] = (queue[newest][0], event)
                 self.superseded += 1
@@ -157,26 +158,29 @@ class Inbox:
 
     def _choose(self, expired: list[Asked]) -> tuple[str | None, bool]:
         """The queue whose turn it is, and whether its newest event is to be taken instead of its oldest."""
-        first: dict[str, int] = {}
-        late: set[str] = set()
+        oldest: str | None = None
+        oldest_number = 0
+        late: set[str] | None = None
         for name, queue in self._queues.items():
             while queue:
                 number, event = next(iter(queue.values()))
                 if isinstance(event, Asked):
-                    if event.expired:
+                    waited_s, timeout_s = event.waited_s, event.timeout_s
+                    if waited_s >= timeout_s:
                         queue.popitem(last=False)
                         self._unread -= 1
                         self._expire(event, expired)
                         continue
-                    if event.waited_s >= min(LATE_S, event.timeout_s / 2):
-                        late.add(name)
-                first[name] = number
+                    if waited_s >= min(LATE_S, timeout_s / 2):
+                        late = {name} if late is None else late | {name}
+                if oldest is None or number < oldest_number:
+                    oldest, oldest_number = name, number
                 break
-        if not late:
-            return min(first, key=first.__getitem__, default=None), False
-        name = next(iter(first))
-        self._queues.move_to_end(name)
-        return name, name in late
+        if late is None:
+            return oldest, False
+        turn = next(name for name, queue in self._queues.items() if queue)
+        self._queues.move_to_end(turn)
+        return turn, turn in late
 
     def _expire(self, asked: Asked, expired: list[Asked]) -> None:
         self.counts["asks_expired"] += 1

@@ -1,5 +1,4 @@
-"""What every process does besides its work: shows that it is alive, which run it belongs to, and what it
-counted."""
+"""What every process does besides its work: shows that it is alive, names its run, publishes its counters."""
 
 from __future__ import annotations
 
@@ -11,6 +10,7 @@ from swarm.clock import NS_PER_S
 from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
 from swarm.runtime.stats import Counters
+from swarm.wire.fields import MOST_TEXT
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.topics import NOTE, RUN, STATS
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 ROUTER = "router"
 NO_RUN = ""
-"""The run id of what belongs to no run: a router passes on everybody's messages."""
+"""The run id of what belongs to no run: a router passes on all messages."""
 _TAG = "run-check"
 _MOST_STRANGERS = 256
 
@@ -27,11 +27,11 @@ _MOST_STRANGERS = 256
 class Member:
     """One process's membership in a run.
 
-    A process asks everybody which run they belong to when it starts, whenever a link comes back and whenever a
-    router appears, as behind it there may be others. Two processes belong together when run id and terrain digest
-    are the same. Nobody ends because of what another says: a process ends, with RunMismatchError, only while no
-    other has confirmed that it belongs, and then when somebody answers and nobody agrees. Once it is confirmed, who
-    differs is a stranger: counted, and named once.
+    A process asks all others for their run when it starts, whenever a link comes back and whenever a router
+    appears, as behind it there may be others. Two processes belong together when run id and terrain digest are the
+    same; each is then confirmed. An unconfirmed process exits, with RunMismatchError, if every answer differs. A
+    confirmed one never exits because of an answer; it reports the sender as a stranger: counts it, and names it
+    once.
     """
 
     def __init__(self, info: RunInfo, bus: Bus, post: Post) -> None:
@@ -41,11 +41,11 @@ class Member:
         self._bus = bus
         self._post = post
         self._stats_due_ns = 0
-        # Whether another process of this run has ever answered: from then on nobody's word ends this one.
+        # Whether another process of this run has ever answered: from then on no answer ends this one.
         self._confirmed = info.run_id == NO_RUN
         # What the round of answers that is coming in has told: the first that differs, in words.
         self._differs: RunMismatchError | None = None
-        # Who was named already, and sentences that the next tick tells.
+        # Processes which were named already, and sentences that the next tick publishes.
         self._strangers: set[Peer] = set()
         self._to_name: list[str] = []
 
@@ -113,7 +113,7 @@ class Member:
     def note(self, now_ns: int, kind: str, text: str, cell: int | None = None) -> None:
         """Publish a sentence for people who watch the run."""
         info = self.info
-        note = Note(role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text, cell=cell)
+        note = Note(role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text[:MOST_TEXT], cell=cell)
         self._bus.publish(NOTE, note, role=info.role, id=info.id)
 
     def _compare(self, other: RunInfo) -> None:
@@ -138,7 +138,7 @@ class Member:
 
 
 def check_belongs(mine: RunInfo, others: Iterable[RunInfo]) -> None:
-    """Raises RunMismatchError, in words, where somebody answers and nobody belongs to the same run."""
+    """Raises RunMismatchError, in words, where others answer and none belongs to the same run."""
     differs: RunMismatchError | None = None
     for other in others:
         if other.run_id == NO_RUN:

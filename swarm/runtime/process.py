@@ -120,7 +120,7 @@ class Process:
         dropped. Raises what the service, a worker's job or any other thread raised, after stopping the service.
 
         Ticks and events share the thread: while events wait, they get at least as long as the last tick took before
-        the next one is taken. So a tick that takes its whole period halves its rate and starves nobody.
+        the next one is taken. So a tick that takes its whole period halves its rate and starves no event.
         """
         with _failing_with_threads(self._inbox):
             self._run()

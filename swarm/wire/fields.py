@@ -75,21 +75,21 @@ Count = Annotated[int, Meta(ge=0, lt=1 << 53)]
 """How often something happened: what a float64 counts exactly."""
 Metres = Annotated[float, Meta(ge=-1e9, le=1e9)]
 """A place in the map frame. Rejects infinities and NaN."""
-Distance = Annotated[float, Meta(ge=0.0, le=1e9)]
+Distance = Annotated[float, Meta(ge=0, le=1e9)]
 """Metres from here to there, on the map."""
-Length = Annotated[float, Meta(ge=0.0, le=1e15)]
+Length = Annotated[float, Meta(ge=0, le=1e15)]
 """Metres along a route."""
 Resolution = Annotated[float, Meta(ge=1e-6, le=1e9)]
 """Side of a cell, in metres."""
-Cost = Annotated[float, Meta(ge=0.0), OR_INFINITE]
+Cost = Annotated[float, Meta(ge=0), OR_INFINITE]
 """Seconds of travel. Inf is no way: who gives a way gives a finite cost."""
-FiniteCost = Annotated[float, Meta(ge=0.0, le=1e18)]
+FiniteCost = Annotated[float, Meta(ge=0, le=1e18)]
 """Seconds of travel along a way that there is."""
-Millis = Annotated[float, Meta(ge=0.0, le=1e12)]
+Millis = Annotated[float, Meta(ge=0, le=1e12)]
 """What something took, in ms."""
-AgeMillis = Annotated[float, Meta(ge=0.0), OR_INFINITE]
+AgeMillis = Annotated[float, Meta(ge=0), OR_INFINITE]
 """How old something is, in ms; inf while it is not there yet."""
-Gap = Annotated[float, Meta(ge=0.0), OR_INFINITE]
+Gap = Annotated[float, Meta(ge=0), OR_INFINITE]
 """Cost over optimum or lower bound: 1 but for rounding, or more; inf is nothing proven."""
 Gauge = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
 """What a process measured of itself: any finite number."""
@@ -181,12 +181,14 @@ _MAX_KNOWN_IDS = 4096
 class Bounded(msgspec.Struct, frozen=True):
     """Base of structs: checks what their annotations state beyond `Meta`, and `relate`, when one is made."""
 
-    def check_bounds(self) -> None:
-        """Raise ValueError where a field breaks a rule of its annotation, or `relate` says so."""
+    def __post_init__(self) -> None:
         for rule in _RULES.get(type(self)) or _rules_of(type(self)):
             rule(self)
 
-    __post_init__ = check_bounds
+    def check_bounds(self) -> None:
+        """Raise ValueError where a field breaks a rule of its annotation, or `relate` says so: for types which do
+        not do that when they are made."""
+        Bounded.__post_init__(self)
 
     def relate(self) -> None:
         """Raise ValueError where fields contradict each other. What one field says alone is in its type."""
@@ -294,7 +296,7 @@ def _values_check(column: Column) -> Callable[[str, bytes], None]:
                 raise ValueError(f"{name} has {len(data)} bytes, not a multiple of {width}")
 
         return check_length
-    code = _CODES[str(column.dtype)]
+    code: Any = _CODES[str(column.dtype)]
     if code == "B":
 
         def check_bytes(name: str, data: bytes) -> None:

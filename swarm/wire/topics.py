@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 from swarm.errors import ProtocolError
+from swarm.liveness import Peer
 from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, access
 from swarm.wire.codec import prime
 from swarm.wire.messages.base import Message, Nothing
@@ -249,3 +250,13 @@ TOPICS = (
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
 """Liveliness tokens, one per process, which raises no other than its own. All roles may watch them."""
+_TOKEN = re.compile(r"(?:.*/)?alive/([A-Za-z0-9_.-]{1,64})/([A-Za-z0-9_.-]{1,64})/([0-9]{1,19})")
+
+
+def peer_of(key: str) -> Peer:
+    """The process whose liveliness token stands under a key. Raises ProtocolError, and nothing else, on another
+    key: whoever reads tokens must not be ended by one."""
+    match = _TOKEN.fullmatch(key)
+    if match is None or int(match[3]) >= 1 << 62:
+        raise ProtocolError(f"{key[:200]} is no token: {ALIVE_KEY}, with an incarnation below 2^62")
+    return Peer(match[1], match[2], int(match[3]))

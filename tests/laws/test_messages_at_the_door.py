@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import random
+import time
 import tracemalloc
+import typing
+from typing import Any
 
 import msgpack
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,19 +21,20 @@ from support.wire_strategies import EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
 from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES, decode, encode
-from swarm.wire.fields import pack_column
+from swarm.wire.fields import Column, pack_column, taken_apart
 from swarm.wire.messages.base import Message, Nothing, schema_of
 from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.traffic import Standing, Table
 from swarm.wire.readable import decode_parameters, encode_readable
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.routes import Route, Routes, RouteStatus
 from swarm.wire.topics import TOPICS
 
 BY_TYPE = {type(example): example for example in EXAMPLES}
 TYPES = tuple(BY_TYPE)
+ROUTE_WITHOUT_END = {"status": "ok", "start": 4, "directions": b"", "cost_s": math.inf}
 
 
 def test_every_message_of_every_topic_has_an_example_and_a_strategy():
@@ -170,6 +176,8 @@ def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(j
         (MarkSet, {"kinds": b"\x00\x03"}, "kind 3 is not in 0..2"),
         (MarkSet, {"paces": pack_column([math.nan, 1], "<f4")}, "the pace of a PACE mark"),
         (MarkSet, {"paces": pack_column([0, 1], "<f4")}, "the pace of a PACE mark"),
+        (MarkSet, {"paces": pack_column([1e-9, 1], "<f4")}, "0.002941 ... 100 s/m"),
+        (MarkSet, {"paces": pack_column([101, 1], "<f4")}, "0.002941 ... 100 s/m"),
         (MarkSet, {"stamps_ns": pack_column([-1, 1], "<i8")}, "negative"),
         (MarkSet, {"author": "a/b"}, "author 'a/b' is not"),
         (MarkSet, {"seq": 1 << 62}, "seq"),
@@ -182,6 +190,12 @@ def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(j
         (Standing, {"vehicles": [["v", 1, 1, [1], [], [2] * 9, 9, 0]]}, "length <= 8"),
         (RouteRequest, {"cells": [1 << 40]}, "cells"),
         (RouteRequest, {"cells": [1], "vehicles": ["a", "b"]}, "2 vehicles for 1 cells"),
+        (RouteRequest, {"cells": [1] * 1001, "vehicles": ["a"] * 1001}, "length <= 1000"),
+        *(
+            (RouteRequest, {"cells": [1], "vehicles": [bad]}, "vehicles")
+            for bad in ("", "a/b", "x*", "v 1", "ü" * 300)
+        ),
+        (PushedRoute, {"route": ROUTE_WITHOUT_END}, "whose status is ok"),
         (RouteRequest, {"row": 3, "col": None}, "both row and col"),
         (CostReply, {"cost_to_go_s": b"123"}, "float32"),
         (CostReply, {"cost_to_go_s": pack_column([math.nan], "<f4")}, "NaN"),
@@ -193,6 +207,60 @@ def test_what_parses_but_cannot_be_is_refused_in_words(kind, change, complaint):
     fields = msgpack.unpackb(encode(BY_TYPE[kind]), strict_map_key=False)
     with pytest.raises(ProtocolError, match=complaint.replace("(", r"\(")):
         decode(msgpack.packb(fields | change), kind)
+
+
+def columns_of(kind: type[Any]) -> dict[str, Column]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    notes = {name: taken_apart(hint)[1] for name, hint in hints.items()}
+    return {name: note for name, each in notes.items() for note in each if isinstance(note, Column)}
+
+
+def beyond(rule: Column) -> list[Any]:
+    """Values of the column's dtype which are just outside its bounds."""
+    dtype = np.dtype(rule.dtype)
+    if dtype.kind == "f":
+        limits = [(rule.least, -np.inf), (rule.most, np.inf)]
+        return [math.nan, *(np.nextafter(dtype.type(at), dtype.type(to)) for at, to in limits if at != to)]
+    if rule.least is None or rule.most is None:
+        return []
+    return [each for each in (rule.least - 1, rule.most + 1) if np.iinfo(dtype).min <= each <= np.iinfo(dtype).max]
+
+
+COLUMNS = [(kind, name) for kind in (*TYPES, Routes) for name in columns_of(kind)]
+
+
+@pytest.mark.parametrize(("kind", "name"), COLUMNS, ids=lambda part: getattr(part, "__name__", part))
+def test_a_column_of_another_length_or_beyond_its_bounds_is_refused(kind, name):
+    """Whether its type checks it or, as for the statements of marks, other code does."""
+    message, rule = BY_TYPE[RouteReply if kind is Routes else kind], columns_of(kind)[name]
+    honest, dtype = getattr(message.routes if kind is Routes else message, name), np.dtype(rule.dtype)
+    honest = honest or bytes(dtype.itemsize)
+    wrong = [honest[:-1]] if dtype.itemsize > 1 or rule.per else []
+    for value in beyond(rule):
+        values = np.frombuffer(honest, dtype).copy()
+        values[0] = value
+        wrong.append(values.tobytes())
+    fields = msgpack.unpackb(encode(message), strict_map_key=False)
+    for bad in wrong:
+        changed = {"routes": fields["routes"] | {name: bad}} if kind is Routes else {name: bad}
+        with pytest.raises(ProtocolError):
+            decode(msgpack.packb(fields | changed), type(message))
+
+
+def test_no_parameters_of_a_person_raise_anything_but_a_protocol_error():
+    odd = ("1", "-1", "1e400", "nan", "9" * 30, "9" * 5000, "", "true", "[1,2]", "null", "\0", "a", "\u0663" * 3)
+    for kind in (RouteRequest, CostRequest, Nothing):
+        for name in (*kind.__struct_fields__, "format", "other"):
+            for value in odd:
+                with contextlib.suppress(ProtocolError):
+                    decode_parameters({name: value, "col": value}, kind)
+
+
+def test_a_payload_of_nested_lists_costs_little_to_refuse():
+    nested = b"\x82\xa6schema\xa1x\xa5cells" + b"\xdd\x00\x04\x00\x00" * 1000 + bytes(1 << 18)
+    began_s = time.process_time()
+    assert not _attempt(nested, RouteRequest)
+    assert time.process_time() - began_s < 1
 
 
 def test_a_route_leaves_the_eight_directions_never():

@@ -1,4 +1,4 @@
-"""Whatever passes the door, no service raises on, in any state; when the lies stop, each does its work again."""
+"""Whatever passes the door, no service raises on, in any state; after the lies each does its work again."""
 
 from __future__ import annotations
 
@@ -148,17 +148,16 @@ def test_no_field_of_any_message_is_without_bounds() -> None:
 
 
 @pytest.mark.parametrize("state", STATES)
-@pytest.mark.parametrize("seed", range(2))
-def test_no_service_raises_on_what_passes_the_door_in_any_state(state: str, seed: int) -> None:
-    swarm = lied_to(state, seed, 30)
-    assert swarm.liar.told > 800
+def test_no_service_raises_on_what_passes_the_door_in_any_state(state: str) -> None:
+    swarm = lied_to(state, 1, 20)
+    assert swarm.liar.told > 500
     swarm.run(3)
     swarm.close()
 
 
 @pytest.mark.parametrize("state", [state for state in STATES if state != "without target"])
 def test_after_the_lies_each_service_does_its_work_again(state: str) -> None:
-    swarm = lied_to(state, 7, 30, besides=RIGHT_OF_WAY)
+    swarm = lied_to(state, 7, 16, besides=RIGHT_OF_WAY)
     swarm.run(8)
     [targets] = [each for name, each in swarm.services.items() if name == "targets-0"]
     truth = targets._world._targets["t0"].walker.cell

@@ -344,6 +344,28 @@ def test_a_revoked_name_is_admitted_again_with_its_next_certificate(routed: Stag
     }
 
 
+def test_outside_of_the_namespace_nobody_may_do_anything(stage: Stage) -> None:
+    endpoint = f"tls/localhost:{free_ports(1)[0]}"
+    router = stage.open("router.0", "router", listen=(endpoint,))
+    inside: list[str] = []
+    outside: list[str] = []
+    router.declare_subscriber("**", lambda sample: inside.append(str(sample.key_expr)))
+    router.declare_queryable("**", reply)
+    for role in ROLES:
+        tried = stage.open(NAMES[role], connect=(endpoint,))
+        tried.declare_subscriber("**", lambda sample: outside.append(str(sample.key_expr)))
+        for key in ("other/run/agent/a0", f"@/{router.zid()}/router/config/access_control/enabled"):
+            tried.put(key, b"false")
+            assert replies(tried, key) == set(), role
+        answered = replies(tried, "**") | replies(tried, "@/**")
+        assert {key for key in answered if not key.startswith(f"@/{tried.zid()}/")} == set(), role  # but its own
+        router.put("other/x", b"x")
+        time.sleep(SETTLE_S)
+        tried.close()
+    assert inside == ["other/x"] * len(ROLES)
+    assert set(outside) == {"other/run/agent/a0"}  # what it put itself, which passes no link
+
+
 def test_two_routers_pass_on_what_is_allowed_and_each_keeps_out_what_is_not(stage: Stage, routed: Stage) -> None:
     endpoint = f"tls/localhost:{free_ports(1)[0]}"
     far = {"listen": (endpoint,), "connect": (endpoint,)}

@@ -53,7 +53,7 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
     hands.network = load_scenario(here).network
     endpoint = hands.network.connect[0]
 
-    hands.start("router", str(here), "--run-id", "far")
+    hands.start("router", str(here))
     eventually(lambda: swarm("status", "--connect", endpoint).returncode == 0, 30, "the router")
     impatient = there.with_name("impatient.toml")
     impatient.write_text(there.read_text().replace("[network]", "[network]\nconnect_timeout_s = 2"))
@@ -64,8 +64,9 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
         "namespace swarm answered; start one where the file is"
     )
 
-    hands.start("keeper", str(here))
-    hands.start("targets", str(here))
+    # A router belongs to no run: what starts beside it says which run it is.
+    for role in ("keeper", "targets"):
+        hands.start(role, str(here), "--run-id", "far")
     eventually(lambda: len(hands.members()) == 3, 60, "those with the file")
     elsewhere = hands.folder / "elsewhere"  # another machine keeps its runs elsewhere
     for role in (("planner", "--target", "t0"), ("agent", "--id", "a0")):
@@ -94,16 +95,16 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
 def test_several_keepers_by_name_agree_and_the_second_outlives_the_first(hands: Hands) -> None:
     scenario = str(hands.path)
     endpoint = hands.network.connect[0]
-    hands.start("router", scenario, "--run-id", "two")
+    hands.start("router", scenario)
     eventually(lambda: swarm("status", "--connect", endpoint).returncode == 0, 30, "the router")
-    first = hands.start("keeper", scenario)
+    first = hands.start("keeper", scenario, "--run-id", "two")
     for role in (
         ("targets",),
         ("planner", "--target", "t0"),
         ("planner", "--target", "t1"),
         ("agent", "--id", "a0"),
     ):
-        hands.start(role[0], scenario, *role[1:])
+        hands.start(role[0], scenario, "--run-id", "two", *role[1:])
 
     def sets(store: str) -> dict[str, int]:
         path = hands.folder / "runs" / "two" / store

@@ -187,12 +187,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     KnownRequest: st.builds(KnownRequest, agent=ids, disk=naturals),
     Known: st.builds(Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(naturals, max_size=3)),
     Followed: st.builds(
-        Followed,
-        vehicle=ids,
-        target=ids,
-        start=cells,
-        directions=directions,
-        cost_s=finite_costs,
+        Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite_costs,
         lower_bound_s=finite_costs,
     ),
     TargetPose: st.builds(

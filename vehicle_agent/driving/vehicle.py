@@ -104,7 +104,7 @@ class Vehicle:
         self._need: Reason | None = None
         """Why it needs a route; None if it needs none."""
         self._retry_ns = _RETRY_NS
-        """Doubles with each request that nobody answers, until a route comes."""
+        """Doubles with each unanswered request, until a route comes."""
         self._ask_due_ns = 0
 
     @property

@@ -52,9 +52,9 @@ def maze(size: int, rng: np.random.Generator, corridor: int = 3) -> Pace:
     pitch = corridor + 1
     many = max(1, (size - 1) // pitch)
     passable = np.zeros((size, size), bool)
-    rooms = np.arange(many) * pitch + 1
-    for top in rooms:
-        for left in rooms:
+    corners = np.arange(many) * pitch + 1
+    for top in corners:
+        for left in corners:
             passable[top : top + corridor, left : left + corridor] = True
     seen = np.zeros((many, many), bool)
     seen[0, 0] = True

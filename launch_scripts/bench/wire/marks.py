@@ -85,7 +85,7 @@ def latency(far: Far, marks: int) -> dict[str, float]:
     return rounded(figures) | ratios(figures, "p50", "p99")
 
 
-def flood(far: Far, sets: int, rounds: int) -> dict[str, float]:
+def throughput(far: Far, sets: int, rounds: int) -> dict[str, float]:
     """Sets of some 200 bytes per second, put as fast as possible: raw into a FIFO, ours into a replica and its
     cost map, in turn. Time counts from the first put to the last arrival."""
     tiles = GRID.tiles
@@ -97,8 +97,8 @@ def flood(far: Far, sets: int, rounds: int) -> dict[str, float]:
         _settle(bus, peer)
         for nth in range(rounds):
             numbers = range(nth * sets, (nth + 1) * sets)
-            payloads = [encode(some_set(n % tiles, n // tiles, 8, "flood.1")) for n in numbers]
-            keys = [map_key(n % tiles, "flood.1") for n in numbers]
+            payloads = [encode(some_set(n % tiles, n // tiles, 8, "writer.1")) for n in numbers]
+            keys = [map_key(n % tiles, "writer.1") for n in numbers]
             for name, root in (("raw", RAW), ("ours", NAMESPACE)):
                 whole = [f"{root}/{key}" for key in keys]
                 asked(peer, "applied")

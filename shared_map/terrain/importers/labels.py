@@ -42,7 +42,7 @@ class _File(Section, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """classes uint8, UNKNOWN where nobody has looked; groups int32, number of polygon or point, -1 elsewhere."""
+    """classes uint8, UNKNOWN where there is no label; groups int32, number of polygon or point, -1 elsewhere."""
 
     classes: Bytes
     groups: NDArray[np.int32]

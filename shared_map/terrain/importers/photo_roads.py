@@ -40,7 +40,7 @@ Shorts = NDArray[np.int16]
 def line_strength(rgb: Bytes) -> Bytes:
     """uint8 (rows, cols), in tenths of a grey level: the strength of a line whose crest is at that cell, else 0.
 
-    The outer `REACH` rows are those of somebody who sees no farther."""
+    The outer `REACH` rows are found from less of the photo."""
     from scipy import ndimage
 
     # A road is bright in red, unlike forest and meadow, and in blue, unlike bare soil.

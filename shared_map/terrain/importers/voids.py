@@ -8,7 +8,7 @@ from shared_map.arrays import Floats
 from shared_map.terrain.row_bands import bands
 
 HIGHEST_M = 20_000.0
-"""Heights beyond this, up or down, are somebody's undeclared voids."""
+"""Heights beyond this, up or down, are undeclared voids."""
 _SEARCH_CELLS = 64
 
 

@@ -61,8 +61,8 @@ def landscape(
 
 
 def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
-    """Plausible classes where nobody has looked: rock on what is steep, forest on slopes, grass between, bare soil
-    here and there."""
+    """Plausible classes without a photo: rock on what is steep, forest on slopes, grass between, bare soil here and
+    there."""
     rows, cols = elevation_m.shape
     rng = np.random.default_rng([seed, 2])
     east, north = gradient(elevation_m, resolution_m)

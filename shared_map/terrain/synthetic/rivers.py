@@ -52,7 +52,7 @@ def _courses(elevation_m: Floats, count: int, rng: np.random.Generator) -> list[
     courses = []
     for number in range(count):
         upright = number % 2 == 0
-        # Away from the borders that it runs along, or the way of least resistance is just outside the picture.
+        # A penalty near the borders that it runs along: rivers would follow the border otherwise.
         off = np.linspace(-1.0, 1.0, cols)[None, :] if upright else np.linspace(-1.0, 1.0, rows)[:, None]
         search = MCP_Geometric(price + 12.0 * off**4, fully_connected=True)
         begin = _lowest(coarse[0], rng) if upright else _lowest(coarse[:, 0], rng)

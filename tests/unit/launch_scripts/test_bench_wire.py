@@ -15,11 +15,11 @@ pytestmark = pytest.mark.network
 
 def test_the_wire_is_measured_beside_raw_zenoh_and_nothing_is_left_running() -> None:
     small = ["--marks", "20", "--sets", "500", "--rounds", "1", "--joins", "1", "--seconds", "1"]
-    ran = CliRunner().invoke(app, ["wire", "--parts", "latency,flood,join", *small, "--json"])
+    ran = CliRunner().invoke(app, ["wire", "--parts", "latency,throughput,join", *small, "--json"])
     assert ran.exit_code == 0, ran.output
     report = json.loads(ran.stdout)
     assert report["latency"]["lost"] == 0
-    assert report["flood"]["superseded_or_lost"] == 0
+    assert report["throughput"]["superseded_or_lost"] == 0
     assert report["join"]["sets"] == 4000
     assert [row["what"].partition(", p")[0] for row in report["rows"]] == [
         "mark put -> applied elsewhere",
@@ -33,7 +33,7 @@ def test_the_wire_is_measured_beside_raw_zenoh_and_nothing_is_left_running() -> 
 def test_a_part_that_there_is_not_is_named() -> None:
     ran = CliRunner().invoke(app, ["wire", "--parts", "latency,speed"])
     assert ran.exit_code != 0
-    assert "'speed' is not one of latency, flood" in str(ran.exception)
+    assert "'speed' is not one of latency, throughput" in str(ran.exception)
 
 
 def test_the_codec_is_measured_beside_msgspec_alone_and_hostile_payloads_take_bounded_memory(

@@ -42,10 +42,10 @@ def test_every_page_is_built_and_in_the_navigation(site):
 
 
 def test_a_page_of_the_python_api_stands_for_every_room(site):
-    from launch_scripts.reference.site import rooms
+    from launch_scripts.reference.site import packages
 
-    for room, modules in rooms().items():
-        page = (site / "reference" / "api" / f"{room}.html").read_text(encoding="utf-8")
+    for package, modules in packages().items():
+        page = (site / "reference" / "api" / f"{package}.html").read_text(encoding="utf-8")
         for module in modules:
             assert f'id="{module}"' in page
 

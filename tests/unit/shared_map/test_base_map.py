@@ -82,8 +82,8 @@ def test_a_piece_takes_two_thirds_of_its_bytes_or_less() -> None:
         ({"data": zlib.compress(bytes(1 << 28))}, "has more than 262144 bytes, expected 262144"),
         ({"data": zlib.compress(bytes(262144))}, "is not as its digest says"),
         ({"data": pack(TERRAIN, "ground", 0).data[:-9]}, "expected 262144"),
-        ({"region": 6}, "nobody asked for layer 'ground', region 6"),
-        ({"layer": "gold"}, "nobody asked for layer 'gold', region 0"),
+        ({"region": 6}, "unrequested: layer 'ground', region 6"),
+        ({"layer": "gold"}, "unrequested: layer 'gold', region 0"),
         ({"region": 1}, "expected|digest"),
     ],
 )

@@ -104,7 +104,7 @@ def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up()
     assert listener.sync.throttled == ["loud.1"]
     assert "calm.1" in listener.replica.held.ledger.held()
     assert keeper.counters.gauges[THROTTLED + "loud.1"] == 1
-    assert notes == ["author loud.1 marks more than its share: it is heard with delay"]
+    assert notes == ["author loud.1 exceeds its quota; its marks are delayed"]
     swarm.run(400)
     assert listener.sync.throttled == []
     assert THROTTLED + "loud.1" not in keeper.counters.gauges

@@ -88,3 +88,21 @@ def test_after_a_silence_a_sender_that_goes_on_is_followed_whatever_was_heard_be
     heard = [newest.is_news("t", (1, seq), seq * step_ns) for seq in range(1, 15)]
     assert heard[-1]
     assert heard == sorted(heard), "once it is followed it stays so"
+
+
+def test_no_single_message_outweighs_those_that_follow_for_longer_than_the_silence() -> None:
+    newest = Newest()
+    assert newest.is_news("t0", (7, 1), 0)
+    assert not newest.is_news("t0", (7, 1), 1)
+    assert newest.is_news("t0", (1 << 61, 5), 2)
+    assert not newest.is_news("t0", (7, 2), 1 + SILENCE_NS)
+    assert newest.is_news("t1", (7, 2), 3)
+    assert newest.is_news("t0", (7, 3), 2 + SILENCE_NS)
+    assert not newest.is_news("t0", (7, 2), 3 + SILENCE_NS)
+    assert newest.is_news("t0", (7, 4), 4 + SILENCE_NS)
+
+
+def test_streams_beyond_the_most_are_always_news_and_take_no_memory() -> None:
+    newest = Newest(most=1)
+    assert newest.is_news("a", (1, 1), 0)
+    assert all(newest.is_news("b", (1, 1), 0) for _ in range(3))

@@ -1,0 +1,37 @@
+"""A whole swarm whose files cannot grow: it goes on, says what is missing, and prints its figures."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+from pathlib import Path
+
+import pytest
+from support.live_swarm import SWARM, write_scenario
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+LONGEST = 300_000
+"""Bytes of a file: the terrain's are shorter, the recording and the report's picture are not."""
+
+
+def test_where_nothing_more_can_be_written_the_swarm_goes_on_and_says_so(tmp_path: Path) -> None:
+    def limit() -> None:
+        _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (LONGEST, hard))
+
+    command = [*SWARM, "up", str(write_scenario(tmp_path)), "--runs", str(tmp_path / "runs")]
+    told = subprocess.run(
+        [*command, "--plain", "--seconds", "15"],
+        capture_output=True, text=True, timeout=150, check=False, preexec_fn=limit,
+    )  # fmt: skip
+    (run_dir,) = (tmp_path / "runs").iterdir()
+    assert told.returncode == 6, told.stdout + told.stderr
+    assert told.stderr == ""
+    assert "8/8 processes, 0 restarts" in told.stdout
+    recording = run_dir / "run.rrd"
+    assert f"monitor-0: the recording {recording} has ended: File too large" in told.stdout
+    lines = [" ".join(line.split()) for line in told.stdout.splitlines()]
+    assert "vehicles that had a route 12" in lines
+    assert "restarts 0" in lines
+    assert lines[-1] == f"cannot write {run_dir / 'report.png'}: File too large"

@@ -1,0 +1,110 @@
+"""`swarm deploy`: a certificate for each process of a scenario, a configuration for zenohd, faults told."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.x509.oid import NameOID
+from typer.testing import CliRunner, Result
+
+from launch_scripts.commands.deploy import app
+from launch_scripts.launcher.options import as_process, tls_of
+from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
+from swarm.config.load import load_scenario
+from swarm.errors import ConfigError
+
+SCENARIO = """
+[terrain]
+source = "synthetic"
+
+[[targets]]
+count = 2
+
+[[groups]]
+vehicles = 30
+
+[network]
+admit = ["operator.anna"]
+"""
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "my.toml"
+    path.write_text(SCENARIO)
+    return path
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def common_name(certs: Path, name: str) -> object:
+    made = x509.load_pem_x509_certificate((certs / f"{name}.pem").read_bytes())
+    return made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
+
+
+def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_path: Path, scenario: Path) -> None:
+    certs = tmp_path / "certs"
+    assert run("certs", certs, "--scenario", scenario, "router.0=10.0.0.1").exit_code == 0
+    loaded = load_scenario(scenario)
+    names = certificate_names(loaded)
+    assert {path.stem for path in certs.glob("*.pem")} == {"ca", *names}
+    assert {common_name(certs, name) for name in names} == set(names)
+    router = x509.load_pem_x509_certificate((certs / "router.0.pem").read_bytes())
+    hosts = router.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert [str(host.value) for host in hosts] == ["10.0.0.1", "localhost", "127.0.0.1"]
+    files = tls_of(str(certs / "ca.pem"), str(certs), str(certs))
+    assert files is not None
+    scenario.write_text(
+        scenario.read_text() + f'tls = {{ca = "{files.ca}", certificate = "certs", key = "certs"}}\n'
+    )
+    loaded = load_scenario(scenario)
+    for spec in processes_of(loaded):
+        own = as_process(loaded, spec.role, spec.id).network.tls
+        assert own is not None
+        assert common_name(certs, Path(own.certificate).stem) in names
+        assert Path(own.key) == Path(own.certificate).with_suffix(".key")
+    assert as_process(loaded, LAUNCHER, "0").network.tls != as_process(loaded, "keeper", "0").network.tls
+    with pytest.raises(ConfigError, match=r"certs/keeper.west.pem, which keeper.west needs"):
+        as_process(loaded, "keeper", "west")
+
+
+def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(tmp_path: Path, scenario: Path) -> None:
+    certs, revoked = tmp_path / "certs", "agent.all.a0"
+    run("certs", certs, "--scenario", scenario)
+    before = {path: path.read_bytes() for path in certs.iterdir()}
+    assert run("certs", certs, "--scenario", scenario).exit_code == 0
+    assert {path: path.read_bytes() for path in certs.iterdir()} == before
+    scenario.write_text(scenario.read_text() + f'revoked = ["{revoked}"]\n')
+    assert run("certs", certs, revoked, "--renew", "--scenario", scenario).exit_code == 0
+    assert common_name(certs, revoked) == f"{revoked}~2"
+    changed = {path.stem for path, was in before.items() if path.read_bytes() != was}
+    assert changed == {revoked}
+
+
+def test_a_name_that_the_router_would_not_know_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    told = run("certs", tmp_path / "certs", "keeper.0", "car1")
+    assert isinstance(told.exception, ConfigError)
+    assert "'car1' is no name of a process: ROLE.ID or agent.GROUP.ID" in str(told.exception)
+    assert not (tmp_path / "certs").exists()
+
+
+def test_zenohd_admits_the_processes_of_a_scenario_and_needs_one_with_certificates(
+    tmp_path: Path, scenario: Path
+) -> None:
+    certs, out = tmp_path / "certs", tmp_path / "zenohd.json5"
+    run("certs", certs, "--scenario", scenario)
+    files = ("--tls-ca", certs / "ca.pem", "--tls-cert", certs, "--tls-key", certs)
+    told = run("zenohd", out, "--listen", "tls/0.0.0.0:7447", *files)
+    assert isinstance(told.exception, ConfigError)
+    assert run("zenohd", out, "--listen", "tls/0.0.0.0:7447", *files, "--scenario", scenario).exit_code == 0
+    config = json.loads(out.read_text())
+    named = {name for each in config["access_control"]["subjects"] for name in each.get("cert_common_names", ())}
+    assert named == set(certificate_names(load_scenario(scenario)))
+    assert config["transport"]["link"]["tls"]["listen_certificate"] == str(certs / "router.0.pem")
+    assert run("zenohd", out, "--listen", "tcp/127.0.0.1:7447").exit_code == 0
+    assert "access_control" not in json.loads(out.read_text())

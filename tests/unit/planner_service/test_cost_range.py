@@ -1,0 +1,52 @@
+"""The lowest and highest cell cost: an extreme cell that is another now leaves no trace."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from planner_service.target_tree import TargetTree
+from planner_service.tree.cost_grid import CostGrid
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec, Window
+from swarm.wire.statements import PACE_LEAST
+
+GRID = GridSpec(256, 256, 10.0)
+
+
+def hills() -> np.ndarray:
+    return np.random.default_rng(1).uniform(0.05, 0.6, (GRID.rows, GRID.cols)).astype(np.float32)
+
+
+def test_the_range_of_cell_costs_is_that_of_the_map_after_any_changes() -> None:
+    chance = np.random.default_rng(2)
+    grid, pace = CostGrid(GRID, PlannerConfig()), hills()
+    grid.load(pace)
+    for _ in range(200):
+        row, col = chance.integers(0, 250, 2).tolist()
+        pace[row : row + 3, col : col + 3] = chance.choice([PACE_LEAST, 0.01, 0.3, 50.0, 100.0, np.inf])
+        if chance.random() < 0.5:  # the extreme itself goes
+            where = np.unravel_index(np.argmin(pace), pace.shape)
+            pace[where] = 0.4
+        grid.apply(pace, [GRID.window])
+        finite = pace[np.isfinite(pace)] * np.float32(10)
+        assert (grid.lowest_cell_cost, grid.highest_cell_cost) == (float(finite.min()), float(finite.max()))
+
+
+@pytest.mark.parametrize("strategy", ["rotation", "variable_range", "auto"])
+@pytest.mark.parametrize("wrong", [1e-9, PACE_LEAST])
+def test_one_wrong_mark_costs_windows_only_while_it_stands(strategy: str, wrong: float) -> None:
+    config = PlannerConfig(strategy=strategy, full_every=1000, k_min=1)  # type: ignore[arg-type]
+    kinds = []
+    for marked in (False, True):
+        tree, pace = TargetTree(GRID, config), hills()
+        tree.update(pace, GRID.cell(120, 120), [], 0)
+        was = float(pace[20, 20])
+        pace[20, 20] = wrong if marked else was
+        tree.update(pace, GRID.cell(120, 120), [Window(20, 20, 21, 21)], 1)
+        pace[20, 20] = was
+        tree.update(pace, GRID.cell(120, 121), [Window(20, 20, 21, 21)], 2)
+        kinds.append([tree.update(pace, GRID.cell(120, 122 + n), [], 3 + n).kind for n in range(5)])
+        assert all(route.gap < 1.5 for route in tree.routes([GRID.cell(5, 5), GRID.cell(250, 9)]))
+    assert kinds[0] == kinds[1]
+    assert strategy == "auto" or set(kinds[0]) == {"window"}
