@@ -162,7 +162,7 @@ class Holdings:
         for vehicle in self._vehicles:
             grant = table.grants.get(vehicle)
             seen = view.seen.pop(vehicle, [])
-            if grant is None:
+            if grant is None or any(self._plots.of(cell) != table.plot for cell in grant.cells):
                 continue
             view.seen[vehicle] = grant.cells
             if vehicle in self._paths:

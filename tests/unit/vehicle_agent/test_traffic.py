@@ -1,0 +1,203 @@
+"""The parts of right of way, one by one: plots, planning, wardens, members, what hosts hold and ask for."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.wire.messages.traffic import Grant, Stand, Standing, Stored, Table
+from vehicle_agent.traffic.holdings import Holdings, Wish
+from vehicle_agent.traffic.member import Member, Refused, Save
+from vehicle_agent.traffic.pibt import Mover, Round
+from vehicle_agent.traffic.plots import Plots
+from vehicle_agent.traffic.warden import Warden, first_life, is_far_ahead
+
+GRID = GridSpec(8, 8, 1.0)
+AGENTS = [f"a{n}" for n in range(5)]
+PLOTS = Plots(GRID, AGENTS)
+MEMBERS = PLOTS.members(0)
+S = NS_PER_S
+
+
+def table_of(epoch: int, seq: int, **grants: list[int]) -> Table:
+    """Vehicles are named by their host: a0=[5] is the vehicle a0-00 on cell 5."""
+    held = {f"{host}-00": Grant(cells, (epoch, seq)) for host, cells in grants.items()}
+    hosts = dict.fromkeys(grants, (1, seq))
+    return Table(plot=0, agent=PLOTS.warden(0, epoch), epoch=epoch, seq=seq, hosts=hosts, grants=held)
+
+
+def standing(host: str, cells: list[int], seq: int, knows: tuple[int, int] = (0, 0), **more: object) -> Standing:
+    stand = Stand(f"{host}-00", cells[0], cells[-1], cells, [], [], 0, 0)
+    fields = {"life": 1, "vehicles": [stand], **more}
+    return Standing(plot=0, agent=host, seq=seq, knows=knows, **fields)  # type: ignore[arg-type]
+
+
+# --- plots --------------------------------------------------------------------------------------------------
+
+
+def test_members_are_the_same_in_every_process_and_spread_over_the_agents() -> None:
+    grid = GridSpec(1000, 1000, 1.0)
+    plots, others = Plots(grid, AGENTS), Plots(grid, AGENTS[::-1])
+    counts = dict.fromkeys(AGENTS, 0)
+    for plot in range(plots.count):
+        assert plots.members(plot) == others.members(plot)
+        assert len(set(plots.members(plot))) == 3
+        for member in plots.members(plot):
+            counts[member] += 1
+    assert min(counts.values()) > plots.count // 3
+    assert Plots(grid, ["a0", "a1"]).members(7) in (("a0",), ("a1",))
+    assert plots.of(-1) == plots.of(grid.cells) == -1
+
+
+# --- planning -----------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10_000), st.integers(1, 30))
+def test_a_round_of_planning_sends_no_two_to_one_cell_and_lets_the_oldest_through(seed: int, count: int) -> None:
+    chance = random.Random(seed)
+    cells = chance.sample(range(GRID.cells), count)
+    movers = []
+    for n, cell in enumerate(cells):
+        near = [other for _, other in GRID.neighbours(cell)]
+        chance.shuffle(near)
+        movers.append(Mover(f"v{n}", cell, near, chance.randint(0, len(near)), age=count - n))
+    round = Round(movers, closed=set(), inside=lambda cell: True)
+    for mover in movers:
+        round.plan(mover)
+    assert len(set(round.to.values())) == count
+    at = {mover.cell: mover.id for mover in movers}
+    for mover in movers:
+        to = round.to[mover.id]
+        assert to == mover.cell or to in mover.wants
+        if to != mover.cell and to in at:
+            assert round.to[at[to]] != mover.cell  # nobody exchanges places
+    # Where there is a cell free somewhere, the oldest gets its first wish: all others can be pushed along.
+    if movers[0].better and count < GRID.cells // 2:
+        assert round.to["v0"] == movers[0].wants[0]
+
+
+# --- the warden ---------------------------------------------------------------------------------------------
+
+
+def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:
+    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10, 11]), {"a1-00"})
+    assert warden.tick(0).grants["a1-00"].cells == [9, 10, 11]  # type: ignore[union-attr]
+    warden.hear(standing("a1", [10, 11], seq=2), 0)
+    assert warden.tick(S).grants["a1-00"].cells == [10, 11]  # type: ignore[union-attr]
+    warden.hear(standing("a1", [9, 10, 11], seq=1), 0)  # late
+    warden.hear(standing("a1", [10], seq=3, knows=(1, 0)), 0)  # of before the last grant
+    assert warden.tick(2 * S).grants["a1-00"].cells == [10, 11]  # type: ignore[union-attr]
+    warden.hear(standing("a1", [10], seq=4, knows=(1, 1)), 0)
+    assert warden.tick(3 * S).grants["a1-00"].cells == [10]  # type: ignore[union-attr]
+
+
+def test_what_an_older_life_may_stand_on_stays_shut_until_it_has_stopped_or_is_proved_dead() -> None:
+    for end in (standing("a1", [9], seq=9, ended=True), standing("a1", [9], seq=9, life=1 << 33, dead=[1])):
+        warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1-00"})
+        warden.hear(standing("a1", [9], seq=1, life=1 << 32, vehicles=[]), 0)
+        table = warden.tick(0)
+        assert table is not None
+        assert [(shut.agent, shut.life, shut.cells) for shut in table.shut] == [("a1", 1, [9, 10])]
+        assert table.grants["a1-00"].cells == [9, 10]
+        warden.hear(end, 0)
+        assert all(shut.life != 1 for shut in warden.tick(S).shut)  # type: ignore[union-attr]
+
+
+def test_a_life_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
+    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9]), {"a1-00"})
+    warden.hear(standing("a1", [9], seq=1, life=1 << 61), 0)
+    assert "a1 names a life" in warden.refused[0]
+    assert warden.tick(0).hosts["a1"] == (1, 1)  # type: ignore[union-attr]
+    assert first_life(5 << 32 | 7, 1) > 5 << 32 | 0xFFFF_FFFF
+    assert not is_far_ahead(first_life(0, 3), 0)
+
+
+# --- members ------------------------------------------------------------------------------------------------
+
+
+def member_of(promised: int = 0) -> Member:
+    return Member(PLOTS, MEMBERS[0], promised, table_of(0, 0), set(), 0)
+
+
+def test_after_a_promise_nothing_older_is_stored() -> None:
+    member = member_of()
+    save, stored = member.hear_table(table_of(1, 1), 0)
+    assert isinstance(save, Save)
+    assert stored == Stored(plot=0, agent=MEMBERS[0], epoch=1, seq=1)
+    assert member.hear_claim(5, S // 10) == []  # the warden was heard just now
+    assert isinstance(member.hear_claim(5, 2 * S)[0], Save)
+    assert member.hear_claim(5, 9 * S) == []
+    assert [type(action) for action in member.hear_table(table_of(1, 2), 2 * S)] == [Stored]
+    assert member.stored.stamp == (1, 1)
+    assert member.hear_table(table_of(5, 1), 2 * S)[-1] == Stored(plot=0, agent=MEMBERS[0], epoch=5, seq=1)
+
+
+def test_an_epoch_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
+    member = member_of()
+    assert isinstance(member.hear_claim(1 << 60, S)[0], Refused)
+    far = next(epoch for epoch in range(1 << 60, (1 << 60) + 3) if PLOTS.warden(0, epoch) != MEMBERS[0])
+    assert isinstance(member.hear_table(table_of(far, 1), S)[0], Refused)
+    assert member.promised == 0
+
+
+# --- what a host holds --------------------------------------------------------------------------------------
+
+
+def holdings_of() -> Holdings:
+    holdings = Holdings(PLOTS, "a0", ["a0-00"])
+    holdings.begin(1, [])
+    holdings.watch([0])
+    return holdings
+
+
+def hear(holdings: Holdings, table: Table) -> None:
+    holdings.hear_table(table, lambda vehicle, cells: cells[0])
+    other = next(member for member in MEMBERS if member != table.agent)
+    stored = Stored(plot=0, agent=other, epoch=table.epoch, seq=table.seq)
+    holdings.hear_stored(stored, lambda vehicle, cells: cells[0])
+
+
+def test_a_table_counts_once_two_of_three_members_have_stored_it() -> None:
+    holdings = holdings_of()
+    holdings.hear_table(table_of(1, 1, a0=[9]), lambda vehicle, cells: cells[0])
+    assert list(holdings.path("a0-00")) == []
+    hear(holdings, table_of(1, 1, a0=[9]))
+    assert list(holdings.path("a0-00")) == [9]
+    hear(holdings, table_of(1, 2, a0=[9, 10, 20]))
+    assert list(holdings.path("a0-00")) == [9, 10]  # 20 does not follow
+
+
+def test_a_cell_given_back_is_not_asked_for_before_the_table_shows_that_it_is_free() -> None:
+    holdings = holdings_of()
+    hear(holdings, table_of(1, 1, a0=[9]))
+    hear(holdings, table_of(1, 2, a0=[9, 10, 11]))
+    holdings.give_back("a0-00")
+    wishes = {"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}
+    (said,) = holdings.standings(wishes)
+    assert (said.vehicles[0].holds, said.vehicles[0].ahead, said.vehicles[0].wants) == ([9], [], [17, 1])
+    hear(holdings, table_of(1, 3, a0=[9]))
+    (said,) = holdings.standings(wishes)
+    assert (said.vehicles[0].ahead, said.vehicles[0].wants) == ([10, 11], [10, 17, 1])
+
+
+def test_the_older_of_two_lives_learns_that_it_is_replaced() -> None:
+    holdings = holdings_of()
+    table = table_of(1, 1, a0=[9])
+    table.hosts["a0"] = (2, 1)
+    hear(holdings, table)
+    assert holdings.replaced
+    assert list(holdings.path("a0-00")) == []
+    assert all(said.ended for said in holdings.standings({}))
+
+
+@pytest.mark.parametrize("lie", [[0, -8], [-8], [56, 64], [1 << 31]])
+def test_cells_from_nowhere_are_not_driven_to(lie: list[int]) -> None:
+    holdings = holdings_of()
+    hear(holdings, table_of(1, 1, a0=lie))
+    hear(holdings, table_of(1, 2, a0=[*lie, -16]))
+    assert all(0 <= cell < GRID.cells for cell in holdings.path("a0-00"))
