@@ -170,11 +170,11 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     BaseMapTile: st.builds(BaseMapTile, layer=texts, region=regions, data=st.binary(max_size=50)),
     Fleet: fleets(),
     Standing: st.builds(
-        Standing, plot=naturals, agent=ids, life=naturals, seq=naturals, knows=stamps,
+        Standing, plot=plots, agent=ids, life=naturals, seq=naturals, knows=stamps,
         vehicles=st.lists(stands, max_size=3), dead=st.lists(naturals, max_size=2), ended=st.booleans(),
     ),
     Table: st.builds(
-        Table, plot=naturals, agent=ids, epoch=naturals, seq=naturals,
+        Table, plot=plots, agent=ids, epoch=naturals, seq=naturals,
         hosts=st.dictionaries(ids, st.tuples(naturals, naturals), max_size=3),
         grants=st.dictionaries(
             ids, st.builds(Grant, cells=st.lists(cells, min_size=1, max_size=4), stamp=stamps), max_size=3
@@ -182,10 +182,10 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         shut=st.lists(st.builds(Shut, agent=ids, life=naturals, cells=few_cells), max_size=2),
         pushed=st.dictionaries(ids, milliseconds, max_size=2),
     ),
-    Stored: st.builds(Stored, plot=naturals, agent=ids, epoch=naturals, seq=naturals),
+    Stored: st.builds(Stored, plot=plots, agent=ids, epoch=naturals, seq=naturals),
     Claim: st.builds(Claim, epoch=naturals),
     KnownRequest: st.builds(KnownRequest, agent=ids, disk=naturals),
-    Known: st.builds(Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(naturals, max_size=3)),
+    Known: st.builds(Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(plots, max_size=3)),
     Followed: st.builds(
         Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite_costs,
         lower_bound_s=finite_costs,
