@@ -76,7 +76,7 @@ class Agent:
     into the map each time, and `decide`.
 
     plan       which vehicles, of which group
-    ground     the agent's map
+    local_map  the agent's map
     spawns     agent -> vehicle -> cell where the vehicles of the run first start
     presence   where all vehicles are; None to know of none but our own
     territory  which agents share plots with us; None if all do
@@ -86,7 +86,7 @@ class Agent:
         self,
         plan: AgentPlan,
         scenario: Scenario,
-        ground: LocalMap,
+        local_map: LocalMap,
         sensor: Sensor,
         spawns: Mapping[str, Mapping[str, int]],
         incarnation: int,
@@ -100,15 +100,15 @@ class Agent:
         self.blocked_ticks = 0
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
-        self._map = ground
+        self._map = local_map
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
-        presence = presence or Presence(ground.grid, 0, 1.0)
-        self._traffic = Traffic(ground.grid, ground.pace, self.rights, scenario, chance, presence)
+        presence = presence or Presence(local_map.grid, 0, 1.0)
+        self._traffic = Traffic(local_map.grid, local_map.pace, self.rights, scenario, chance, presence)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._newest_poses = Newest(silence_ns=POSE_SILENCE_NS)
-        self._unplaced = Unplaced(ground.grid, self.rights, self._traffic.closed)
+        self._unplaced = Unplaced(local_map.grid, self.rights, self._traffic.closed)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
