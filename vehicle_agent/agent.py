@@ -72,18 +72,18 @@ class Agent:
     Call `place` as soon as a vehicle's place is known. In each tick call `begin_drive`, `drive` until it returns
     None, writing what it found into the map each time, and `decide`.
 
-    plan      which vehicles, of which group
-    ground    the agent's map
-    holdings  the cells that the vehicles may stand on and enter
+    plan       which vehicles, of which group
+    local_map  the agent's map
+    holdings   the cells that the vehicles may stand on and enter
 
-    wishes    what to ask of wardens, as of the last `decide`
+    wishes     what to ask of wardens, as of the last `decide`
     """
 
     def __init__(
         self,
         plan: AgentPlan,
         scenario: Scenario,
-        ground: LocalMap,
+        local_map: LocalMap,
         sensor: Sensor,
         holdings: Holdings,
     ) -> None:
@@ -95,13 +95,12 @@ class Agent:
         self.blocked_ticks = 0
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
-        self._map = ground
+        self._map = local_map
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
-        self._steering = Steering(
-            ground.grid, ground.pace, scenario.planner, config.reserve_cells, chance, holdings.occupied
-        )
+        grid, pace = local_map.grid, local_map.pace
+        self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._newest_poses = Newest(silence_ns=POSE_SILENCE_NS)

@@ -6,17 +6,17 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn
 
-from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.scene import TerrainMesh
 
 BACKGROUND = (17, 22, 28)
 TRAIL_S = 25.0
 
 
-def make_blueprint(ground: Ground) -> rrb.Blueprint:
+def make_blueprint(mesh: TerrainMesh) -> rrb.Blueprint:
     """The 3D view on the left; figures, plots and the log on the right."""
     return rrb.Blueprint(
         rrb.Horizontal(
-            _view_3d(ground),
+            _view_3d(mesh),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/summary", name="Now"),
                 _plot("captures_and_marks", "Captures and marks"),
@@ -40,9 +40,9 @@ def make_blueprint(ground: Ground) -> rrb.Blueprint:
     )
 
 
-def _view_3d(ground: Ground) -> rrb.Spatial3DView:
-    middle = (ground.width_m / 2, -ground.depth_m / 2, float(ground.heights_m.mean()))
-    far = max(ground.width_m, ground.depth_m)
+def _view_3d(mesh: TerrainMesh) -> rrb.Spatial3DView:
+    middle = (mesh.width_m / 2, -mesh.depth_m / 2, float(mesh.heights_m.mean()))
+    far = max(mesh.width_m, mesh.depth_m)
     trail = rr.VisibleTimeRange(
         "sim_time",
         start=rr.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),

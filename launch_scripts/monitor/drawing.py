@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, Ground, MeshTile, Points
+from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, MeshTile, Points, TerrainMesh
 from launch_scripts.monitor.sinks import Streams
 from launch_scripts.report import palette
 from launch_scripts.report.recorder import Sample
@@ -35,9 +35,9 @@ _PLOT_COLOURS = [
 class Drawing:
     """Logs the scene to one recording stream."""
 
-    def __init__(self, rec: rr.RecordingStream | Streams, ground: Ground, target_ids: Sequence[str]) -> None:
+    def __init__(self, rec: rr.RecordingStream | Streams, mesh: TerrainMesh, target_ids: Sequence[str]) -> None:
         self._rec = rec
-        self._ground = ground
+        self._mesh = mesh
         self._target_ids = list(target_ids)
         self._vehicle_ids: list[str] = []
         self._vehicle_colours: Bytes = np.empty((0, 3), np.uint8)
@@ -50,9 +50,9 @@ class Drawing:
 
     def begin(self) -> None:
         """Logs what never changes: the terrain's mesh and the styles."""
-        rec, ground = self._rec, self._ground
+        rec, mesh = self._rec, self._mesh
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for tile in ground.mesh_tiles():
+        for tile in mesh.mesh_tiles():
             self._tile(tile)
         thin, line, thick = _screen_points(0.5), _screen_points(1.3), _screen_points(2.2)
         rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [_TRAIL_COLOUR], [line]), static=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.recording_watch import RecordingWatch
-from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.scene import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import load_terrain
@@ -25,13 +25,13 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Records and shows the run until SIGTERM, SIGINT or the end of the launcher."""
     config = setup.scenario.monitor
     terrain = load_terrain(setup)
-    ground = Ground(terrain)
+    mesh = TerrainMesh(terrain)
     path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
     inbox = Inbox()
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_bus(setup.scenario.network))
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
-        sinks = Sinks(recording_id, path, config, make_blueprint(ground))
+        sinks = Sinks(recording_id, path, config, make_blueprint(mesh))
         stack.callback(sinks.close)
         service = MonitorService(
             setup,
@@ -39,7 +39,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             bus,
             inbox.post,
             sinks.streams,
-            ground=ground,
+            mesh=mesh,
             live_url=sinks.live_url,
             recording=None if path is None else RecordingWatch(path, sinks.begin_file),
         )

@@ -70,7 +70,7 @@ class Points:
     colours: Bytes
 
 
-class Ground:
+class TerrainMesh:
     """The terrain as the view has it: of a large one, the finest level of its pyramid with at most `_MOST_TEXELS`.
 
     texel      cells of the terrain along one pixel of the photo
@@ -216,68 +216,68 @@ def _lit_photo(seen: Level) -> Bytes:
 # --- what moves -------------------------------------------------------------------------------------------------
 
 
-def vehicle_points(ground: Ground, vehicles: Mapping[str, VehicleNow]) -> Points:
+def vehicle_points(mesh: TerrainMesh, vehicles: Mapping[str, VehicleNow]) -> Points:
     """All vehicles, coloured by state."""
     now = list(vehicles.values())
-    positions = ground.place(
+    positions = mesh.place(
         np.array([vehicle.east_m for vehicle in now], np.float32),
         np.array([vehicle.south_m for vehicle in now], np.float32),
-        0.15 * ground.scale_m,
+        0.15 * mesh.scale_m,
     )
     colours = np.array([STATE_COLOURS[vehicle.state] for vehicle in now], np.uint8).reshape(-1, 3)
     return Points(list(vehicles), positions.reshape(-1, 3), colours)
 
 
-def target_points(ground: Ground, places_m: Mapping[str, tuple[float, float]]) -> Points:
+def target_points(mesh: TerrainMesh, places_m: Mapping[str, tuple[float, float]]) -> Points:
     """All targets, on top of poles that show over the hills."""
     east_south = np.array(list(places_m.values()), np.float32).reshape(-1, 2)
-    positions = ground.place(east_south[:, 0], east_south[:, 1], 2.2 * ground.scale_m)
+    positions = mesh.place(east_south[:, 0], east_south[:, 1], 2.2 * mesh.scale_m)
     return Points(list(places_m), positions, np.tile(np.array(TARGET_COLOUR, np.uint8), (len(positions), 1)))
 
 
-def sighting_points(ground: Ground, seen: Mapping[str, Sighted]) -> tuple[Points, Floats]:
+def sighting_points(mesh: TerrainMesh, seen: Mapping[str, Sighted]) -> tuple[Points, Floats]:
     """Where targets were seen last, and their uncertainty in metres, float32 (n,)."""
-    grid = ground.grid
+    grid = mesh.grid
     east_m = np.array([each.x_m - grid.west_m for each in seen.values()], np.float32)
     south_m = np.array([grid.north_m - each.y_m for each in seen.values()], np.float32)
-    positions = ground.place(east_m, south_m, 0.3 * ground.scale_m)
+    positions = mesh.place(east_m, south_m, 0.3 * mesh.scale_m)
     colours = np.tile(np.array(SIGHTED_COLOUR, np.uint8), (len(positions), 1))
     return Points(list(seen), positions, colours), np.array([s.uncertainty_m for s in seen.values()], np.float32)
 
 
-def label_places(ground: Ground, targets: Points) -> Floats:
+def label_places(mesh: TerrainMesh, targets: Points) -> Floats:
     """Places of the targets' names: above them."""
-    names: Floats = targets.positions + np.array([0, 0, 3.4 * ground.scale_m], np.float32)
+    names: Floats = targets.positions + np.array([0, 0, 3.4 * mesh.scale_m], np.float32)
     return names
 
 
-def poles(ground: Ground, targets: Points) -> list[Floats]:
+def poles(mesh: TerrainMesh, targets: Points) -> list[Floats]:
     """A line from each target down to the terrain."""
-    feet = ground.place(targets.positions[:, 0], -targets.positions[:, 1])
+    feet = mesh.place(targets.positions[:, 0], -targets.positions[:, 1])
     return [np.stack([foot, top]) for foot, top in zip(feet, targets.positions, strict=True)]
 
 
-def window_outline(ground: Ground, window: Window) -> Floats:
+def window_outline(mesh: TerrainMesh, window: Window) -> Floats:
     """The border of a window, laid over the terrain."""
-    rows = np.clip([window.row0, window.row1 - 1], 0, ground.grid.rows - 1)
-    cols = np.clip([window.col0, window.col1 - 1], 0, ground.grid.cols - 1)
+    rows = np.clip([window.row0, window.row1 - 1], 0, mesh.grid.rows - 1)
+    cols = np.clip([window.col0, window.col1 - 1], 0, mesh.grid.cols - 1)
     east, west = (np.full(_along(rows), col) for col in (cols[1], cols[0]))
     north, south = (np.full(_along(cols), row) for row in (rows[0], rows[1]))
     across, down = (np.linspace(ends[0], ends[1], _along(ends)).astype(int) for ends in (cols, rows))
     row_path = np.concatenate([north, down, south, down[::-1]])
     col_path = np.concatenate([across, east, across[::-1], west])
-    return ground.place_cells(row_path * ground.grid.cols + col_path, 0.25 * ground.scale_m)
+    return mesh.place_cells(row_path * mesh.grid.cols + col_path, 0.25 * mesh.scale_m)
 
 
 def _along(ends: NDArray[np.integer]) -> int:
     return int(min(max((ends[1] - ends[0]) // 4, 1) + 1, 65))
 
 
-def route_strip(ground: Ground, cells: NDArray[np.integer], most: int = 64) -> Floats:
+def route_strip(mesh: TerrainMesh, cells: NDArray[np.integer], most: int = 64) -> Floats:
     """A route over the terrain, thinned so that a hundred routes stay cheap to draw."""
     if len(cells) > most:
         cells = cells[np.unique(np.linspace(0, len(cells) - 1, most).astype(int))]
-    return ground.place_cells(cells, 0.2 * ground.scale_m)
+    return mesh.place_cells(cells, 0.2 * mesh.scale_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

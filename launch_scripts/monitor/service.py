@@ -15,8 +15,8 @@ from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.recording_watch import RecordingWatch
 from launch_scripts.monitor.scene import (
-    Ground,
     RouteNow,
+    TerrainMesh,
     Trails,
     cell_at,
     label_places,
@@ -75,7 +75,7 @@ class MonitorService:
         post: Post,
         rec: rr.RecordingStream | Streams,
         *,
-        ground: Ground | None = None,
+        mesh: TerrainMesh | None = None,
         live_url: str | None = None,
         recording: RecordingWatch | None = None,
     ) -> None:
@@ -90,11 +90,11 @@ class MonitorService:
         self._cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, self._cost_map)
         self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role)
-        self._ground = ground or Ground(terrain)
+        self._mesh = mesh or TerrainMesh(terrain)
         self._target_ids = setup.scenario.target_ids
         self._rec = rec
         self._recording = recording
-        self._drawing = Drawing(rec, self._ground, self._target_ids)
+        self._drawing = Drawing(rec, self._mesh, self._target_ids)
         scale = setup.scenario.time_scale
         quickest_m = 4 * scale * max(setup.scenario.cost.road_speed_m_per_s, 1.0)
         self._vehicle_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
@@ -157,7 +157,7 @@ class MonitorService:
         self._drawing.set_time(self._frame, self._seconds())
         self._watch_recording(now_ns)
         for window in self._cost_map.take_dirty():
-            self._stale_tiles.update(dict.fromkeys(self._ground.tiles_touching(window)))
+            self._stale_tiles.update(dict.fromkeys(self._mesh.tiles_touching(window)))
         if not self._stale_tiles and now_ns >= self._refresh_due_ns:
             self._refresh(now_ns)
         self._draw_textures(_TEXTURES_PER_FRAME)
@@ -194,7 +194,7 @@ class MonitorService:
             return
         sentence, begun = self._recording.look(now_ns)
         if begun:
-            self._drawing = Drawing(self._rec, self._ground, self._target_ids)
+            self._drawing = Drawing(self._rec, self._mesh, self._target_ids)
             self._begin_drawing()
         if sentence is not None:
             log.warning("%s", sentence)
@@ -203,7 +203,7 @@ class MonitorService:
     def _begin_drawing(self) -> None:
         """Draws all that does not move."""
         self._drawing.begin()
-        self._stale_tiles = dict.fromkeys(range(self._ground.tile_rows * self._ground.tile_cols))
+        self._stale_tiles = dict.fromkeys(range(self._mesh.tile_rows * self._mesh.tile_cols))
         self._draw_textures(len(self._stale_tiles))
 
     def _seconds(self) -> float:
@@ -215,13 +215,13 @@ class MonitorService:
         """Sends one texture again: a viewer which joins late has only what the server still holds."""
         self._refresh_due_ns = now_ns + _REFRESH_NS
         self._stale_tiles[self._next_refresh] = None
-        self._next_refresh = (self._next_refresh + 1) % (self._ground.tile_rows * self._ground.tile_cols)
+        self._next_refresh = (self._next_refresh + 1) % (self._mesh.tile_rows * self._mesh.tile_cols)
 
     def _draw_textures(self, most: int) -> None:
         for tile in list(self._stale_tiles)[:most]:
             del self._stale_tiles[tile]
-            window = self._ground.tile_window(tile)
-            image = self._ground.texture(window, self._cost_map.ground_s_per_m, self._terrain.ground_s_per_m)
+            window = self._mesh.tile_window(tile)
+            image = self._mesh.texture(window, self._cost_map.ground_s_per_m, self._terrain.ground_s_per_m)
             self._drawing.texture(tile, image)
 
     def _draw_movers(self, now_ns: int) -> None:
@@ -231,16 +231,16 @@ class MonitorService:
         if self._fleets_new:
             self._fleets_new = False
             vehicles = self.recorder.observed.vehicles()
-            points = vehicle_points(self._ground, vehicles)
+            points = vehicle_points(self._mesh, vehicles)
             self._drawing.vehicles(points)
             if trails_due:
                 self._drawing.trails("vehicles", self._vehicle_trails.advance(points.ids, points.positions))
             self._draw_routes(now_ns, vehicles)
         if self._targets_new:
             self._targets_new = False
-            targets = target_points(self._ground, self.recorder.observed.targets())
-            feet = poles(self._ground, targets)
-            self._drawing.targets(targets, feet, label_places(self._ground, targets))
+            targets = target_points(self._mesh, self.recorder.observed.targets())
+            feet = poles(self._mesh, targets)
+            self._drawing.targets(targets, feet, label_places(self._mesh, targets))
             if trails_due:
                 places = np.array([pole[0] for pole in feet], np.float32)
                 self._drawing.trails("targets", self._target_trails.advance(targets.ids, places))
@@ -248,7 +248,7 @@ class MonitorService:
         sighted = self._sightings.best(now_ns)
         if sighted != self._sighted:  # a new sighting, or one that expired
             self._sighted = sighted
-            self._drawing.sightings(*sighting_points(self._ground, sighted))
+            self._drawing.sightings(*sighting_points(self._mesh, sighted))
         if self._windows_new:
             self._windows_new = False
             self._draw_windows()
@@ -258,7 +258,7 @@ class MonitorService:
         told = [status.window for _, status in sorted(self.recorder.observed.status.items())]
         windows = [Window(*window) for window in told if window]
         parts = [window for window in windows if not window.empty and window.cells < self._terrain.grid.cells]
-        self._drawing.windows([window_outline(self._ground, window) for window in parts])
+        self._drawing.windows([window_outline(self._mesh, window) for window in parts])
 
     def _draw_routes(self, now_ns: int, vehicles: dict[str, VehicleNow]) -> None:
         """Draws what is left of the routes, one target after the other."""
@@ -274,7 +274,7 @@ class MonitorService:
                 continue
             ahead = route.ahead_of(cell_at(self._terrain.grid, vehicle.east_m, vehicle.south_m))
             if len(ahead) > 1:
-                strips.append(route_strip(self._ground, ahead))
+                strips.append(route_strip(self._mesh, ahead))
         self._drawing.routes(target, strips)
 
     def _draw_plots(self, now_ns: int) -> None:

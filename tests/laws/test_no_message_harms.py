@@ -12,7 +12,7 @@ from support.swarm_model import SwarmModel
 
 from launch_scripts.launcher.router import RouterService
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.world.targets import TargetsService
+from launch_scripts.world.service import TargetsService
 from planner_service.service import PlannerService
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.store import KeeperStore

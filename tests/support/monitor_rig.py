@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.scene import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.sinks import Sinks
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
@@ -65,13 +65,13 @@ class Rig(SwarmModel):
     ) -> None:
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
         self.speaker = self.bus("speaker")
-        ground = Ground(terrain)
-        self.sinks = Sinks("run.1", path, config, make_blueprint(ground))
+        mesh = TerrainMesh(terrain)
+        self.sinks = Sinks("run.1", path, config, make_blueprint(mesh))
         setup = self.setup("monitor", "0")
         self.service = self.start(
             "monitor",
             lambda bus, post: MonitorService(
-                setup, terrain, bus, post, self.sinks.streams, ground=ground, live_url=live_url
+                setup, terrain, bus, post, self.sinks.streams, mesh=mesh, live_url=live_url
             ),
         )
 

@@ -25,7 +25,7 @@ from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little
 from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.recording_watch import RecordingWatch
-from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.scene import TerrainMesh
 from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event
@@ -70,7 +70,7 @@ def still_entities(path: Path) -> set[str]:
 
 def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
     rig = Rig(scenario, terrain, new_recording_path(tmp_path))
-    tiles = rig.service._ground.tile_rows * rig.service._ground.tile_cols
+    tiles = rig.service._mesh.tile_rows * rig.service._mesh.tile_cols
     rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
     rig.close()
     rows = rows_by_entity(tmp_path / "run.rrd")
@@ -211,7 +211,7 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
     home.mkdir()
     monkeypatch.setenv("HOME", str(home))
     before = children(os.getpid())
-    sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(Ground(terrain)))
+    sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(TerrainMesh(terrain)))
     assert sinks.live_url is not None
     try:
         with urllib.request.urlopen(sinks.live_url, timeout=30) as reply:
@@ -239,12 +239,12 @@ def test_a_killed_monitor_leaves_a_readable_file(tmp_path: Path) -> None:
 import time, numpy, pathlib
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.sinks import Sinks
-from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.scene import TerrainMesh
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 import rerun as rr
-ground = Ground(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
-sinks = Sinks("r", pathlib.Path({str(path)!r}), MonitorConfig(live=False), make_blueprint(ground))
+mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
+sinks = Sinks("r", pathlib.Path({str(path)!r}), MonitorConfig(live=False), make_blueprint(mesh))
 for n in range(100):
     sinks.rec.set_time("tick", sequence=n)
     sinks.rec.log("a", rr.Scalars(n))
@@ -267,14 +267,14 @@ import rerun as rr
 from launch_scripts.monitor import recording_watch
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.recording_watch import RecordingWatch
-from launch_scripts.monitor.scene import Ground
+from launch_scripts.monitor.scene import TerrainMesh
 from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 
 path = new_recording_path(pathlib.Path({str(tmp_path)!r}))
-ground = Ground(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
-sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(ground))
+mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
+sinks = Sinks("r", path, MonitorConfig(live=False), make_blueprint(mesh))
 watch = RecordingWatch(path, sinks.begin_file)
 _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, hard))
@@ -347,14 +347,14 @@ def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytes
         with pytest.raises(
             BusError, match=rf"live view on port {port}: Address already in use; .*monitor\.web_port"
         ):
-            Sinks("r", None, config, make_blueprint(Ground(terrain)))
+            Sinks("r", None, config, make_blueprint(TerrainMesh(terrain)))
 
 
 @pytest.mark.network
 def test_logging_does_not_wait_for_a_viewer_that_reads_nothing(terrain: Terrain) -> None:
     import rerun as rr
 
-    sinks = Sinks("r", None, LIVE, make_blueprint(Ground(terrain)))
+    sinks = Sinks("r", None, LIVE, make_blueprint(TerrainMesh(terrain)))
     try:
         assert sinks.live_url is not None
         port = stream_port(sinks.live_url)

@@ -9,8 +9,8 @@ from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.scene import (
     LETHAL_MARK,
     STATE_COLOURS,
-    Ground,
     RouteNow,
+    TerrainMesh,
     Trails,
     cell_at,
     label_places,
@@ -38,9 +38,9 @@ def hill(rows: int, cols: int, resolution_m: float = 10.0, top_m: float = 50.0) 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (64, 64), (65, 65), (100, 151), (424, 400)])
 def test_the_tiles_of_the_ground_cover_every_cell_once_and_join_without_gaps(shape: tuple[int, int]) -> None:
     rows, cols = shape
-    ground = Ground(hill(rows, cols))
+    mesh = TerrainMesh(hill(rows, cols))
     area = 0.0
-    for tile in ground.mesh_tiles():
+    for tile in mesh.mesh_tiles():
         if len(tile.triangles):
             assert tile.triangles.max() < len(tile.vertices)
             corners = tile.vertices[tile.triangles.astype(int)][:, :, :2]
@@ -54,8 +54,8 @@ def test_the_tiles_of_the_ground_cover_every_cell_once_and_join_without_gaps(sha
 
 
 def test_the_corners_of_the_ground_are_the_middles_of_the_corner_cells() -> None:
-    ground = Ground(hill(100, 151))
-    vertices = np.concatenate([tile.vertices for tile in ground.mesh_tiles()])
+    mesh = TerrainMesh(hill(100, 151))
+    vertices = np.concatenate([tile.vertices for tile in mesh.mesh_tiles()])
     assert vertices[:, 0].min() == 5.0
     assert vertices[:, 0].max() == 1505.0
     assert vertices[:, 1].max() == -5.0
@@ -63,61 +63,61 @@ def test_the_corners_of_the_ground_are_the_middles_of_the_corner_cells() -> None
 
 
 def test_a_huge_terrain_is_thinned_out_and_a_small_one_is_not() -> None:
-    assert Ground(hill(100, 100)).texel == 1
-    ground = Ground(hill(2100, 2100))
-    assert ground.texel == 4
-    assert sum(len(tile.vertices) for tile in ground.mesh_tiles()) < 150_000
-    texture = ground.texture(
-        ground.tile_window(0), np.ones((2100, 2100), np.float32), np.ones((2100, 2100), np.float32)
+    assert TerrainMesh(hill(100, 100)).texel == 1
+    mesh = TerrainMesh(hill(2100, 2100))
+    assert mesh.texel == 4
+    assert sum(len(tile.vertices) for tile in mesh.mesh_tiles()) < 150_000
+    texture = mesh.texture(
+        mesh.tile_window(0), np.ones((2100, 2100), np.float32), np.ones((2100, 2100), np.float32)
     )
     assert texture.shape[0] <= 70
 
 
 def test_a_mark_on_one_cell_shows_however_far_one_looks_from() -> None:
     terrain = hill(2100, 2100)
-    ground, pace = Ground(terrain), np.array(terrain.pace_s_per_m)
+    mesh, pace = TerrainMesh(terrain), np.array(terrain.pace_s_per_m)
     pace[130, 70] = np.inf
-    (tile,) = ground.tiles_touching(Window(130, 70, 131, 71))
-    window = ground.tile_window(tile)
-    marked = ground.texture(window, pace, terrain.pace_s_per_m)
-    plain = ground.texture(window, terrain.pace_s_per_m, terrain.pace_s_per_m)
+    (tile,) = mesh.tiles_touching(Window(130, 70, 131, 71))
+    window = mesh.tile_window(tile)
+    marked = mesh.texture(window, pace, terrain.pace_s_per_m)
+    plain = mesh.texture(window, terrain.pace_s_per_m, terrain.pace_s_per_m)
     rows, cols = np.nonzero((marked != plain).any(axis=2))
     assert (rows.tolist(), cols.tolist()) == ([(130 - window.row0) // 4], [(70 - window.col0) // 4])
 
 
 def test_things_stand_on_the_ground_between_cells_too() -> None:
     terrain = hill(10, 11, top_m=100.0)
-    ground = Ground(terrain)
+    mesh = TerrainMesh(terrain)
     east_m = np.array([5.0, 10.0, 55.0, 105.0, 1000.0], np.float32)
-    placed = ground.place(east_m, np.full(5, 50.0, np.float32))
+    placed = mesh.place(east_m, np.full(5, 50.0, np.float32))
     assert placed[:, 1].tolist() == [-50.0] * 5
-    assert (placed[:, 2] / ground.stretch).tolist() == pytest.approx([0, 5, 50, 100, 100], abs=1e-3)
+    assert (placed[:, 2] / mesh.stretch).tolist() == pytest.approx([0, 5, 50, 100, 100], abs=1e-3)
 
 
 def test_gentle_land_is_stretched_and_a_void_is_level_with_the_lowest_ground() -> None:
     terrain = hill(100, 100, top_m=5.0)
     elevation_m = np.array(terrain.elevation_m) + 300
     elevation_m[3, 3] = np.nan
-    ground = Ground(terrain_of_pace(np.ones((100, 100), np.float32), 10.0, elevation_m))
-    assert ground.stretch == 8.0
-    assert ground.heights_m[3, 3] == 0.0
-    assert ground.heights_m.max() == pytest.approx(40.0)
-    assert Ground(hill(100, 100, top_m=500.0)).stretch == 1.0
+    mesh = TerrainMesh(terrain_of_pace(np.ones((100, 100), np.float32), 10.0, elevation_m))
+    assert mesh.stretch == 8.0
+    assert mesh.heights_m[3, 3] == 0.0
+    assert mesh.heights_m.max() == pytest.approx(40.0)
+    assert TerrainMesh(hill(100, 100, top_m=500.0)).stretch == 1.0
 
 
 def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_other() -> None:
     terrain = hill(130, 130)
-    ground = Ground(terrain)
+    mesh = TerrainMesh(terrain)
     pace = np.array(terrain.pace_s_per_m)
     pace[64, 10] = np.inf
-    touched = ground.tiles_touching(Window(64, 10, 65, 11))
-    for tile in range(ground.tile_rows * ground.tile_cols):
-        window = ground.tile_window(tile)
-        before = ground.texture(window, terrain.pace_s_per_m, terrain.pace_s_per_m)
-        after = ground.texture(window, pace, terrain.pace_s_per_m)
+    touched = mesh.tiles_touching(Window(64, 10, 65, 11))
+    for tile in range(mesh.tile_rows * mesh.tile_cols):
+        window = mesh.tile_window(tile)
+        before = mesh.texture(window, terrain.pace_s_per_m, terrain.pace_s_per_m)
+        after = mesh.texture(window, pace, terrain.pace_s_per_m)
         assert (tile in touched) == bool((before != after).any())
-    window = ground.tile_window(touched[-1])
-    texture = ground.texture(window, pace, terrain.pace_s_per_m)
+    window = mesh.tile_window(touched[-1])
+    texture = mesh.texture(window, pace, terrain.pace_s_per_m)
     mark = texture[64 - window.row0, 10 - window.col0].astype(int)
     assert np.abs(mark - np.array(LETHAL_MARK)).max() < 40
 
@@ -126,31 +126,31 @@ def test_what_was_lethal_before_anybody_drove_is_no_mark() -> None:
     pace = np.ones((20, 20), np.float32)
     pace[5, 5] = np.inf
     terrain = terrain_of_pace(pace)
-    ground = Ground(terrain)
+    mesh = TerrainMesh(terrain)
     assert np.array_equal(
-        ground.texture(ground.tile_window(0), terrain.pace_s_per_m, terrain.pace_s_per_m), ground.photo[:20, :20]
+        mesh.texture(mesh.tile_window(0), terrain.pace_s_per_m, terrain.pace_s_per_m), mesh.photo[:20, :20]
     )
 
 
 def test_vehicles_are_shades_of_green_and_targets_red() -> None:
-    ground = Ground(hill(20, 20))
+    mesh = TerrainMesh(hill(20, 20))
     vehicles = {f"a0-{state:02d}": VehicleNow(10.0 * state, 20.0, 0.0, state, None) for state in VehicleState}
-    points = vehicle_points(ground, vehicles)
+    points = vehicle_points(mesh, vehicles)
     assert points.ids == list(vehicles)
     assert [tuple(colour) for colour in points.colours.tolist()] == [STATE_COLOURS[state] for state in VehicleState]
     assert (points.colours[:, 1] >= points.colours[:, [0, 2]].max(axis=1)).all(), "green is the strongest"
-    targets = target_points(ground, {"t0": (50.0, 60.0)})
+    targets = target_points(mesh, {"t0": (50.0, 60.0)})
     red, green, blue = targets.colours[0].tolist()
     assert red > 4 * max(green, blue)
-    (pole,) = poles(ground, targets)
+    (pole,) = poles(mesh, targets)
     assert pole[:, :2].tolist() == [[50.0, -60.0], [50.0, -60.0]]
-    assert pole[0, 2] < pole[1, 2] < label_places(ground, targets)[0, 2]
+    assert pole[0, 2] < pole[1, 2] < label_places(mesh, targets)[0, 2]
 
 
 def test_nobody_there_is_nothing_to_draw() -> None:
-    ground = Ground(hill(20, 20))
-    assert vehicle_points(ground, {}).positions.shape == (0, 3)
-    assert poles(ground, target_points(ground, {})) == []
+    mesh = TerrainMesh(hill(20, 20))
+    assert vehicle_points(mesh, {}).positions.shape == (0, 3)
+    assert poles(mesh, target_points(mesh, {})) == []
 
 
 def test_what_is_left_of_a_route_begins_where_the_vehicle_is() -> None:
@@ -160,17 +160,17 @@ def test_what_is_left_of_a_route_begins_where_the_vehicle_is() -> None:
 
 
 def test_a_long_route_is_drawn_with_few_points_that_keep_its_ends() -> None:
-    ground = Ground(hill(10, 1000))
+    mesh = TerrainMesh(hill(10, 1000))
     cells = np.arange(1000)
-    strip = route_strip(ground, cells)
+    strip = route_strip(mesh, cells)
     assert len(strip) == 64
     assert strip[0, 0] == 5.0
     assert strip[-1, 0] == 9995.0
 
 
 def test_the_outline_of_a_window_is_closed_and_runs_along_its_border() -> None:
-    ground = Ground(hill(50, 60))
-    outline = window_outline(ground, Window(10, 20, 31, 41))
+    mesh = TerrainMesh(hill(50, 60))
+    outline = window_outline(mesh, Window(10, 20, 31, 41))
     assert outline[0].tolist() == outline[-1].tolist()
     assert (outline[:, 0].min(), outline[:, 0].max()) == (205.0, 405.0)
     assert (outline[:, 1].max(), outline[:, 1].min()) == (-105.0, -305.0)
