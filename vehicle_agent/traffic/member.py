@@ -175,6 +175,8 @@ class Member:
             newest = max(self._promises.values(), key=lambda table: table.stamp)
             self.warden = Warden(self._plots, self._me, self._claimed, newest, self._vehicles)
             self._acked_ns = now_ns
+            # Once in an epoch: a promise that comes again after the warden has resigned must not begin it anew.
+            self._claimed, self._promises = 0, {}
 
     def _promise(self, epoch: int) -> None:
         self.promised = epoch

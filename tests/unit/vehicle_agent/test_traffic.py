@@ -137,6 +137,21 @@ def test_after_a_promise_nothing_older_is_stored() -> None:
     assert member.hear_table(table_of(5, 1), 2 * S)[-1] == Stored(plot=0, agent=MEMBERS[0], epoch=5, seq=1)
 
 
+def test_an_epoch_has_one_warden_only_though_a_promise_comes_twice() -> None:
+    member = member_of()
+    member.hear_standing(standing("a1", [9], seq=1), 2 * S)
+    save = member.tick(2 * S)[0]
+    assert isinstance(save, Save)
+    member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 2 * S)
+    first = member.warden
+    assert first is not None
+    member.hear_standing(standing("a1", [9], seq=3), 3 * S)
+    member.tick(3 * S)  # nobody has acknowledged anything: it resigns
+    assert member.warden is None
+    member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 3 * S)
+    assert member.warden is None
+
+
 def test_an_epoch_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
     member = member_of()
     assert isinstance(member.hear_claim(1 << 60, S)[0], Refused)
