@@ -185,7 +185,7 @@ def test_a_long_payload_of_small_things_is_refused_before_it_takes_much_memory(j
         (TargetPose, {"y_m": 1e10}, "y_m"),
         (TargetPose, {"target": "*"}, "target"),
         (Table, {"grants": {"v": [[], [1, 1]]}}, "length >= 1"),
-        (Table, {"grants": {"a b": [[1], [1, 1]]}}, "vehicle"),
+        (Table, {"grants": {"a b": [[1], [1, 1]]}}, "grants"),
         (Standing, {"life": (1 << 64) - 1}, "life"),
         (Standing, {"vehicles": [["v", 1, 1, [1], [], [2] * 9, 9, 0]]}, "length <= 8"),
         (RouteRequest, {"cells": [1 << 40]}, "cells"),

@@ -26,7 +26,7 @@ from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.routes import RouteStatus
 from swarm.wire.statements import MarkKind
-from swarm.wire.topics import RESERVATIONS, ROUTE, RUN, TERRITORY
+from swarm.wire.topics import KNOWN, ROUTE, RUN, STANDING, STORED, TABLE
 from vehicle_agent.service import AgentService
 
 SCENARIO = parse_scenario("""
@@ -47,7 +47,7 @@ live = false
 PACE = np.ones((40, 72), np.float32) / 5
 PACE[10:30, 30] = np.inf
 STATES = ("fresh", "running", "cut", "without target", "restarted")
-RIGHT_OF_WAY = (RESERVATIONS, TERRITORY)
+RIGHT_OF_WAY = (STANDING, TABLE, STORED, KNOWN)
 """Lies about the right of way stop vehicles for good: nothing but the word of each agent guards it today."""
 
 
