@@ -27,6 +27,7 @@ from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.routes import RouteStatus
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import KNOWN, ROUTE, RUN, STANDING, STORED, TABLE
+from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
 SCENARIO = parse_scenario("""
@@ -61,6 +62,7 @@ class Lied(SwarmModel):
         self.ear = self.bus("ear")
         self.heard: list[RouteReply] = []
         self.stores: list[KeeperStore] = []
+        self.promises = {id: MemoryPromiseStore(n) for n, id in enumerate(("a0", "a1"), 1)}
         self.liar = Liar(self.bus("liar"), self.terrain.grid.cells, seed)
         for role in ROLES:
             for id in ("a0", "a1") if role == "agent" else ("t0",) if role == "planner" else ("0",):
@@ -85,7 +87,7 @@ class Lied(SwarmModel):
                     return PlannerService(setup, terrain, bus, post, InlineWorker(self.scheduler))
                 case "targets":
                     return TargetsService(setup, terrain, truth, bus, post)
-            return AgentService(setup, terrain, truth, bus, post)
+            return AgentService(setup, terrain, truth, bus, post, self.promises[id])
 
         service = self.start(f"{role}-{id}", make)
         self.services = {**getattr(self, "services", {}), f"{role}-{id}": service}
