@@ -21,8 +21,8 @@ _PANEL = "One role, by hand"
 
 
 @dataclass(frozen=True)
-class Part:
-    """In which run a process takes part, and where it finds it."""
+class Place:
+    """Where a process finds its scenario, its router and its files."""
 
     scenario: Annotated[
         str,
@@ -31,17 +31,23 @@ class Part:
     connect: Annotated[
         str | None, typer.Option(help="The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.")
     ] = None
+    namespace: Namespace = None
+    runs: Runs = Path("runs")
+
+
+@dataclass(frozen=True)
+class Part(Place):
+    """In which run a process takes part, and where it finds it."""
+
     run_id: Annotated[
         str | None, typer.Option(help="The run to take part in; if not given, the one in the namespace.")
     ] = None
-    namespace: Namespace = None
-    runs: Runs = Path("runs")
 
 
 @app.command(rich_help_panel=_PANEL)
 @spread
 def router(
-    part: Part,
+    place: Place,
     tls: Tls,
     listen: Annotated[str | None, typer.Option(help="Where to listen, such as tls/0.0.0.0:7447.")] = None,
 ) -> None:
@@ -49,7 +55,7 @@ def router(
 
     With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
     """
-    _run("router", "0", part, tls, listen=listen)
+    _run("router", "0", place, tls, listen=listen)
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -113,7 +119,7 @@ def monitor(part: Part, tls: Tls) -> None:
     _run("monitor", "0", part, tls)
 
 
-def _run(role: str, id: str, part: Part, tls: Tls, *, listen: str | None = None, **role_options: Any) -> None:
+def _run(role: str, id: str, part: Place, tls: Tls, *, listen: str | None = None, **role_options: Any) -> None:
     import msgspec
 
     from launch_scripts.launcher import options
@@ -145,7 +151,7 @@ def _run(role: str, id: str, part: Part, tls: Tls, *, listen: str | None = None,
     scenario = options.as_process(scenario, role, id)
     log_to(None)
     found: list[RunInfo] = []
-    run_id = part.run_id
+    run_id = part.run_id if isinstance(part, Part) else None
     if role != "router":
         found = _found(scenario.network)
         check_vacant(found, role, id)

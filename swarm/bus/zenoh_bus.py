@@ -16,7 +16,6 @@ from typing import Any
 import zenoh
 
 from swarm.bus.bus import (
-    LONGEST_TIMEOUT_S,
     TIMEOUT_PARAMETER,
     USUAL_TIMEOUT_S,
     Appeared,
@@ -30,6 +29,7 @@ from swarm.bus.bus import (
     Replied,
 )
 from swarm.bus.zenoh_config import session_config
+from swarm.bus.zenoh_threads import guarded, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
@@ -55,8 +55,6 @@ _TOKEN_BUFFER = 65_536
 """Changes of tokens that wait to be read: more than processes can start in a second."""
 _CLOSE_S = 3.0
 """How long `close` waits for a router that does not answer."""
-_TOGETHER = 1024
-"""Most samples in one `HeardMany`, so that a tick does not wait for long."""
 
 
 def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
@@ -184,7 +182,7 @@ class ZenohBus:
             timeout = parameters.pop(TIMEOUT_PARAMETER, "")
             answerer = _ZenohAnswerer(self, topic, query, concrete, parameters.get("format") == "json")
             try:
-                answerer.timeout_s = _timeout_s(timeout)
+                answerer.timeout_s = timeout_of(timeout)
                 payload = query.payload
                 if payload is None:
                     request = decode_parameters(parameters, request_type)
@@ -243,7 +241,7 @@ class ZenohBus:
         self._count("messages_out")
         self._session.get(
             f"{topic.expression(self._namespace, **fields)}?{TIMEOUT_PARAMETER}={timeout_s}",
-            zenoh.handlers.Callback(_guarded(arrive), _guarded(finish), indirect=False),
+            zenoh.handlers.Callback(guarded(arrive), guarded(finish), indirect=False),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
@@ -311,7 +309,7 @@ class ZenohBus:
         def run() -> None:
             try:
                 while True:
-                    arrive(_waiting(channel) if together else channel.recv())
+                    arrive(waiting_in(channel) if together else channel.recv())
             except zenoh.ZError:
                 if not self._closed and entity in self._entities:
                     raise  # by itself, so that nothing more would be heard
@@ -339,44 +337,6 @@ class ZenohBus:
                 self._logged_s.clear()
             self._logged_s[key] = now_s
             log.warning("dropped a payload on %s: %s", key[:200], error)
-
-
-def _waiting(channel: Any) -> list[Any]:
-    """All items that wait in a channel; blocks until there is one.
-
-    `try_recv` keeps the interpreter's lock, `recv` releases it: taking it back for each item costs hundreds of
-    times more while another thread is busy.
-    """
-    items = [channel.recv()]
-    while len(items) < _TOGETHER and (item := channel.try_recv()) is not None:
-        items.append(item)
-    return items
-
-
-def _guarded(callback: Callable[..., None]) -> Callable[..., None]:
-    """A callback for Zenoh's own threads, which swallow an error: it ends like one of a thread of ours."""
-
-    def guarded(*arguments: Any) -> None:
-        try:
-            callback(*arguments)
-        except Exception as error:
-            what = (type(error), error, error.__traceback__, threading.current_thread())
-            threading.excepthook(threading.ExceptHookArgs(what))
-
-    return guarded
-
-
-def _timeout_s(said: str) -> float:
-    """The timeout that a query states, within bounds. Raises ProtocolError on what is no positive number."""
-    if not said:
-        return USUAL_TIMEOUT_S
-    try:
-        timeout_s = float(said)
-    except ValueError:
-        timeout_s = 0.0
-    if not timeout_s > 0:  # neither is NaN
-        raise ProtocolError(f"{TIMEOUT_PARAMETER} {said[:40]!r} is not a positive number of seconds")
-    return min(timeout_s, LONGEST_TIMEOUT_S)
 
 
 class _ZenohAnswerer:

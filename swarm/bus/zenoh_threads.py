@@ -1,0 +1,51 @@
+"""Threads of Zenoh and those that read its channels: how they wait and end, and how long a query may take."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
+from swarm.errors import ProtocolError
+
+MOST_TOGETHER = 1024
+"""Most samples in one `HeardMany`, so that a tick does not wait for long."""
+
+
+def waiting_in(channel: Any) -> list[Any]:
+    """All items that wait in a channel; blocks until there is one.
+
+    `try_recv` keeps the interpreter's lock, `recv` releases it: taking it back for each item costs hundreds of
+    times more while another thread is busy.
+    """
+    items = [channel.recv()]
+    while len(items) < MOST_TOGETHER and (item := channel.try_recv()) is not None:
+        items.append(item)
+    return items
+
+
+def guarded(callback: Callable[..., None]) -> Callable[..., None]:
+    """A callback for Zenoh's own threads, which swallow an error: it ends like one of a thread of ours."""
+
+    def guard(*arguments: Any) -> None:
+        try:
+            callback(*arguments)
+        except Exception as error:
+            what = (type(error), error, error.__traceback__, threading.current_thread())
+            threading.excepthook(threading.ExceptHookArgs(what))
+
+    return guard
+
+
+def timeout_of(said: str) -> float:
+    """The timeout that a query states, within bounds. Raises ProtocolError on what is no positive number."""
+    if not said:
+        return USUAL_TIMEOUT_S
+    try:
+        timeout_s = float(said)
+    except ValueError:
+        timeout_s = 0.0
+    if not timeout_s > 0:  # neither is NaN
+        raise ProtocolError(f"{TIMEOUT_PARAMETER} {said[:40]!r} is not a positive number of seconds")
+    return min(timeout_s, LONGEST_TIMEOUT_S)
