@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
-from vehicle_agent.traffic.resumption import Resumption
 
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
@@ -22,11 +21,13 @@ from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.traffic import Grant, Table
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent import Agent, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
-from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.traffic.holdings import Holdings
+from vehicle_agent.traffic.plots import Plots
 
 RES = 10.0
 
@@ -293,10 +294,19 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
     row, col = grid.row_col(start)
     text = f"[[groups]]\nvehicles = 1\ncells = [[{row}, {col}]]\n[vehicles]\ncapture_range_m = 1\n"
     scenario = parse_scenario(text)
-    spawns = spawn_cells(scenario, grid, level, level)
-    ground = LocalMap(grid, level, level, level, level, climb)
-    agent = Agent(plan_agents(scenario)[0], scenario, ground, TruthSensor(grid, level, 20.0), spawns, 1)
-    agent.place(Resumption("a0", spawns, grid.cells).placement({}))
+    local_map = LocalMap(grid, level, level, level, level, climb)
+    plots, plan = Plots(grid, ["a0"]), plan_agents(scenario)[0]
+    holdings = Holdings(plots, plan.id, plan.vehicle_ids)
+    holdings.begin(1, [])
+    agent = Agent(plan, scenario, local_map, TruthSensor(grid, level, 20.0), holdings)
+
+    def grant(seq: int, cells: list[int]) -> None:
+        """As the warden of the only plot, which has nobody else to consider."""
+        grants = {"a0-00": Grant(cells, (1, seq))}
+        table = Table(plot=0, agent=plots.warden(0, 1), epoch=1, seq=seq, hosts={"a0": (1, seq)}, grants=grants)
+        agent.place(holdings.hear_table(table, lambda vehicle, found: found[0]))
+
+    grant(1, [start])
     agent.set_planners({"t": 1}, 0)
     x_m, y_m = grid.centre_m(target)
     agent.hear_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=target, x_m=x_m, y_m=y_m), 0)
@@ -305,15 +315,15 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
     for tick in range(2000):
         now_ns = tick * 50_000_000
         agent.begin_drive(now_ns)
-        agent.rights.grant()
-        while agent.drive(now_ns) is not None:
-            agent.rights.grant()
+        while agent.drive() is not None:
+            pass
         if set_out_s is None and not (motion.at_rest and motion.cell == start):
             set_out_s = (tick - 1) * 0.05
         if set_out_s is not None and motion.at_rest and motion.cell == target:
             return tick * 0.05 - set_out_s, tree.routes([start])[0].cost_s
         asks = agent.decide(now_ns)
-        agent.rights.next_message()
+        wish = agent.wishes["a0-00"]
+        grant(tick + 2, [*holdings.path("a0-00"), *(wish.ahead or wish.wants[: wish.better][:1])])
         for asked in asks:
             if isinstance(asked, AskCosts):
                 agent.costs_given(asked.request, "t", tree.cost_to_go_at(asked.cells))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,7 +22,11 @@ def test_no_follower_stands_outside_the_grid_whatever_status_its_answer_had(
 ) -> None:
     followers = Followers("t", GRID, 10, 0)
     for n, (cell, status) in enumerate(asked):
-        followers.given(f"v{n}", Route(status=status, start=cell), 0, 0, 0)
+        seconds = 1.0 if status is RouteStatus.OK else math.inf
+        route = Route(
+            status=status, start=cell, cost_s=seconds, lower_bound_s=seconds, length_m=seconds, remaining_s=0.0
+        )
+        followers.given(f"v{n}", route, 0, 0, 0)
     assert all(0 <= each.cell < GRID.cells for each in followers.all())
     followers.touch(Window(0, 0, 5, 5), [Window(3, 3, 9, 9)])
 
