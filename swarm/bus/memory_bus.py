@@ -159,7 +159,7 @@ class MemoryBus:
     def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
         post = as_batches(post) if together else checking_key(post, self.counts)
         subscriptions = self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions())
-        subscriptions.add(declare(self, topic, fields, post), topic)
+        subscriptions.add(declare(self, topic, fields, post))
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         narrow = narrowed(topic, fields)

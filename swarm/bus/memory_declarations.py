@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 from swarm.bus.bus import Event, Heard, HeardMany, Post
@@ -40,36 +41,41 @@ def narrowed(topic: Topic, fields: Mapping[str, str | int]) -> dict[str, str]:
 
 
 class Subscriptions:
-    """The subscriptions of one topic.
+    """The subscriptions of one topic, looked up by the values of the fields that they name.
 
-    Those without wildcards are looked up by their key: a hundred vehicles each listen to one of their own.
+    A topic has few such sets of fields, and hundreds of subscriptions: a hundred vehicles each listen to a key of
+    their own, agents to each plot near them.
     """
 
     def __init__(self) -> None:
-        self._wide: list[Declaration] = []
-        self._exact: dict[tuple[str, ...], list[Declaration]] = {}
+        self._count = 0
+        self._by_names: dict[tuple[str, ...], dict[tuple[str, ...], list[tuple[int, Declaration]]]] = {}
+        """Names of the fields that are no wildcard -> their values -> (number of the declaration, subscription)."""
 
-    def add(self, declaration: Declaration, topic: Topic) -> None:
-        if len(declaration.narrow) == len(topic.fields):
-            self._exact.setdefault(tuple(declaration.narrow.values()), []).append(declaration)
-        else:
-            self._wide.append(declaration)
+    def add(self, declaration: Declaration) -> None:
+        names, values = tuple(declaration.narrow), tuple(declaration.narrow.values())
+        self._by_names.setdefault(names, {}).setdefault(values, []).append((self._count, declaration))
+        self._count += 1
 
     def remove(self, bus: MemoryBus, narrow: Mapping[str, str] | None = None) -> None:
         """Forget the subscriptions of a bus: all, or those with exactly these fields."""
-
-        def goes(declaration: Declaration) -> bool:
-            return declaration.bus is bus and (narrow is None or declaration.narrow == narrow)
-
-        self._wide = [declaration for declaration in self._wide if not goes(declaration)]
-        for key, declarations in list(self._exact.items()):
-            self._exact[key] = [declaration for declaration in declarations if not goes(declaration)]
+        for names, by_values in self._by_names.items():
+            if narrow is not None and names != tuple(narrow):
+                continue
+            for values in list(by_values) if narrow is None else [tuple(narrow.values())]:
+                kept = [each for each in by_values.pop(values, ()) if each[1].bus is not bus]
+                if kept:
+                    by_values[values] = kept
 
     def find(self, fields: Mapping[str, str]) -> list[Declaration]:
         """Those that a value with these fields reaches: first the ones with wildcards, each kind in the order of
         its declaration. A replayed run depends on this order."""
-        found = [declaration for declaration in self._wide if declaration.meets(fields)]
-        return found + self._exact.get(tuple(fields.values()), [])
+        wide: list[tuple[int, Declaration]] = []
+        exact: list[tuple[int, Declaration]] = []
+        for names, by_values in self._by_names.items():
+            found = by_values.get(tuple([fields[name] for name in names]), ())
+            (exact if len(names) == len(fields) else wide).extend(found)
+        return [declaration for _, declaration in sorted(wide, key=itemgetter(0)) + exact]
 
 
 def checking_key(post: Post, counts: dict[str, int]) -> Post:
