@@ -204,9 +204,9 @@ class AgentService:
         self._member.note(self._now_ns, "refused", text)
 
     def _stand_down(self, now_ns: int) -> None:
-        """A later life of this agent drives the vehicles. This one keeps its promises only, while the other lives."""
+        """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""
         self._agent.stand_down()
-        text = f"agent {self._setup.id} runs elsewhere, too, and that one is younger: this one drives no more beside it"
+        text = f"agent {self._setup.id} runs elsewhere, too, and that one is younger: this one drives no more"
         log.warning(text)
         self._member.note(now_ns, "replaced", text)
 

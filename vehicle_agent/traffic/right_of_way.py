@@ -24,7 +24,7 @@ from vehicle_agent.traffic.warden import first_life, is_far_ahead
 Place = Callable[[str, Sequence[int]], int]
 
 _LIVES_KEPT = 32
-_ALONE_NS = NS_PER_S
+_ALONE_NS = NS_PER_S // 2
 """A life that has been replaced begins again once no other process of its agent has been alive for so long."""
 
 

@@ -8,6 +8,7 @@ import pytest
 from support.bus_behaviour import *  # noqa: F403
 from support.bus_behaviour import Box, answering, asked, note, pose, run_info
 from support.swarm_model import START_NS, SwarmModel
+from support.trusted_behaviour import *  # noqa: F403
 
 from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
 from swarm.bus.memory_bus import PerfectLinks
