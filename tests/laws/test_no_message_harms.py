@@ -1,4 +1,4 @@
-"""Whatever passes the door, no service raises on, in any state; after the lies each does its work again."""
+"""No service raises on a message that `decode` accepts, in any state; after the lies each does its work again."""
 
 from __future__ import annotations
 

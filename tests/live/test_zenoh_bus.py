@@ -15,7 +15,8 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_behaviour import Box, answering, asked, pose, run_info
+from support.bus_world import Box, answering, asked, pose, run_info
+from support.query_behaviour import *  # noqa: F403
 from support.trusted_behaviour import *  # noqa: F403
 from support.trusted_behaviour import OURS, stored, table
 

@@ -5,7 +5,7 @@ A world's `bus` takes an `authenticator`.
 
 from __future__ import annotations
 
-from support.bus_behaviour import Box, answering, asked, pose
+from support.bus_world import Box, answering, asked, pose
 
 from swarm.bus.bus import Asked, AskEnded, Heard, Replied
 from swarm.wire.authentication import Authenticator

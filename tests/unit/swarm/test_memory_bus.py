@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import pytest
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_behaviour import Box, answering, asked, note, pose, run_info
+from support.bus_world import Box, answering, asked, note, pose, run_info
+from support.query_behaviour import *  # noqa: F403
 from support.swarm_model import START_NS, SwarmModel
 from support.trusted_behaviour import *  # noqa: F403
 
