@@ -18,7 +18,7 @@ from swarm.wire.topics import KNOWN, STANDING, STORED, TABLE
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.holdings import Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
-from vehicle_agent.traffic.plots import PLOT_CELLS, Plots
+from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
@@ -61,7 +61,7 @@ class RightOfWaySync:
         self._warn = warn
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
-        self._near = Interest(grid, _LEAD_CELLS, square_cells=PLOT_CELLS)
+        self._near = Interest(grid, _LEAD_CELLS)
         self._seats = frozenset(plot for plot in range(plots.count) if setup.id in plots.members(plot))
         self._listens_to: frozenset[int] = frozenset()
         self._ask_due_ns: int | None = None

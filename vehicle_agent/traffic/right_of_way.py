@@ -153,9 +153,8 @@ class RightOfWay:
         placed = []
         if self.holdings.life and table.plot in self.holdings.plots:
             placed = self.holdings.hear_table(table, self._place)
-            for action in actions:
-                if isinstance(action, Stored):
-                    placed += self.holdings.hear_stored(action, self._place)
+            if member is not None:
+                placed += self.holdings.hear_stored(member.on_file, self._place)
         return actions, placed
 
     def hear_stored(self, stored: Stored, now_ns: int) -> list[str]:
@@ -184,7 +183,7 @@ class RightOfWay:
         for member in self._members.values():
             actions += member.tick(now_ns)
         if self.holdings.life:
-            actions += self.holdings.standings(wishes)
+            actions += self.holdings.standings(wishes, now_ns)
         return actions
 
     def _member(self, plot: int, now_ns: int) -> Member | None:
