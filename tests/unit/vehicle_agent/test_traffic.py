@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import random
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.traffic import Grant, Stand, Standing, Stored, Table
+from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
 from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.member import Member, Refused, Save
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.plots import Plots
+from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
 from vehicle_agent.traffic.warden import BEAT_NS, Warden, first_life, is_far_ahead
 
 GRID = GridSpec(8, 8, 1.0)
@@ -240,6 +242,32 @@ def test_the_older_of_two_lives_learns_that_it_is_replaced() -> None:
     assert holdings.replaced
     assert list(holdings.path("a0-00")) == []
     assert all(said.ended for said in holdings.standings({}, S))
+
+
+def rights_of(agent: str, saved: dict[int, tuple[int, Table]] | None = None) -> RightOfWay:
+    spawns = {name: {f"{name}-00": n} for n, name in enumerate(AGENTS)}
+    return RightOfWay(agent, PLOTS, spawns, OwnRecord(disk=7), saved or {})
+
+
+def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there_that_it_has_stopped() -> None:
+    """Nobody else can: the later life has another file. It had left that plot long ago."""
+    table = msgspec.structs.replace(table_of(1, 1), shut=[Shut("a4", 1 << 32, [9])])
+    member = rights_of(MEMBERS[0], {0: (1, table)})
+    (*_, known) = member.answer_known(KnownRequest(agent="a4", disk=7))
+    assert isinstance(known, Known)
+    assert known.plots == [0]
+    older = rights_of("a4")
+    older.begin(0)
+    for name in AGENTS[:4]:
+        older.hear_known(Known(agent=name, disk=7, life=0, plots=[]))
+    assert older.settled
+    older.holdings.plots.clear()
+    older.holdings.replaced = True
+    assert not older.settled  # so it is asked again what is known of it
+    older.hear_known(known)
+    (said,) = older.tick({}, S)
+    assert isinstance(said, Standing)
+    assert (said.plot, said.ended) == (0, True)
 
 
 @pytest.mark.parametrize("lie", [[0, -8], [-8], [56, 64], [1 << 31]])
