@@ -19,7 +19,7 @@ from swarm.wire.topics import KNOWN, STANDING, STORED, TABLE
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.holdings import Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
-from vehicle_agent.traffic.plots import PLOT_CELLS, Plots
+from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
@@ -62,10 +62,11 @@ class RightOfWaySync:
         self._warn = warn
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
-        self._near = Interest(grid, _LEAD_CELLS, square_cells=PLOT_CELLS)
+        self._near = Interest(grid, _LEAD_CELLS)
         self._seats = frozenset(plot for plot in range(plots.count) if setup.id in plots.members(plot))
         self._listens_to: frozenset[int] = frozenset()
-        self._ask_due_ns: int | None = None
+        self._asking = False
+        self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._refused: set[str] = set()
 
@@ -114,8 +115,7 @@ class RightOfWaySync:
         return True
 
     def tick(self, wishes: Mapping[str, Wish], places: Sequence[int], now_ns: int) -> None:
-        if self._ask_due_ns is not None and now_ns >= self._ask_due_ns:
-            self._ask_due_ns = None
+        if not self._asking and not self.core.settled and now_ns >= self._ask_due_ns:
             self._ask_known()
         holdings = self.core.holdings
         if places:
@@ -125,15 +125,16 @@ class RightOfWaySync:
 
     def _ask_known(self) -> None:
         request = KnownRequest(agent=self._id, disk=self._store.own.disk)
+        self._asking = True
         self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
 
     def _known_ended(self, now_ns: int) -> None:
-        """Begin, once all who could be asked have answered; ask on until everybody has noted our file."""
+        """Begin, once all who could be asked have answered; ask on, ever more rarely, as long as it is needed."""
+        self._asking = False
         if not self.core.holdings.life:
             self._perform(self.core.begin(self._chance))
-        if not self.core.settled:
-            self._ask_due_ns = now_ns + self._ask_wait_ns
-            self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
+        self._ask_due_ns = now_ns + self._ask_wait_ns
+        self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
 
     def _listen(self, plots: frozenset[int]) -> None:
         for plot in sorted(plots - self._listens_to):

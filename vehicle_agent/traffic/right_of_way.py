@@ -92,8 +92,9 @@ class RightOfWay:
 
     @property
     def settled(self) -> bool:
-        """Whether all other agents have noted our file, so that nobody needs to be asked again."""
-        return len(self.own.noted_by) >= len(self._spawns) - 1
+        """Whether nobody needs to be asked what is known of us: all other agents have noted our file, and no later
+        life leaves it to us to say, wherever cells of ours are shut, that we have stopped."""
+        return len(self.own.noted_by) >= len(self._spawns) - 1 and not self.holdings.replaced
 
     def answer_known(self, request: KnownRequest) -> list[Action]:
         """Another agent has begun a life. The last action is what to answer.
@@ -154,12 +155,16 @@ class RightOfWay:
         return [AskKnown()]
 
     def _known(self, agent: str) -> tuple[int, list[int]]:
-        """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles."""
+        """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles or keep
+        some of an earlier life shut."""
         stored = {plot: table for plot, (_, table) in self._saved.items()}
         stored.update((plot, member.stored) for plot, member in self._members.items())
         life = max((table.hosts.get(agent, (0, 0))[0] for table in stored.values()), default=0)
         return life, sorted(
-            plot for plot, table in stored.items() if any(agent_of(v) == agent for v in table.grants)
+            plot
+            for plot, table in stored.items()
+            if any(agent_of(vehicle) == agent for vehicle in table.grants)
+            or any(shut.agent == agent for shut in table.shut)
         )
 
     def leads(self, plot: int) -> bool:
@@ -181,9 +186,8 @@ class RightOfWay:
         placed = []
         if self.holdings.life and table.plot in self.holdings.plots:
             placed = self.holdings.hear_table(table, self._place)
-            for action in actions:
-                if isinstance(action, Stored):
-                    placed += self.holdings.hear_stored(action, self._place)
+            if member is not None:
+                placed += self.holdings.hear_stored(member.on_file, self._place)
         return actions, placed
 
     def hear_stored(self, stored: Stored, now_ns: int) -> list[str]:
@@ -211,8 +215,10 @@ class RightOfWay:
         actions: list[Action] = []
         for member in self._members.values():
             actions += member.tick(now_ns)
+        if self.holdings.replaced:
+            self.holdings.watch(self._known(self.agent)[1])
         if self.holdings.life:
-            actions += self.holdings.standings(wishes)
+            actions += self.holdings.standings(wishes, now_ns)
         if self.holdings.replaced:
             actions += self._again(now_ns)
         return actions
