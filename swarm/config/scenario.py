@@ -239,8 +239,8 @@ class MapConfig(Section, frozen=True, kw_only=True):
                         only. Planners, keepers and the monitor hold all
     interest_m          near: distance up to which an agent holds marks around its vehicles
     digest_s            every replica publishes this often which sets it holds
-    author_marks_per_s  an author which changes more cells than this for ten seconds is named, its sets delayed
-    total_marks_per_s   the same of all authors together: the sets of those above an equal share of it are delayed
+    author_marks_per_s  a process which changes more cells than this for ten seconds is named, its sets delayed
+    total_marks_per_s   the same of all processes together: the sets of those above an equal share of it are delayed
     compact_after_s     an author of which a keeper has heard nothing for so long counts as dead: its sets are
                         compacted with those of other dead authors. Longer than a partition is likely to last
     """
