@@ -140,13 +140,12 @@ class KeeperStore:
         """Author -> what was dropped from its set of this tile, under the number of its last compacted set."""
         return {each.author: each for each in self._sets("FROM folded WHERE tile = ?", tile)}
 
-    def forget_set_aside(self, before_ns: int) -> None:
-        """Delete what compaction set aside before this time."""
+    def tiles_set_aside(self) -> list[int]:
+        """Tiles of which compaction dropped something, in order."""
         try:
-            with self._db:
-                self._db.execute("DELETE FROM folded WHERE since_ns < ?", (before_ns,))
+            return [row[0] for row in self._db.execute("SELECT DISTINCT tile FROM folded ORDER BY tile")]
         except sqlite3.Error as error:
-            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+            raise StoreError(_damaged(self.path, str(error))) from error
 
     def _sets(self, where: str, *values: object) -> Iterator[MarkSet]:
         try:

@@ -239,11 +239,10 @@ class MapConfig(Section, frozen=True, kw_only=True):
                         only. Planners, keepers and the monitor hold all
     interest_m          near: distance up to which an agent holds marks around its vehicles
     digest_s            every replica publishes this often which sets it holds
-    author_marks_per_s  an author which changes more cells than this for ten seconds is named, its sets delayed
-    total_marks_per_s   the same of all authors together: the sets of those above an equal share of it are delayed
+    author_marks_per_s  a process which changes more cells than this for ten seconds is named, its sets delayed
+    total_marks_per_s   the same of all processes together: the sets of those above an equal share of it are delayed
     compact_after_s     an author of which a keeper has heard nothing for so long counts as dead: its sets are
                         compacted with those of other dead authors. Longer than a partition is likely to last
-    compact_keep_s      what compaction dropped can be put back for so long
     """
 
     interest: Literal["all", "near"] = "all"
@@ -252,7 +251,6 @@ class MapConfig(Section, frozen=True, kw_only=True):
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0
     compact_after_s: Positive = 60.0
-    compact_keep_s: Positive = 86_400.0
 
 
 class TlsConfig(Section, frozen=True, kw_only=True):
