@@ -32,13 +32,14 @@ _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
 _PROMISE_TIMEOUT_S = 0.5
 _MOST_REFUSALS_TOLD = 100
+_TELL_AGAIN_NS = 10 * NS_PER_S
 
 
 class RightOfWaySync:
     """Carries an agent's right of way.
 
     placed  called with the vehicles that have found their places
-    warn    called with a sentence about what was refused
+    warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class RightOfWaySync:
         bus: Bus,
         post: Post,
         placed: Callable[[Sequence[str]], None],
-        warn: Callable[[str], None],
+        warn: Callable[[str, str], None],
     ) -> None:
         plots = Plots(grid, list(spawns))
         self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
@@ -69,6 +70,8 @@ class RightOfWaySync:
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._refused: set[str] = set()
+        self._unled_due_ns: dict[int, int] = {}
+        """Plot without a warden -> when that is said again."""
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role="agent")
@@ -122,6 +125,15 @@ class RightOfWaySync:
             holdings.watch(sorted(self._near.update(places)))
         self._listen(self._seats.union(holdings.plots))
         self._perform(self.core.tick(wishes, now_ns))
+        self._tell_unled(now_ns)
+
+    def _tell_unled(self, now_ns: int) -> None:
+        unled = self.core.unled(now_ns)
+        self._unled_due_ns = {plot: self._unled_due_ns.get(plot, now_ns) for plot in unled}
+        for plot, text in unled.items():
+            if now_ns >= self._unled_due_ns[plot]:
+                self._unled_due_ns[plot] = now_ns + _TELL_AGAIN_NS
+                self._warn("waiting", text)
 
     def _ask_known(self) -> None:
         request = KnownRequest(agent=self._id, disk=self._store.own.disk)
@@ -181,4 +193,4 @@ class RightOfWaySync:
                 case Refused(text):
                     if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:
                         self._refused.add(text)
-                        self._warn(text)
+                        self._warn("refused", text)

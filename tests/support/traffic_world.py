@@ -110,7 +110,7 @@ class Process:
             self.disk.bodies[vehicle] = self.rights.holdings.path(vehicle)[0]
             self.world.unmoved.pop(vehicle, None)
             self.world.placed += 1
-        self.world.look()
+            self.world.look()
 
     def tick(self) -> None:
         holdings = self.rights.holdings

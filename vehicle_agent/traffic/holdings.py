@@ -114,6 +114,10 @@ class Holdings:
         self._paths[vehicle] = self._paths[vehicle][: max(keep, 1)]
         self._cells = None
 
+    def waiting(self, plot: int) -> list[str]:
+        """The vehicles that hold cells of a plot, as far as its table in use tells."""
+        return list(self._views[plot].seen) if plot in self._views else []
+
     # --- what members say -----------------------------------------------------------------------------------
 
     def watch(self, plots: Collection[int]) -> None:

@@ -26,6 +26,8 @@ Place = Callable[[str, Sequence[int]], int]
 _LIVES_KEPT = 32
 _ALONE_NS = NS_PER_S // 2
 """A life that has been replaced begins again once no other process of its agent has been alive for so long."""
+_UNLED_NS = 2 * NS_PER_S
+"""A plot that is silent for so long has no warden; another one takes over within a second where it can."""
 
 
 def _first(vehicle: str, cells: Sequence[int]) -> int:
@@ -87,6 +89,8 @@ class RightOfWay:
         self._known_life = 0
         self._twins = Roster()
         self._alone_since_ns: int | None = None
+        self._table_ns: dict[int, int] = {}
+        """Plot that concerns us -> when a table of it was heard last."""
 
     # --- beginning a life -----------------------------------------------------------------------------------
 
@@ -185,6 +189,7 @@ class RightOfWay:
         actions: list[Action] = [] if member is None else [*member.hear_table(table, now_ns)]
         placed = []
         if self.holdings.life and table.plot in self.holdings.plots:
+            self._table_ns[table.plot] = now_ns
             placed = self.holdings.hear_table(table, self._place)
             if member is not None:
                 placed += self.holdings.hear_stored(member.on_file, self._place)
@@ -222,6 +227,20 @@ class RightOfWay:
         if self.holdings.replaced:
             actions += self._again(now_ns)
         return actions
+
+    def unled(self, now_ns: int) -> dict[int, str]:
+        """Why vehicles of ours wait: plot -> that no warden of it is heard."""
+        plots = self.holdings.plots
+        self._table_ns = {plot: self._table_ns.get(plot, now_ns) for plot in plots}
+        found = {}
+        for plot, heard_ns in self._table_ns.items():
+            if now_ns - heard_ns > _UNLED_NS and (vehicles := self.holdings.waiting(plot)):
+                members = self.plots.members(plot)
+                found[plot] = (
+                    f"plot {plot} has no warden: {len(vehicles)} of our vehicles there wait until "
+                    f"{self.plots.majority} of its members {', '.join(members)} run and reach each other and us"
+                )
+        return found
 
     def _member(self, plot: int, now_ns: int) -> Member | None:
         """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is

@@ -270,6 +270,26 @@ def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there
     assert (said.plot, said.ended) == (0, True)
 
 
+def test_whoever_waits_in_a_plot_without_a_warden_says_so() -> None:
+    rights = rights_of("a0")
+    rights.begin(0)
+    life = rights.holdings.life
+
+    def hear(seq: int, now_ns: int) -> None:
+        table = table_of(1, seq, a0=[0])
+        table.hosts["a0"] = (life, 1)
+        rights.hear_table(table, now_ns)
+        rights.hear_stored(Stored(plot=0, agent=MEMBERS[2], epoch=1, seq=seq), now_ns)
+
+    assert rights.unled(S) == {}
+    hear(1, S)
+    assert rights.unled(3 * S) == {}
+    (sentence,) = rights.unled(4 * S).values()
+    assert all(member in sentence for member in MEMBERS)
+    hear(1, 4 * S)  # told again
+    assert rights.unled(5 * S) == {}
+
+
 @pytest.mark.parametrize("lie", [[0, -8], [-8], [56, 64], [1 << 31]])
 def test_cells_from_nowhere_are_not_driven_to(lie: list[int]) -> None:
     holdings = holdings_of()
