@@ -31,13 +31,15 @@ _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
 _PROMISE_TIMEOUT_S = 0.5
 _MOST_REFUSALS_TOLD = 100
+_RESERVE_NS = NS_PER_S
+_TELL_AGAIN_NS = 60 * NS_PER_S
 
 
 class RightOfWaySync:
     """Carries an agent's right of way.
 
     placed  called with the vehicles that have found their places
-    warn    called with a sentence about what was refused
+    warn    called with a kind and a sentence: about what was "refused", about the file of "promises"
     """
 
     def __init__(
@@ -49,7 +51,7 @@ class RightOfWaySync:
         bus: Bus,
         post: Post,
         placed: Callable[[Sequence[str]], None],
-        warn: Callable[[str], None],
+        warn: Callable[[str, str], None],
     ) -> None:
         plots = Plots(grid, list(spawns))
         self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
@@ -67,6 +69,9 @@ class RightOfWaySync:
         self._ask_due_ns: int | None = None
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._refused: set[str] = set()
+        self._reserve_due_ns = 0
+        self._told_silent_ns: int | None = None
+        """When it was last said that our seats are silent; None while they are not."""
 
     def start(self, now_ns: int) -> None:
         self._bus.serve(KNOWN, self._post, agent=self._id)
@@ -79,6 +84,7 @@ class RightOfWaySync:
     def handle(self, event: Event, now_ns: int) -> bool:
         """True if the event was about right of way."""
         core = self.core
+        core.silent = not self._store.ready
         match event:
             case Heard(message=Standing() as standing):
                 core.hear_standing(standing, now_ns)
@@ -111,11 +117,27 @@ class RightOfWaySync:
         if self._ask_due_ns is not None and now_ns >= self._ask_due_ns:
             self._ask_due_ns = None
             self._ask_known()
+        self._look_after_store(now_ns)
         holdings = self.core.holdings
         if places:
             holdings.watch(sorted(self._near.update(places)))
         self._listen(self._seats.union(holdings.plots))
         self._perform(self.core.tick(wishes, now_ns))
+
+    def _look_after_store(self, now_ns: int) -> None:
+        """A seat whose promises would not be on file must not act. Say so, and go on when there is space."""
+        if now_ns >= self._reserve_due_ns:
+            self._reserve_due_ns = now_ns + _RESERVE_NS
+            why = self._store.reserve()
+            told = self._told_silent_ns
+            if self._store.ready:
+                if told is not None:
+                    self._told_silent_ns = None
+                    self._warn("promises", "promises can be written again: this agent votes on right of way again")
+            elif told is None or now_ns - told >= _TELL_AGAIN_NS:
+                self._told_silent_ns = now_ns
+                self._warn("promises", f"{why}; this agent does not vote on right of way until there is space")
+        self.core.silent = not self._store.ready
 
     def _ask_known(self) -> None:
         request = KnownRequest(agent=self._id, disk=self._store.own.disk)
@@ -123,9 +145,10 @@ class RightOfWaySync:
 
     def _known_ended(self, now_ns: int) -> None:
         """Begin, once all who could be asked have answered; ask on until everybody has noted our file."""
-        if not self.core.holdings.life:
+        self.core.silent = not self._store.ready
+        if not self.core.holdings.life and not self.core.silent:
             self._perform(self.core.begin(self._chance))
-        if not self.core.settled:
+        if not self.core.settled or not self.core.holdings.life:
             self._ask_due_ns = now_ns + self._ask_wait_ns
             self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
 
@@ -172,4 +195,4 @@ class RightOfWaySync:
                 case Refused(text):
                     if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:
                         self._refused.add(text)
-                        self._warn(text)
+                        self._warn("refused", text)

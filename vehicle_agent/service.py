@@ -198,10 +198,11 @@ class AgentService:
             self._agent.place(vehicles)
             log.info("%d vehicles have their places", len(self._agent.vehicles))
 
-    def _warn(self, text: str) -> None:
-        log.warning("refused: %s", text)
-        self.counters.count("refused")
-        self._member.note(self._now_ns, "refused", text)
+    def _warn(self, kind: str, text: str) -> None:
+        log.warning("%s: %s", kind, text)
+        if kind == "refused":
+            self.counters.count("refused")
+        self._member.note(self._now_ns, kind, text)
 
     def _stand_down(self, now_ns: int) -> None:
         """A later life of this agent drives the vehicles. This one drives no more, and only keeps its promises."""

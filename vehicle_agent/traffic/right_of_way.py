@@ -54,6 +54,8 @@ class RightOfWay:
     place   tells on which of the cells that it was granted a vehicle of a new life stands
 
     holdings  which cells our vehicles hold: none before `begin`
+    silent    whether our file takes nothing now: then we are no member of any plot, and note nobody's file. What
+              our vehicles hold and are granted does not depend on it
     """
 
     def __init__(
@@ -75,6 +77,7 @@ class RightOfWay:
         self._place = place
         self._members: dict[int, Member] = {}
         self._known_life = 0
+        self.silent = False
 
     # --- beginning a life -----------------------------------------------------------------------------------
 
@@ -89,7 +92,7 @@ class RightOfWay:
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
         first.
         """
-        if request.agent not in self._spawns or request.agent == self.agent:
+        if request.agent not in self._spawns or request.agent == self.agent or self.silent:
             return []
         actions: list[Action] = []
         if request.agent not in self.own.noted:
@@ -106,7 +109,7 @@ class RightOfWay:
         if not is_far_ahead(known.life, self._known_life):
             self._known_life = max(self._known_life, known.life)
         self.holdings.watch([plot for plot in known.plots if plot < self.plots.count])
-        if known.disk != self.own.disk or known.agent in self.own.noted_by:
+        if self.silent or known.disk != self.own.disk or known.agent in self.own.noted_by:
             return []
         self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
         return [self.own]
@@ -181,7 +184,7 @@ class RightOfWay:
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
         """What our members and our vehicles have to say now."""
         actions: list[Action] = []
-        for member in self._members.values():
+        for member in () if self.silent else self._members.values():
             actions += member.tick(now_ns)
         if self.holdings.life:
             actions += self.holdings.standings(wishes)
@@ -190,8 +193,8 @@ class RightOfWay:
     def _member(self, plot: int, now_ns: int) -> Member | None:
         """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is
         not known to be the first, and what was promised in the first is not in it."""
-        known = self._members.get(plot)
-        if known is not None or not 0 <= plot < self.plots.count:
+        known = None if self.silent else self._members.get(plot)
+        if self.silent or known is not None or not 0 <= plot < self.plots.count:
             return known
         members = self.plots.members(plot)
         if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):
