@@ -50,7 +50,7 @@ def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: 
     with out.open("w") as file:
         swarm = subprocess.Popen([*command, "--seconds", "70"], stdout=file, stderr=subprocess.STDOUT)
     try:
-        until(out, "routes are served", 100)
+        until(out, "routes are served", 240)
         (run_dir,) = (disk / "runs").iterdir()
         filler = disk / "filler"
         with pytest.raises(OSError, match="No space"):
