@@ -122,7 +122,7 @@ def _read_npy(path: Path) -> NDArray[np.floating[Any]]:
         raise TerrainError(
             f"field {path}, row {row}, column {col}: a pace of {pace[row, col]}; expected more than 0, or inf"
         )
-    return pace  # type: ignore[no-any-return]
+    return pace
 
 
 class Field:
