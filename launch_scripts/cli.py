@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import sys
@@ -14,7 +15,7 @@ import typer
 
 from launch_scripts.commands import query, roles
 from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Tls, spread
-from swarm.errors import SwarmError
+from swarm.errors import StoreError, SwarmError
 
 
 def _began_s() -> float:
@@ -225,10 +226,27 @@ _mount(
 def main() -> int:
     """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
     try:
-        app(prog_name="swarm")
+        try:
+            app(prog_name="swarm")
+        finally:
+            sys.stdout.flush()
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
+        _leave_output()
         return 0
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
+            raise
+        _leave_output()
+        print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
+        return StoreError.exit_code
     return 0
+
+
+def _leave_output() -> None:
+    """Send what still waits to be printed nowhere: the interpreter would complain about it at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)

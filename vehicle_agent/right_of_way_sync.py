@@ -32,14 +32,17 @@ _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
 _PROMISE_TIMEOUT_S = 0.5
 _MOST_REFUSALS_TOLD = 100
-_TELL_AGAIN_NS = 10 * NS_PER_S
+_RESERVE_NS = NS_PER_S
+_SILENT_AGAIN_NS = 60 * NS_PER_S
+_WAITING_AGAIN_NS = 10 * NS_PER_S
 
 
 class RightOfWaySync:
     """Carries an agent's right of way.
 
     placed  called with the vehicles that have found their places
-    warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait
+    warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait;
+            "promises", for the file of promises
     """
 
     def __init__(
@@ -72,6 +75,9 @@ class RightOfWaySync:
         self._refused: set[str] = set()
         self._unled_due_ns: dict[int, int] = {}
         """Plot without a warden -> when that is said again."""
+        self._reserve_due_ns = 0
+        self._told_silent_ns: int | None = None
+        """When it was last said that our seats are silent; None while they are not."""
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role="agent")
@@ -85,6 +91,7 @@ class RightOfWaySync:
     def handle(self, event: Event, now_ns: int) -> bool:
         """True if the event was about right of way."""
         core = self.core
+        core.silent = not self._store.ready
         match event:
             case Heard(message=Standing() as standing):
                 core.hear_standing(standing, now_ns)
@@ -120,6 +127,7 @@ class RightOfWaySync:
     def tick(self, wishes: Mapping[str, Wish], places: Sequence[int], now_ns: int) -> None:
         if not self._asking and not self.core.settled and now_ns >= self._ask_due_ns:
             self._ask_known()
+        self._look_after_store(now_ns)
         holdings = self.core.holdings
         if places:
             holdings.watch(sorted(self._near.update(places)))
@@ -132,8 +140,23 @@ class RightOfWaySync:
         self._unled_due_ns = {plot: self._unled_due_ns.get(plot, now_ns) for plot in unled}
         for plot, text in unled.items():
             if now_ns >= self._unled_due_ns[plot]:
-                self._unled_due_ns[plot] = now_ns + _TELL_AGAIN_NS
+                self._unled_due_ns[plot] = now_ns + _WAITING_AGAIN_NS
                 self._warn("waiting", text)
+
+    def _look_after_store(self, now_ns: int) -> None:
+        """A seat whose promises would not be on file must not act. Say so, and go on when there is space."""
+        if now_ns >= self._reserve_due_ns:
+            self._reserve_due_ns = now_ns + _RESERVE_NS
+            why = self._store.reserve()
+            told = self._told_silent_ns
+            if self._store.ready:
+                if told is not None:
+                    self._told_silent_ns = None
+                    self._warn("promises", "promises can be written again: this agent votes on right of way again")
+            elif told is None or now_ns - told >= _SILENT_AGAIN_NS:
+                self._told_silent_ns = now_ns
+                self._warn("promises", f"{why}; this agent does not vote on right of way until there is space")
+        self.core.silent = not self._store.ready
 
     def _ask_known(self) -> None:
         request = KnownRequest(agent=self._id, disk=self._store.own.disk)
@@ -141,9 +164,11 @@ class RightOfWaySync:
         self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
 
     def _known_ended(self, now_ns: int) -> None:
-        """Begin, once all who could be asked have answered; ask on, ever more rarely, as long as it is needed."""
+        """Begin, once all who could be asked have answered and promises can be kept; ask on, ever more rarely, as
+        long as it is needed."""
         self._asking = False
-        if not self.core.holdings.life:
+        self.core.silent = not self._store.ready
+        if not self.core.holdings.life and not self.core.silent:
             self._perform(self.core.begin(self._chance))
         self._ask_due_ns = now_ns + self._ask_wait_ns
         self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)

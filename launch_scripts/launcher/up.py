@@ -338,7 +338,7 @@ class _Run:
         )
         numbers = {name: value for name, value in report.items() if name != "series"}
         if self._options.as_json:
-            print(json.dumps(numbers, indent=2))
+            self._terminal.print_json(json.dumps(numbers, indent=2))
         else:
             self._terminal.report(numbers)
         # The figures come first: a full disk keeps nobody from them.

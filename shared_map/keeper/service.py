@@ -107,7 +107,7 @@ class KeeperService:
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]
         self.counters.counts["sets_refused"] = counts["sets_refused"]
-        self.counters.gauge("sets_waiting", float(len(self._keeper.waiting)))
+        self.counters.gauge("sets_waiting", float(self._keeper.waiting))
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
@@ -173,22 +173,21 @@ class KeeperService:
 
     def _save(self, now_ns: int) -> None:
         """Commit what waits. If the disk refuses, say so once, go on serving and try again."""
-        waiting = self._keeper.waiting
-        if not waiting:
-            return
         try:
-            self._store.save(waiting, now_ns)
+            for batch in self._keeper.batches():
+                self._store.save(batch, now_ns)
+                self._keeper.saved(batch)
+                self.counters.count("sets_saved", len(batch))
         except StoreError as error:
             self.counters.count("saves_failed")
             self._save_due_ns = now_ns + _RETRY_NS
             if self._noted_ns is None or now_ns - self._noted_ns >= _NOTE_AGAIN_NS:
                 self._noted_ns = now_ns
-                log.error("%s; %d sets wait, serving goes on", error, len(waiting))
-                self._member.note(now_ns, "store", f"{error}; {len(waiting)} sets wait, serving goes on")
+                text = f"{error}; {self._keeper.waiting} sets wait, serving goes on"
+                log.error("%s", text)
+                self._member.note(now_ns, "store", text)
             return
         if self._noted_ns is not None:
             self._noted_ns = None
             log.info("the store can be written again")
             self._member.note(now_ns, "store", f"the store {self._store.path} can be written again")
-        self._keeper.saved(waiting)
-        self.counters.count("sets_saved", len(waiting))

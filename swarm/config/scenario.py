@@ -21,6 +21,10 @@ ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}$")]
 CommonName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}(~[0-9]{1,4})?$")]
 Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Point = tuple[Metres, Metres]
+Polygon = Annotated[tuple[Point, ...], Meta(min_length=3, max_length=10_000)]
+
+MOST_TARGETS = 1000
+"""Of all entries together."""
 
 Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
@@ -49,7 +53,7 @@ class ZoneConfig(Section, frozen=True, kw_only=True):
     """
 
     kind: Literal["forbidden", "preferred", "road", "rough"]
-    polygon_m: Annotated[tuple[Point, ...], Meta(min_length=3)] | None = None
+    polygon_m: Polygon | None = None
     mask: str | None = None
     name: str = ""
 
@@ -66,7 +70,7 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
     closed_roads: Annotated[int, Meta(ge=0, le=1000)] = 0
     rubble_fields: Annotated[int, Meta(ge=0, le=10_000)] = 0
     flooded_share: Annotated[float, Meta(ge=0, le=0.3)] = 0.0
-    zones: tuple[ZoneConfig, ...] = ()
+    zones: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
 
 
 class TerrainConfig(Section, frozen=True, kw_only=True):
@@ -131,7 +135,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     classes: bool = True
     class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0
-    zones: tuple[ZoneConfig, ...] = ()
+    zones: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
 
 
 class TargetConfig(Section, frozen=True, kw_only=True):
@@ -149,7 +153,7 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     """
 
     name: Name = "t"
-    count: Annotated[int, Meta(ge=1, le=1000)] = 1
+    count: Annotated[int, Meta(ge=1, le=MOST_TARGETS)] = 1
     walk: Walk = "waypoints"
     speed_m_per_s: NotNegative = 4.0
     tracker: Literal["always", "sighted"] = "always"
@@ -329,8 +333,8 @@ class Scenario(Section, frozen=True, kw_only=True):
     time_scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
     terrain: TerrainConfig = TerrainConfig()
     cost: CostConfig = CostConfig()
-    targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1)] = (TargetConfig(),)
-    groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1)] = (GroupConfig(),)
+    targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1, max_length=MOST_TARGETS)] = (TargetConfig(),)
+    groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1, max_length=256)] = (GroupConfig(),)
     vehicles: VehicleConfig = VehicleConfig()
     planner: PlannerConfig = PlannerConfig()
     map: MapConfig = MapConfig()

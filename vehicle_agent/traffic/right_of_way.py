@@ -66,6 +66,8 @@ class RightOfWay:
     place   tells on which of the cells that it was granted a vehicle of a new life stands
 
     holdings  which cells our vehicles hold: none before `begin`
+    silent    whether our file takes nothing now: then we are no member of any plot, and note nobody's file. What
+              our vehicles hold and are granted does not depend on it
     """
 
     def __init__(
@@ -91,14 +93,16 @@ class RightOfWay:
         self._alone_since_ns: int | None = None
         self._table_ns: dict[int, int] = {}
         """Plot that concerns us -> when a table of it was heard last."""
+        self.silent = False
 
     # --- beginning a life -----------------------------------------------------------------------------------
 
     @property
     def settled(self) -> bool:
-        """Whether nobody needs to be asked what is known of us: all other agents have noted our file, and no later
-        life leaves it to us to say, wherever cells of ours are shut, that we have stopped."""
-        return len(self.own.noted_by) >= len(self._spawns) - 1 and not self.holdings.replaced
+        """Whether nobody needs to be asked what is known of us: we live, all other agents have noted our file, and
+        no later life leaves it to us to say, wherever cells of ours are shut, that we have stopped."""
+        noted = len(self.own.noted_by) >= len(self._spawns) - 1
+        return self.holdings.life > 0 and noted and not self.holdings.replaced
 
     def answer_known(self, request: KnownRequest) -> list[Action]:
         """Another agent has begun a life. The last action is what to answer.
@@ -106,7 +110,7 @@ class RightOfWay:
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
         first.
         """
-        if request.agent not in self._spawns or request.agent == self.agent:
+        if request.agent not in self._spawns or request.agent == self.agent or self.silent:
             return []
         actions: list[Action] = []
         if request.agent not in self.own.noted:
@@ -123,7 +127,7 @@ class RightOfWay:
         if not is_far_ahead(known.life, self._known_life):
             self._known_life = max(self._known_life, known.life)
         self.holdings.watch([plot for plot in known.plots if plot < self.plots.count])
-        if known.disk != self.own.disk or known.agent in self.own.noted_by:
+        if self.silent or known.disk != self.own.disk or known.agent in self.own.noted_by:
             return []
         self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
         return [self.own]
@@ -218,7 +222,7 @@ class RightOfWay:
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
         """What our members and our vehicles have to say now."""
         actions: list[Action] = []
-        for member in self._members.values():
+        for member in () if self.silent else self._members.values():
             actions += member.tick(now_ns)
         if self.holdings.replaced:
             self.holdings.watch(self._known(self.agent)[1])
@@ -245,8 +249,8 @@ class RightOfWay:
     def _member(self, plot: int, now_ns: int) -> Member | None:
         """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is
         not known to be the first, and what was promised in the first is not in it."""
-        known = self._members.get(plot)
-        if known is not None or not 0 <= plot < self.plots.count:
+        known = None if self.silent else self._members.get(plot)
+        if self.silent or known is not None or not 0 <= plot < self.plots.count:
             return known
         members = self.plots.members(plot)
         if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):
