@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from launch_scripts.world.service import TargetsService
+from launch_scripts.world.service import TICK_HZ, TargetsService
 from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
-
-TICK_HZ = 10.0
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:

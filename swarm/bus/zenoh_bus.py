@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import zenoh
@@ -92,8 +92,10 @@ class ZenohBus:
         """All that was declared and not yet undeclared, in order; `close` undeclares it backwards."""
         self._subscribers: dict[str, list[Any]] = {}
         """Key expression -> its subscribers, for `unsubscribe`."""
+        self._queryables: dict[str, list[Any]] = {}
+        """Key expression -> its queryables, for `unserve`."""
         self._threads: list[threading.Thread] = []
-        """One per channel; those that have ended are removed at the next `unsubscribe`."""
+        """One per channel; those that have ended are removed when the next is ended."""
         self._logged_s: dict[str, float] = {}
         """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
         self._closed = False
@@ -164,10 +166,7 @@ class ZenohBus:
             self._read(subscriber, arrive, f"sub-{topic.name}")
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        for subscriber in self._subscribers.pop(topic.expression(self._namespace, **fields), ()):
-            self._entities.remove(subscriber)
-            subscriber.undeclare()  # which ends the thread that reads its channel
-        self._threads = [thread for thread in self._threads if thread.is_alive()]  # those of earlier ones
+        self._undeclare_all(self._subscribers.pop(topic.expression(self._namespace, **fields), ()))
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         request_type = topic.request
@@ -197,10 +196,13 @@ class ZenohBus:
             asked = topic.parse(self._namespace, key) or dict.fromkeys(topic.fields, "*") | concrete
             post(Asked(topic, asked, request, answerer))
 
-        queryable = self._session.declare_queryable(
-            topic.expression(self._namespace, **fields), zenoh.handlers.FifoChannel(_QUERY_BUFFER)
-        )
+        expression = topic.expression(self._namespace, **fields)
+        queryable = self._session.declare_queryable(expression, zenoh.handlers.FifoChannel(_QUERY_BUFFER))
+        self._queryables.setdefault(expression, []).append(queryable)
         self._read(queryable, arrive, f"serve-{topic.name}")
+
+    def unserve(self, topic: Topic, **fields: str | int) -> None:
+        self._undeclare_all(self._queryables.pop(topic.expression(self._namespace, **fields), ()))
 
     def ask(
         self,
@@ -290,6 +292,12 @@ class ZenohBus:
         closer.join(_CLOSE_S)
         if closer.is_alive():
             log.warning("the router does not answer: left without closing the session")
+
+    def _undeclare_all(self, entities: Iterable[Any]) -> None:
+        for entity in entities:
+            self._entities.remove(entity)
+            entity.undeclare()  # which ends the thread that reads its channel
+        self._threads = [thread for thread in self._threads if thread.is_alive()]  # those of earlier ones
 
     def _undeclare(self) -> None:
         for entity in reversed(self._entities):

@@ -12,6 +12,7 @@ import msgspec
 from swarm.config.explain import explain, nearest
 from swarm.config.scenario import WHOLE_TREE_STRATEGIES, PlannerConfig, Scenario, TlsConfig, ZoneConfig
 from swarm.errors import ConfigError
+from swarm.ranks import split_rank
 
 
 def load_scenario(path: Path) -> Scenario:
@@ -45,6 +46,9 @@ def _check(scenario: Scenario, source: str) -> None:
     doubled = sorted({id for id in ids if ids.count(id) > 1})
     if doubled:
         raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    for id in ids:
+        if split_rank(id)[1]:  # planner and standby of two targets would share an id
+            raise ConfigError(f"{source}: targets: {id!r} is what a standby of another target is called; rename it")
     for key, zones in (
         ("cost.zones", scenario.cost.zones),
         ("terrain.hidden.zones", scenario.terrain.hidden.zones),
