@@ -22,9 +22,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     scenario = setup.scenario
     target = job_of(setup.id)
     if target not in scenario.target_ids:
-        raise ConfigError(
-            f"scenario {scenario.name} has no target {target}; it has {', '.join(scenario.target_ids)}"
-        )
+        ids = ", ".join(scenario.target_ids)
+        raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = load_terrain(setup)
     warm_up()
     clock = MonotonicClock()

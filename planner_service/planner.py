@@ -126,8 +126,8 @@ class Planner:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
-        """Take over, or leave it to another. Who takes over does not know which routes followers have: each is pushed
-        one."""
+        """Take over, or leave it to another. A planner that takes over does not know which routes followers have:
+        it pushes one to each."""
         self.leads = leads
         if leads:
             self.followers.forget_routes()

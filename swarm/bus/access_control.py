@@ -39,7 +39,7 @@ class Bearer:
     author: str
 
     def own(self, field: str) -> str:
-        """What a field of a key must be where it must be the bearer's own. A standby serves what its leader does."""
+        """What a field of a key must be where it must be the bearer's own. A standby serves its job's."""
         own = {"role": self.role, "author": f"{self.author}.$*", "target": job_of(self.id)}
         return own.get(field, self.id)
 

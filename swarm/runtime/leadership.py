@@ -39,7 +39,8 @@ class Leadership:
 
     - Who leads stops when it hears a better one lead. Better is: ready, then of lower rank, then the younger life.
     - Who hears nobody lead for a lease begins, unless a better one is there, which does so itself.
-    - Who hears a worse one lead begins once it has been ready for `SETTLED_NS`; if that one is not ready, for a lease.
+    - Who hears a worse one lead begins once it has been ready for `SETTLED_NS`, or for a lease if that one is not
+      ready.
     - A leader that stalls for a lease stops if another was ready to replace it.
 
     All periods are measured on a clock that counts the time between two ticks for half a lease at most: while this

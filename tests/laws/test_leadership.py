@@ -1,4 +1,4 @@
-"""Who leads: at most one among those who hear each other, soon one after every fault, and no change without cause."""
+"""Who leads: at most one of those who hear each other, soon one after every fault, no change without cause."""
 
 from __future__ import annotations
 

@@ -52,8 +52,8 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
 
 
 class Beat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
-    """How one of several processes with one job is: a planner of a target or one of its standbys. `ready`: it can do
-    the job. `leads`: it does."""
+    """State of one of several processes with one job, such as a target's planner and its standbys. `ready`: it can
+    do the job. `leads`: it does."""
 
     role: Id
     id: Id
