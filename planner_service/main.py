@@ -28,7 +28,10 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     warm_up()
     clock = MonotonicClock()
     inbox = Inbox()
-    with open_bus(scenario.network) as bus, closing(ThreadWorker("grow-tree", inbox, clock)) as worker:
+    with (
+        open_bus(scenario.network, patient=True) as bus,
+        closing(ThreadWorker("grow-tree", inbox, clock)) as worker,
+    ):
         service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
         process = Process(service, inbox, clock, scenario.planner.tick_hz)
         process.stop_on_signals()

@@ -27,7 +27,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         if setup.run_dir is None
         else FilePromiseStore(setup.run_dir / f"promises-{setup.id}")
     )
-    with open_bus(setup.scenario.network) as bus:
+    with open_bus(setup.scenario.network, patient=True) as bus:
         inbox = Inbox()
         service = AgentService(setup, terrain, truth, bus, inbox.post, store)
         process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz)

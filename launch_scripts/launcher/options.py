@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from launch_scripts.process_table import certificate_name
+from swarm.bus.endpoints import host_port
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
@@ -138,21 +139,6 @@ def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
                 f"port {port}, which {who} needs, is taken; choose others with --port N (N, N+1 and N+2 are used), "
                 "or let --port 0 pick free ones"
             )
-
-
-def host_port(endpoint: str) -> tuple[str, int]:
-    """Host and port of an endpoint such as tcp/[::1]:7447."""
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
-    return host.strip("[]"), int(port)
-
-
-def listening(endpoint: str) -> bool:
-    """Whether something accepts connections there."""
-    try:
-        with socket.create_connection(host_port(endpoint), timeout=0.5):
-            return True
-    except OSError:
-        return False
 
 
 def _taken(host: str, port: int) -> bool:

@@ -18,7 +18,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     terrain = load_terrain(setup)
     truth = load_truth(setup, terrain)
     inbox = Inbox()
-    with open_bus(setup.scenario.network) as bus:
+    with open_bus(setup.scenario.network, patient=True) as bus:
         service = TargetsService(setup, terrain, truth, bus, inbox.post)
         process = Process(service, inbox, MonotonicClock(), TICK_HZ)
         process.stop_on_signals()

@@ -28,6 +28,7 @@ from swarm.bus.bus import (
     Post,
     Replied,
 )
+from swarm.bus.endpoints import listening, wait_for_router
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_threads import guarded, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
@@ -57,15 +58,20 @@ _CLOSE_S = 3.0
 """How long `close` waits for a router that does not answer."""
 
 
-def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
+def open_bus(network: NetworkConfig, *, mode: str = "client", patient: bool = False) -> ZenohBus:
     """Open a session. Raises BusError when it cannot listen or no router answers.
 
-    mode  "client" connects to `network.connect`; "router" listens on `network.listen` and passes messages on
+    mode     "client" connects to `network.connect`; "router" listens on `network.listen` and passes messages on
+    patient  wait for as long as nobody listens there: a process may be started before its router
     """
     endpoints = network.listen if mode == "router" else network.connect
+    if patient:
+        wait_for_router(endpoints)
     try:
         return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace)
     except zenoh.ZError as error:
+        if patient and not any(map(listening, endpoints)):
+            return open_bus(network, patient=True)
         reason = str(error).split(" at /")[0]
         what = "listen on" if mode == "router" else "reach a router at"
         hint = "is the port taken?" if mode == "router" else "is `swarm router` running there?"
