@@ -159,7 +159,9 @@ def new_run_id() -> str:
 
 def common_run_id(scenario: Scenario) -> str:
     """Run id derived from the scenario, so that separately started parts agree on it."""
-    same = msgspec.structs.replace(scenario, network=NetworkConfig(), monitor=MonitorConfig())
+    same = msgspec.structs.replace(
+        scenario, network=NetworkConfig(), monitor=MonitorConfig(), seconds=Scenario().seconds
+    )
     digest = hashlib.blake2b(msgspec.json.encode(same, order="deterministic"), digest_size=4).hexdigest()
     return f"{scenario.name}-{digest}"
 

@@ -137,7 +137,7 @@ def _table(options: UpOptions) -> list[ProcessSpec]:
     if not table:
         of_rank = "" if options.rank is None else f" of rank {options.rank}"
         raise ConfigError(
-            f"scenario {options.scenario.name} has no {' or '.join(options.roles)}{of_rank}; `standbys` says how many"
+            f"scenario {options.scenario.name} has no {' or '.join(options.roles)}{of_rank}; see standbys"
         )
     return table
 

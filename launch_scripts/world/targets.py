@@ -32,6 +32,8 @@ PATIENCE_NS = 5 * NS_PER_S
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
+_MOST_COUNTED = 1 << 32
+"""Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +167,8 @@ class TargetWorld:
             self._others_incarnation = max(self._others_incarnation, pose.incarnation)
             if pose.captures > target.captures:
                 target.calm_until_ns = now_ns + _cool_down_ns(target)
-            target.seq, target.captures, target.jumps = pose.seq, pose.captures, pose.jumps
+            if max(pose.captures, pose.jumps) < _MOST_COUNTED:
+                target.captures, target.jumps = pose.captures, pose.jumps
         if pose.cell != target.walker.cell or not target.config.is_simulated:
             target.walker.put(pose.cell)
         target.x_m, target.y_m = pose.x_m, pose.y_m

@@ -290,7 +290,8 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
     connect            endpoints of the routers that the other processes connect to
     peers              endpoints of other routers that a router connects to
     lease_s            a peer that is silent for this long counts as gone
-    connect_timeout_s  a process that reaches no router for this long ends
+    connect_timeout_s  a tool that reaches no router for this long ends, and a process whose router listens but does
+                       not answer; while no router listens, processes wait
     tls                certificates, for endpoints beyond loopback
     admit              names in certificates that a router lets take part, beside those of the scenario's processes:
                        router.north, keeper.east, operator.anna
