@@ -205,9 +205,9 @@ class AgentService:
         self._member.note(self._now_ns, "refused", text)
 
     def _stand_down(self, now_ns: int) -> None:
-        """A later life of this agent drives the vehicles. This one drives no more, and only keeps its promises."""
+        """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""
         self._agent.stand_down()
-        text = f"agent {self._setup.id} runs elsewhere, too, and that one is the younger: this one drives no more"
+        text = f"agent {self._setup.id} runs elsewhere, too, and that one is younger: this one drives no more"
         log.warning(text)
         self._member.note(now_ns, "replaced", text)
 

@@ -30,6 +30,7 @@ from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import Scenario
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
+from swarm.wire.authentication import Authenticator
 from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
@@ -93,7 +94,8 @@ class Node:
         """Start a new incarnation."""
         simulation = self._simulation
         simulation.log.event(self._clock.now_ns(), "boot", self.name)
-        bus = self.bus = simulation.network.bus(self.name, simulation.scenario.network.namespace)
+        namespace = simulation.scenario.network.namespace
+        bus = self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)
         worker = self._worker = InlineWorker(simulation.scheduler)
 
         def post(event: Event) -> None:
@@ -173,6 +175,7 @@ class Simulation:
         self.scenario = scenario
         self.faults = faults or FaultPlan()
         self.run_id = f"simulated-{scenario.seed}"
+        self.authenticator = Authenticator(b"simulated", self.run_id)
         self.terrain = terrain or build_terrain(scenario)
         self.truth = build_truth(scenario, self.terrain)
         self.recorder = Recorder(scenario, self.terrain.grid)

@@ -63,6 +63,7 @@ def test_who_is_started_before_the_router_waits_says_so_once_and_goes_on(hands: 
     assert keeper.poll() is part.poll() is None
     assert hands.logs().count(sentence) == 3
     hands.start("router", scenario)
+    eventually(lambda: swarm("status", "--connect", connect).returncode == 0, 60, "the router")
     eventually(lambda: len(hands.members()) == 4, 150, "router, keeper and planners")
     assert len({run_id for role, _, run_id in hands.members() if role != "router"}) == 1
     for process in (part, keeper):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.simulated_swarm import Laws, names, seeded
+from support.simulated_swarm import WIDE_TERRAIN, Laws, names, seeded
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
 from launch_scripts.simulation.simulate import Simulation
@@ -12,15 +12,9 @@ from swarm.config.scenario import Scenario
 from vehicle_agent.service import AgentService
 
 SECONDS = 24.0
-WIDE: Scenario = parse_scenario("""
+WIDE: Scenario = parse_scenario(f"""
 name = "wide"
-time_scale = 40
-[terrain]
-source = "synthetic"
-rows = 280
-cols = 800
-resolution_m = 30
-relief_m = 200
+{WIDE_TERRAIN}
 [terrain.hidden]
 rubble_fields = 6
 [cost]

@@ -1,4 +1,4 @@
-"""A sender of well-formed lies: any message that passes the door, made of the bounds in its type."""
+"""A sender of well-formed lies: any message that `decode` accepts, made of the bounds in its type."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Liar:
     # --- making ---------------------------------------------------------------------------------------------
 
     def lie(self, kind: type[M]) -> M:
-        """A message of this type which passes the door."""
+        """A message of this type which `decode` accepts."""
         for _ in range(30):
             try:
                 made = self._made(kind)

@@ -45,6 +45,17 @@ sense_range_m = 120
 capture_range_m = 60
 """)
 
+WIDE_TERRAIN = """
+time_scale = 40
+[terrain]
+source = "synthetic"
+rows = 280
+cols = 800
+resolution_m = 30
+relief_m = 200
+"""
+"""Begins a scenario with eight regions, in which vehicles drive ten cells a second and cross borders."""
+
 Stamp = tuple[int, int]
 Sets = dict[tuple[str, int], Stamp]
 """(author, tile) -> (epoch, seq)."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.simulated_swarm import Laws, names, seeded
+from support.simulated_swarm import WIDE_TERRAIN, Laws, names, seeded
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import Simulation
@@ -71,15 +71,9 @@ def test_within_its_regions_it_equals_one_that_holds_all(
     assert near.missing(everything.held.ledger.held()) == []
 
 
-NEAR: Scenario = parse_scenario("""
+NEAR: Scenario = parse_scenario(f"""
 name = "near"
-time_scale = 40
-[terrain]
-source = "synthetic"
-rows = 280
-cols = 800
-resolution_m = 30
-relief_m = 200
+{WIDE_TERRAIN}
 [terrain.hidden]
 rubble_fields = 12
 flooded_share = 0.02
