@@ -16,6 +16,7 @@ import typer
 from launch_scripts.commands import query, roles
 from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Tls, spread
 from swarm.errors import StoreError, SwarmError
+from swarm.ranks import HIGHEST_RANK
 
 
 def _began_s() -> float:
@@ -100,6 +101,14 @@ def up(
     only: Annotated[
         list[str] | None, typer.Option(help="Start only this role; may be given several times.")
     ] = None,
+    rank: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=HIGHEST_RANK,
+            help="Of planners and the targets process, start those of this rank: 0 lead, 1 stand by, and so on.",
+        ),
+    ] = None,
     run_id: Annotated[
         str | None, typer.Option(help="Take part in this run; by default a new one, or the one in the namespace.")
     ] = None,
@@ -111,9 +120,13 @@ def up(
 
     swarm up my.toml --only router --only keeper
 
+    swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-ca ca.pem --tls-cert . --tls-key .
+
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
-    _up(scenario, run, tls, connect=connect, listen=listen, namespace=namespace, only=only, run_id=run_id)
+    _up(
+        scenario, run, tls, connect=connect, listen=listen, namespace=namespace, only=only, rank=rank, run_id=run_id
+    )
 
 
 def _up(
@@ -125,6 +138,7 @@ def _up(
     listen: str | None = None,
     namespace: str | None = None,
     only: list[str] | None = None,
+    rank: int | None = None,
     run_id: str | None = None,
 ) -> None:
     import msgspec
@@ -162,6 +176,7 @@ def _up(
         run.runs,
         roles=roles,
         joins="router" not in roles,
+        rank=rank,
         run_id=run_id,
         as_json=run.as_json,
         plain=run.plain,

@@ -20,6 +20,7 @@ from swarm.config.scenario import (
     ZoneConfig,
 )
 from swarm.errors import ConfigError
+from swarm.ranks import split_rank
 
 
 def load_scenario(path: Path) -> Scenario:
@@ -47,6 +48,9 @@ def _check(scenario: Scenario, source: str) -> None:
     doubled = sorted(id for id, times in Counter(ids).items() if times > 1)
     if doubled:
         raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    for id in ids:
+        if split_rank(id)[1]:  # planner and standby of two targets would share an id
+            raise ConfigError(f"{source}: targets: {id!r} is what a standby of another target is called; rename it")
     for key, zones in (
         ("cost.zones", scenario.cost.zones),
         ("terrain.hidden.zones", scenario.terrain.hidden.zones),

@@ -12,9 +12,12 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from swarm.ranks import HIGHEST_RANK
+
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
+Standbys = Annotated[int, Meta(ge=0, le=HIGHEST_RANK)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
 GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
 ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}$")]
@@ -236,6 +239,17 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     push_s: Positive = 1.0
 
 
+class StandbyConfig(Section, frozen=True, kw_only=True):
+    """Processes that stand by: as many as said keep up with each one that leads, and take over when it is dead.
+
+    planner  standbys of each target's planner; each costs as much as that planner
+    targets  standbys of the process that moves the targets
+    """
+
+    planner: Standbys = 0
+    targets: Standbys = 0
+
+
 class MapConfig(Section, frozen=True, kw_only=True):
     """How the shared map is replicated.
 
@@ -278,7 +292,8 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
     connect            endpoints of the routers that the other processes connect to
     peers              endpoints of other routers that a router connects to
     lease_s            a peer that is silent for this long counts as gone
-    connect_timeout_s  a process that reaches no router for this long ends
+    connect_timeout_s  a tool that reaches no router for this long ends, and a process whose router listens but does
+                       not answer; while no router listens, processes wait
     tls                certificates, for endpoints beyond loopback
     admit              names in certificates that a router lets take part, beside those of the scenario's processes:
                        router.north, keeper.east, operator.anna
@@ -322,6 +337,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     groups      which vehicles there are
     vehicles    how vehicles behave
     planner     how a planner keeps its tree
+    standbys    which processes stand by
     map         how the shared map is replicated
     network     where processes meet
     monitor     the live view
@@ -337,6 +353,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1, max_length=256)] = (GroupConfig(),)
     vehicles: VehicleConfig = VehicleConfig()
     planner: PlannerConfig = PlannerConfig()
+    standbys: StandbyConfig = StandbyConfig()
     map: MapConfig = MapConfig()
     network: NetworkConfig = NetworkConfig()
     monitor: MonitorConfig = MonitorConfig()

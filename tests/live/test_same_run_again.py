@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 from support.live_swarm import LiveSwarm, swarm
 from support.processes import eventually, session_of
@@ -50,5 +51,6 @@ def test_parts_of_a_swarm_that_are_started_on_several_machines_belong_to_one_run
     from launch_scripts.launcher.options import common_run_id, with_port
 
     scenario = find_scenario("synthetic")
-    assert common_run_id(with_port(scenario, 4711)) == common_run_id(scenario)
+    longer = msgspec.structs.replace(scenario, seconds=scenario.seconds + 60)
+    assert common_run_id(with_port(scenario, 4711)) == common_run_id(longer) == common_run_id(scenario)
     assert common_run_id(find_scenario("jacksboro")) != common_run_id(scenario)

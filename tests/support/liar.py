@@ -29,7 +29,23 @@ from swarm.wire.statements import PACE_LEAST, PACE_MOST
 from swarm.wire.topics import TOPICS, Topic
 
 BY_TYPE = {type(example): example for example in EXAMPLES}
-NAMES = ("t0", "t1", "a0", "a1", "a0-00", "a0-01", "all.a0.1", "a0.1", "all", "0", "agent", "keeper", "x" * 64)
+NAMES = (
+    "t0",
+    "t1",
+    "a0",
+    "a1",
+    "a0-00",
+    "a0-01",
+    "all.a0.1",
+    "a0.1",
+    "all",
+    "0",
+    "agent",
+    "keeper",
+    "planner",
+    "t0.r1",
+    "x" * 64,
+)
 ROLES = ("agent", "planner", "keeper", "targets", "monitor", "router")
 
 M = TypeVar("M")
