@@ -52,7 +52,8 @@ class RightOfWaySync:
         warn: Callable[[str], None],
     ) -> None:
         plots = Plots(grid, list(spawns))
-        self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
+        self._new_core = lambda: RightOfWay(setup.id, plots, spawns, store.own, store.saved)
+        self.core = self._new_core()
         self._id = setup.id
         self._store = store
         self._bus = bus
@@ -74,6 +75,12 @@ class RightOfWaySync:
         for plot in sorted(self._seats):
             self._bus.subscribe(STANDING, self._post, plot=plot)
         self._listen(self._seats)
+        self._ask_known()
+
+    def begin_again(self) -> None:
+        """Begin a later life in this process, from what is on file, as a new process would."""
+        self.core = self._new_core()
+        self._chance ^= self.core.own.lives[-1] if self.core.own.lives else 1
         self._ask_known()
 
     def handle(self, event: Event, now_ns: int) -> bool:
