@@ -52,8 +52,9 @@ class RightOfWaySync:
         warn: Callable[[str], None],
     ) -> None:
         plots = Plots(grid, list(spawns))
-        self._new_core = lambda: RightOfWay(setup.id, plots, spawns, store.own, store.saved)
-        self.core = self._new_core()
+        self._plots = plots
+        self._spawns = spawns
+        self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
         self._id = setup.id
         self._store = store
         self._bus = bus
@@ -79,7 +80,7 @@ class RightOfWaySync:
 
     def begin_again(self) -> None:
         """Begin a later life in this process, from what is on file, as a new process would."""
-        self.core = self._new_core()
+        self.core = RightOfWay(self._id, self._plots, self._spawns, self._store.own, self._store.saved)
         self._chance ^= self.core.own.lives[-1] if self.core.own.lives else 1
         self._ask_known()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +106,8 @@ class AgentService:
             scenario.vehicles.sense_range_m,
         )
         self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
-        self._new_agent = lambda: Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings)
-        self._agent = self._new_agent()
+        self._new_agent = partial(Agent, plan, scenario, local, sensor)
+        self._agent = self._new_agent(self._right_of_way.core.holdings)
         self._replaced = Replaced()
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
@@ -233,7 +234,7 @@ class AgentService:
     def _begin_again(self, now_ns: int) -> None:
         """Nobody drives the vehicles: what told of a younger life was wrong, or it has ended."""
         self._right_of_way.begin_again()
-        self._agent = self._new_agent()
+        self._agent = self._new_agent(self._right_of_way.core.holdings)
         self._agent.set_planners(self._roster.alive("planner"), now_ns)
         text = f"no other process answers for agent {self._setup.id}: a new life begins here"
         log.warning(text)

@@ -6,6 +6,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from launch_scripts.process_table import ROLES
+
 _PROC = Path("/proc")
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
@@ -19,26 +21,30 @@ class Usage:
     files: int
 
 
+_ROLES = tuple(f"{role}-" for role in ROLES)
+
+
 def processes(run_dir: Path) -> dict[str, int]:
     """Name -> pid of the processes that log into a run's folder; the launcher itself is not among them."""
     found: dict[str, int] = {}
-    for pid in _pids():
+    for pid in os.listdir(_PROC):
+        if not pid.isdigit():
+            continue
         try:
-            log = os.readlink(_PROC / str(pid) / "fd" / "1")
-            state = (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()[0]
+            log = Path(os.readlink(_PROC / pid / "fd" / "1"))
         except OSError:  # ended meanwhile, or somebody else's
             continue
-        path = Path(log)
-        if path.parent == run_dir and path.name.startswith(_ROLES) and state != "Z":
-            found[path.name.partition(".log")[0]] = pid
+        if log.parent == run_dir and log.name.startswith(_ROLES) and not has_ended(int(pid)):
+            found[log.name.partition(".log")[0]] = int(pid)
     return found
 
 
-_ROLES = ("router-", "keeper-", "monitor-", "planner-", "targets-", "agent-")
-
-
-def _pids() -> list[int]:
-    return [int(each) for each in os.listdir(_PROC) if each.isdigit()]
+def has_ended(pid: int) -> bool:
+    """Whether a process is gone, or dead and not yet reaped."""
+    try:
+        return (_PROC / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except OSError:
+        return True
 
 
 def usage(pid: int) -> Usage | None:

@@ -17,7 +17,7 @@ import numpy as np
 from launch_scripts.chaos.blows import BLOWS, Blow, blows
 from launch_scripts.chaos.hostile import KINDS, Hostile
 from launch_scripts.chaos.lies import NAMES, Lies
-from launch_scripts.chaos.processes import Usage, processes, usage
+from launch_scripts.chaos.processes import Usage, has_ended, processes, usage
 from launch_scripts.chaos.recovery import Recovery
 from launch_scripts.chaos.stranger import Stranger
 from launch_scripts.chaos.tally import Ended, Outcome, Sample, Tally, name_of
@@ -35,10 +35,12 @@ _UP_WITHIN_S = 180.0
 _SETTLE_S = 5.0
 _WATCH_S = 30.0
 """A blow that has not recovered by then never does."""
-_SCAN_S = 0.25
+_SCAN_S = 0.2
 _SAMPLE_S = 1.0
 _AT_ONCE = 25
 """Hostile messages between two looks at what is heard."""
+_MESSAGES_PER_S = 2000.0
+"""Faster ones would be dropped by our own session, and not reach the router."""
 _END_S = 60.0
 _MARGIN_S = 600.0
 _COMMAND = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
@@ -260,14 +262,16 @@ class Siege:
         self._stopped.clear()
 
     def _burst(self, stranger: Stranger, lasts_s: float) -> int:
-        until_s, many = self._now_s + lasts_s, 0
-        while self._now_s < until_s and not self._finished():
+        for key, payload in stranger.said():
+            self._hostile.heard(key, payload)
+        began_s, many = self._now_s, 0
+        while self._now_s < began_s + lasts_s and not self._finished():
             for _ in range(_AT_ONCE):
                 kind, key, payload = self._hostile.next()
                 stranger.say(key, payload)
                 self.tally.messages[kind] = self.tally.messages.get(kind, 0) + 1
                 many += 1
-            self._listen(stranger, 0.0)
+            self._listen(stranger, max(began_s + many / _MESSAGES_PER_S - self._now_s, 0.0))
         return many
 
     # --- watching -------------------------------------------------------------------------------------------
@@ -276,8 +280,8 @@ class Siege:
         """Take in what is said for so long; look at the processes when it is time."""
         until_s = self._now_s + seconds
         while True:
-            for key, payload in stranger.take(min(max(until_s - self._now_s, 0.0), 0.05)):
-                self._hear(key, payload)
+            for payload in stranger.reports(min(max(until_s - self._now_s, 0.0), 0.05)):
+                self._hear(payload)
             now_s = self._now_s
             if now_s >= self._scan_due_s:
                 self._scan_due_s = now_s + _SCAN_S
@@ -288,10 +292,7 @@ class Siege:
             if now_s >= until_s:
                 return
 
-    def _hear(self, key: str, payload: bytes) -> None:
-        self._hostile.heard(key, payload)
-        if FLEET.parse(self._scenario.network.namespace, key) is None:
-            return
+    def _hear(self, payload: bytes) -> None:
         with contextlib.suppress(ProtocolError):
             fleet = decode(payload, FLEET.message)
             self._recovery.hear(fleet, self._now_s)  # type: ignore[arg-type]
@@ -306,13 +307,15 @@ class Siege:
 
     def _scan(self) -> None:
         """Who runs now; who has ended without being killed."""
-        found = processes(self.run_dir)
-        for name, pid in self._pids.items():
-            if found.get(name) != pid and pid not in self._killed and _ended(pid):
-                self._killed.add(pid)
+        gone = [(name, pid) for name, pid in self._pids.items() if has_ended(pid)]
+        for name, pid in gone:
+            del self._pids[name]
+            if pid not in self._killed:
                 self.tally.ended.append(Ended(at_s=self._now_s, name=name, reason=self._reason(name)))
                 self._tell(f"{name} ended by itself at {self._now_s:.1f} s")
-        self._pids = {name: pid for name, pid in {**self._pids, **found}.items() if not _ended(pid)}
+        # To search costs more than all else here, so only what is missing is searched for.
+        if len(self._pids) < len(self._names):
+            self._pids.update(processes(self.run_dir))
 
     def _reason(self, name: str) -> str:
         """What the launcher said of it last."""
@@ -351,10 +354,3 @@ def _sentence(outcome: Outcome) -> str:
 def _send(pid: int, number: signal.Signals) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, number)
-
-
-def _ended(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
-    except OSError:
-        return True

@@ -45,16 +45,17 @@ def simulate_once(name: str, seed: int | None, seconds: float | None, trace: Pat
 
 def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: int, as_json: bool) -> bool:
     """Run many seeds with faults, and print what they break. True if every law held in all of them."""
+    from launch_scripts.launcher.options import find_scenario
     from launch_scripts.simulation.campaign import MIX, run_seeds
-    from launch_scripts.simulation.trial import SECONDS, build
+    from launch_scripts.simulation.trial import SECONDS
+    from launch_scripts.simulation.worlds import WORLDS
 
     some = parse_seeds(seeds)
     name = MIX if name is None else name
-    if name != MIX:
-        build(name, some[0])  # raises on a name that nothing has, before any process starts
+    given = None if name in (MIX, *WORLDS) else find_scenario(name)
     began_s = time.monotonic()
     verdicts: list[Verdict] = []
-    for verdict in run_seeds(name, some, jobs, SECONDS if seconds is None else seconds):
+    for verdict in run_seeds(name, some, jobs, SECONDS if seconds is None else seconds, given):
         verdicts.append(verdict)
         typer.echo(_line(verdict, len(verdicts), len(some)), err=as_json)
     verdicts.sort(key=lambda verdict: verdict.seed)

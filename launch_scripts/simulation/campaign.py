@@ -9,6 +9,7 @@ from itertools import islice
 
 from launch_scripts.simulation.trial import SECONDS, Verdict, try_seed
 from launch_scripts.simulation.worlds import WORLDS
+from swarm.config.scenario import Scenario
 
 MIX = "mix"
 """Each seed in the world of `WORLDS` that is its turn."""
@@ -18,11 +19,16 @@ def world_of(name: str, seed: int) -> str:
     return WORLDS[seed % len(WORLDS)] if name == MIX else name
 
 
-def run_seeds(name: str, seeds: Sequence[int], jobs: int, seconds: float = SECONDS) -> Iterator[Verdict]:
-    """Try each seed; yields verdicts as they come. What a seed does depends on nothing but its world and number."""
+def run_seeds(
+    name: str, seeds: Sequence[int], jobs: int, seconds: float = SECONDS, given: Scenario | None = None
+) -> Iterator[Verdict]:
+    """Try each seed; yields verdicts as they come. What a seed does depends on nothing but its world and number.
+
+    name   a world, `MIX`, or the name of the scenario that is `given`
+    """
     if jobs == 1 or len(seeds) == 1:
         for seed in seeds:
-            yield try_seed(world_of(name, seed), seed, seconds)
+            yield try_seed(world_of(name, seed), seed, seconds, given)
         return
     # Children of their own, not forks: numpy and numba have threads.
     context = multiprocessing.get_context("spawn")
@@ -32,7 +38,7 @@ def run_seeds(name: str, seeds: Sequence[int], jobs: int, seconds: float = SECON
     try:
         while True:
             for seed in islice(rest, jobs + 1 - len(waiting)):
-                waiting.add(executor.submit(try_seed, world_of(name, seed), seed, seconds))
+                waiting.add(executor.submit(try_seed, world_of(name, seed), seed, seconds, given))
             if not waiting:
                 return
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)

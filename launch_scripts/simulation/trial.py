@@ -8,12 +8,11 @@ from typing import Any
 
 import msgspec
 
-from launch_scripts.launcher.options import find_scenario
 from launch_scripts.process_table import processes_of
 from launch_scripts.simulation.faults import FaultPlan, random_plan
 from launch_scripts.simulation.laws import Laws, Routed, Waits, missing, replica_of
 from launch_scripts.simulation.simulate import SIMULATED_ROLES, Simulation
-from launch_scripts.simulation.worlds import WORLDS, world
+from launch_scripts.simulation.worlds import world
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import Scenario
 
@@ -60,17 +59,12 @@ def nodes_of(scenario: Scenario) -> list[str]:
     return [spec.name for spec in processes_of(scenario, SIMULATED_ROLES)]
 
 
-def build(name: str, seed: int) -> tuple[Scenario, Terrain]:
-    """A world by name, else a scenario by name or file. Raises ConfigError."""
-    if name in WORLDS:
-        return world(name, seed)
-    scenario = msgspec.structs.replace(find_scenario(name), seed=seed)
-    return scenario, build_terrain(scenario)
+def try_seed(name: str, seed: int, seconds: float = SECONDS, given: Scenario | None = None) -> Verdict:
+    """Run a world with all faults of a seed. A service that raises is a broken law, too.
 
-
-def try_seed(name: str, seed: int, seconds: float = SECONDS) -> Verdict:
-    """Run a world with all faults of a seed. A service that raises is a broken law, too."""
-    scenario, terrain = build(name, seed)
+    given  the scenario of that name, where it is none of `WORLDS`
+    """
+    scenario, terrain = world(name, seed) if given is None else _seeded(given, seed)
     plan = random_plan(seed, nodes_of(scenario), seconds)
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
     began_s = time.perf_counter()
@@ -153,6 +147,11 @@ class Trial:
         if routed.after_s is not None and routed.after_s > ROUTED_WITHIN_S:
             return [f"the last vehicle has a route {routed.after_s:.1f} s after the last fault"]
         return []
+
+
+def _seeded(scenario: Scenario, seed: int) -> tuple[Scenario, Terrain]:
+    scenario = msgspec.structs.replace(scenario, seed=seed)
+    return scenario, build_terrain(scenario)
 
 
 def _count(plan: FaultPlan) -> dict[str, int]:
