@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -37,12 +38,16 @@ _WATCH_S = 30.0
 """A blow that has not recovered by then never does."""
 _SCAN_S = 0.2
 _SAMPLE_S = 1.0
-_AT_ONCE = 25
+_AT_ONCE = 100
 """Hostile messages between two looks at what is heard."""
+_MATERIAL_S = 1.0
+"""So long before each burst everything that is said is kept as material."""
 _MESSAGES_PER_S = 2000.0
 """Faster ones would be dropped by our own session, and not reach the router."""
 _END_S = 60.0
 _MARGIN_S = 600.0
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
 _COMMAND = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
 
 
@@ -124,13 +129,17 @@ class Siege:
         """`swarm up`, in a session of its own; ends it, and all that it started."""
         options = self._options
         port = self._scenario.network.connect[0].rpartition(":")[2]
-        # Should we be killed, it ends by itself.
         limit_s = (options.seconds or _LONGEST_S) + _MARGIN_S
         command = [*_COMMAND, "up", options.scenario, "--port", port, "--plain", "--no-live"]
         command += ["--seconds", f"{limit_s:g}", "--run-id", self.run_dir.name, "--runs", str(options.runs)]
         with (self.run_dir / "up.log").open("wb") as output:
             launcher = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=_end_with_parent,
             )
         try:
             yield launcher
@@ -262,8 +271,10 @@ class Siege:
         self._stopped.clear()
 
     def _burst(self, stranger: Stranger, lasts_s: float) -> int:
-        for key, payload in stranger.said():
-            self._hostile.heard(key, payload)
+        with stranger.listening_to_all() as last:
+            self._listen(stranger, _MATERIAL_S)
+        for key, sample in sorted(last.items()):
+            self._hostile.heard(key, sample.payload.to_bytes())
         began_s, many = self._now_s, 0
         while self._now_s < began_s + lasts_s and not self._finished():
             for _ in range(_AT_ONCE):
@@ -354,3 +365,8 @@ def _sentence(outcome: Outcome) -> str:
 def _send(pid: int, number: signal.Signals) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, number)
+
+
+def _end_with_parent() -> None:
+    """In the launcher, before it begins: the kernel tells it to stop when we are gone, even if we are killed."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGINT))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -28,18 +30,17 @@ class Stranger:
         self._there = threading.Event()
         self._last: dict[str, Any] = {}
         """Key -> the last sample under it."""
-        session, namespace = self._bus.session, network.namespace
-        self._ears = [
-            session.declare_subscriber(key, hear, allowed_origin=zenoh.Locality.REMOTE)
-            for key, hear in ((FLEET.expression(namespace), self._hear_fleet), (f"{namespace}/**", self._hear))
-        ]
+        self._namespace = network.namespace
+        self._fleets = self._subscribe(FLEET.expression(network.namespace), self._hear_fleet)
+
+    def _subscribe(self, key: str, hear: Callable[[Any], None]) -> Any:
+        return self._bus.session.declare_subscriber(key, hear, allowed_origin=zenoh.Locality.REMOTE)
 
     def _hear_fleet(self, sample: Any) -> None:
         self._waiting.append(sample.payload.to_bytes())
         self._there.set()
 
     def _hear(self, sample: Any) -> None:
-        # Two thousand a second: so nothing is done here but to keep it.
         key = str(sample.key_expr)
         if key in self._last or len(self._last) < _KEYS:
             self._last[key] = sample
@@ -51,15 +52,21 @@ class Stranger:
             self._there.wait(timeout_s)
         return [self._waiting.popleft() for _ in range(len(self._waiting))]
 
-    def said(self) -> list[tuple[str, bytes]]:
-        """The last payload of every key."""
-        return [(key, sample.payload.to_bytes()) for key, sample in sorted(self._last.copy().items())]
+    @contextlib.contextmanager
+    def listening_to_all(self) -> Iterator[dict[str, Any]]:
+        """Key -> the last sample under it, filled while the block lasts: thousands of messages a second, for which
+        a busy machine has no time all along."""
+        self._last = {}
+        ear = self._subscribe(f"{self._namespace}/**", self._hear)
+        try:
+            yield self._last
+        finally:
+            ear.undeclare()
 
     def say(self, key: str, payload: bytes) -> None:
         # As our own processes put: to block would wait for the slowest reader of the run.
         self._bus.session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
 
     def close(self) -> None:
-        for ear in self._ears:
-            ear.undeclare()  # type: ignore[no-untyped-call]
+        self._fleets.undeclare()
         self._bus.close()

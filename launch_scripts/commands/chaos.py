@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import sys
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -20,15 +19,16 @@ def chaos(options: SiegeOptions, as_json: bool) -> bool:
     from launch_scripts.chaos.siege import Siege
     from swarm.errors import StoreError
 
-    # A second thought must still end the swarm: as an exception, it passes every `finally`.
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: sys.exit(1))
+    # As an exception, the end passes every `finally`, and with it the end of the swarm.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _interrupt)
     siege = Siege(options, lambda text: typer.echo(text, err=True))
     typer.echo(f"logs, chaos.json and chaos.png in {siege.run_dir}", err=True)
+    interrupted = False
     try:
         tally = siege.run()
     except KeyboardInterrupt:
-        tally = siege.tally
+        tally, interrupted = siege.tally, True
         typer.echo("interrupted: the figures are of the part that has run", err=True)
     report = tally.report()
     try:
@@ -40,7 +40,11 @@ def chaos(options: SiegeOptions, as_json: bool) -> bool:
         typer.echo(json.dumps({name: value for name, value in report.items() if name != "samples"}, indent=2))
     else:
         _print(tally, report)
-    return not report["broken"]
+    return not report["broken"] and not interrupted
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
 
 
 def check_kinds(option: str, given: list[str] | None, known: tuple[str, ...]) -> tuple[str, ...]:
