@@ -11,6 +11,7 @@ from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 from vehicle_agent.promise_store import FilePromiseStore, MemoryPromiseStore, PromiseStore
 from vehicle_agent.service import AgentService
 
@@ -27,7 +28,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         if setup.run_dir is None
         else FilePromiseStore(setup.run_dir / f"promises-{setup.id}")
     )
-    with open_bus(setup.scenario.network) as bus:
+    network = setup.scenario.network
+    with open_bus(network, authenticator=authenticator_of(network, setup.run_id)) as bus:
         inbox = Inbox()
         service = AgentService(setup, terrain, truth, bus, inbox.post, store)
         process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz)

@@ -9,9 +9,10 @@ from hashlib import blake2s
 from msgspec.structs import replace
 
 from shared_map.replication.interest import Interest
-from swarm.bus.bus import Asked, AskEnded, Bus, Event, Heard, Post, Replied
+from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
+from swarm.liveness import Peer
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Claim, Known, KnownRequest, Standing, Stored, Table
 from swarm.wire.topics import KNOWN, STANDING, STORED, TABLE
@@ -19,7 +20,7 @@ from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.holdings import Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.plots import PLOT_CELLS, Plots
-from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +53,6 @@ class RightOfWaySync:
         warn: Callable[[str], None],
     ) -> None:
         plots = Plots(grid, list(spawns))
-        self._plots = plots
-        self._spawns = spawns
         self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
         self._id = setup.id
         self._store = store
@@ -71,17 +70,12 @@ class RightOfWaySync:
         self._refused: set[str] = set()
 
     def start(self, now_ns: int) -> None:
+        self._bus.watch_alive(self._post, role="agent")
         self._bus.serve(KNOWN, self._post, agent=self._id)
         self._bus.serve(TABLE, self._post, agent=self._id)
         for plot in sorted(self._seats):
             self._bus.subscribe(STANDING, self._post, plot=plot)
         self._listen(self._seats)
-        self._ask_known()
-
-    def begin_again(self) -> None:
-        """Begin a later life in this process, from what is on file, as a new process would."""
-        self.core = RightOfWay(self._id, self._plots, self._spawns, self._store.own, self._store.saved)
-        self._chance ^= self.core.own.lives[-1] if self.core.own.lives else 1
         self._ask_known()
 
     def handle(self, event: Event, now_ns: int) -> bool:
@@ -107,6 +101,10 @@ class RightOfWaySync:
                 core.hear_promise(fields["agent"], int(tag.rpartition("-")[2]), table, now_ns)
             case Replied(message=Known() as known):
                 self._perform(core.hear_known(known))
+            case Appeared(peer=Peer(role="agent") as peer):
+                core.hear_token(peer, up=True)
+            case Disappeared(peer=Peer(role="agent") as peer):
+                core.hear_token(peer, up=False)
             case AskEnded(topic=topic) if topic is KNOWN:
                 self._known_ended(now_ns)
             case AskEnded(topic=topic) if topic is TABLE:
@@ -162,6 +160,8 @@ class RightOfWaySync:
             match action:
                 case Save(promised, table):
                     self._store.save(promised, table)
+                case AskKnown():
+                    self._ask_known()
                 case OwnRecord():
                     self._store.save_own(action)
                 case Standing():

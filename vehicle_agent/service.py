@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,7 @@ from swarm.liveness import Roster
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
-from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
-from swarm.wire.messages.processes import RunInfo
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
 from swarm.wire.topics import (
@@ -34,7 +31,6 @@ from swarm.wire.topics import (
     POSE,
     PUSHED_ROUTE,
     ROUTE,
-    RUN,
     SIGHTED,
     TRUE_POSE,
 )
@@ -44,15 +40,12 @@ from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.replaced import Replaced
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
 
 log = logging.getLogger(__name__)
 
-_YOUNGER = "younger"
-"""Tag of the question who else answers for this agent."""
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least."""
 
@@ -106,9 +99,7 @@ class AgentService:
             scenario.vehicles.sense_range_m,
         )
         self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
-        self._new_agent = partial(Agent, plan, scenario, local, sensor)
-        self._agent = self._new_agent(self._right_of_way.core.holdings)
-        self._replaced = Replaced()
+        self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings)
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
@@ -136,14 +127,6 @@ class AgentService:
         self._right_of_way.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        match event:
-            case Replied(tag=tag, message=RunInfo() as info) if tag == _YOUNGER:
-                self._replaced.heard(info, self._member.info)
-                return
-            case AskEnded(tag=tag) if tag == _YOUNGER:
-                if self._replaced.ended(now_ns) and self._agent.holdings.replaced:
-                    self._begin_again(now_ns)
-                return
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         if self._right_of_way.handle(event, now_ns):
@@ -184,12 +167,8 @@ class AgentService:
         self._member.tick(now_ns)
         self._sync.tick(now_ns)
         agent = self._agent
-        if agent.holdings.replaced:
-            if agent.vehicles:
-                self._stand_down(now_ns)
-            if self._replaced.ask_due(now_ns):
-                setup = self._setup
-                self._bus.ask(RUN, Nothing(), self._post, tag=_YOUNGER, timeout_s=1.0, role=setup.role, id=setup.id)
+        if agent.holdings.replaced and agent.vehicles:
+            self._stand_down(now_ns)
         if self._cost_map.take_dirty():
             agent.map_changed(now_ns, look=True)
         if agent.places:
@@ -225,18 +204,9 @@ class AgentService:
         self._member.note(self._now_ns, "refused", text)
 
     def _stand_down(self, now_ns: int) -> None:
-        """A later life of this agent drives the vehicles. This one drives no more, and only keeps its promises."""
+        """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""
         self._agent.stand_down()
-        text = f"agent {self._setup.id} runs elsewhere, too, and that one is the younger: this one drives no more"
-        log.warning(text)
-        self._member.note(now_ns, "replaced", text)
-
-    def _begin_again(self, now_ns: int) -> None:
-        """Nobody drives the vehicles: what told of a younger life was wrong, or it has ended."""
-        self._right_of_way.begin_again()
-        self._agent = self._new_agent(self._right_of_way.core.holdings)
-        self._agent.set_planners(self._roster.alive("planner"), now_ns)
-        text = f"no other process answers for agent {self._setup.id}: a new life begins here"
+        text = f"agent {self._setup.id} runs elsewhere, too, and that one is younger: this one drives no more"
         log.warning(text)
         self._member.note(now_ns, "replaced", text)
 

@@ -63,6 +63,10 @@ def document() -> str:
 def _keys() -> Iterator[str]:
     yield "## Keys\n"
     yield "`put` is published and never waited for; `get` is answered by the processes that serve the key.\n"
+    yield (
+        "`with a code`: a message counts only with 16 bytes as its Zenoh attachment that nobody outside the run "
+        "can make ([decision 32](decisions/0032-whose-word-moves-vehicles.md)). Reading needs no code.\n"
+    )
     yield "| key | how | message | rate | priority | what |"
     yield "|---|---|---|---|---|---|"
     for topic in TOPICS:
@@ -103,6 +107,8 @@ def _how(topic: Topic) -> str:
     if topic.request is not None:
         several = f", {_link(topic.bulk)} where asked for" if topic.bulk is not None else ""
         ways.append(f"get with {_link(topic.request)}{several}")
+    if topic.trusted:
+        ways.append("with a code")
     return "; ".join(ways)
 
 

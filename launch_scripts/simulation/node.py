@@ -74,7 +74,8 @@ class Node:
         self._waiting = None
         # As the launcher counts lives: a restart is the later one although the clock was put back meanwhile.
         self._life = max(self.now_ns(), self._life + 1)
-        bus = self.bus = simulation.network.bus(self.name, simulation.scenario.network.namespace)
+        namespace = simulation.scenario.network.namespace
+        bus = self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)
         worker = self._worker = InlineWorker(simulation.scheduler)
 
         def post(event: Event) -> None:

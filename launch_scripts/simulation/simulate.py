@@ -25,6 +25,7 @@ from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import Scenario
+from swarm.wire.authentication import Authenticator
 
 SIMULATED_ROLES = ("keeper", "planner", "targets", "agent")
 BOOT_SPREAD_S = 0.3
@@ -75,6 +76,7 @@ class Simulation:
         self.scenario = scenario
         self.faults = faults or FaultPlan()
         self.run_id = f"simulated-{scenario.seed}"
+        self.authenticator = Authenticator(b"simulated", self.run_id)
         self.terrain = terrain or build_terrain(scenario)
         self.truth = build_truth(scenario, self.terrain)
         self.recorder = Recorder(scenario, self.terrain.grid)

@@ -44,8 +44,7 @@ sense_range_m = 120
 capture_range_m = 60
 """)
 """Three agents on a hill with hidden obstacles: marks are made all the time."""
-WIDE = parse_scenario("""
-name = "wide"
+WIDE_TERRAIN = """
 time_scale = 40
 [terrain]
 source = "synthetic"
@@ -53,6 +52,11 @@ rows = 280
 cols = 800
 resolution_m = 30
 relief_m = 200
+"""
+"""Begins a scenario with eight regions, in which vehicles drive ten cells a second and cross borders."""
+WIDE = parse_scenario(f"""
+name = "wide"
+{WIDE_TERRAIN}
 [terrain.hidden]
 rubble_fields = 6
 [cost]
@@ -68,7 +72,7 @@ sense_range_m = 120
 capture_range_m = 60
 reassign_s = 2
 """)
-"""Eight regions, the vehicles of eight agents, ten cells a second: they cross borders all the time."""
+"""Eight agents, whose vehicles cross borders of plots and regions all the time."""
 WORLDS = ("small", "wide", *CROWDS)
 _CROWD = """
 name = "crowd"

@@ -45,6 +45,7 @@ NEEDED = ("ground", "elevation", "classes")
 
 
 def layers_of(terrain: Terrain) -> dict[str, NDArray[Any]]:
+    """The arrays of a terrain by layer, (rows, cols) or (rows, cols, depth), typed as in `LAYERS`. No copies."""
     return {
         "ground": terrain.ground_s_per_m,
         "elevation": terrain.elevation_m,
@@ -61,7 +62,10 @@ def region_window(grid: GridSpec, region: int) -> Window:
 
 
 def describe(terrain: Terrain, keeper: str) -> BaseMap:
-    """What a keeper tells of its terrain."""
+    """What a keeper tells of its terrain: grid, notes, and the digest of every layer of every region.
+
+    `keeper` is the keeper's id, which a refusal names.
+    """
     grid = terrain.grid
     digests = {}
     for name, array in layers_of(terrain).items():
@@ -82,7 +86,21 @@ def describe(terrain: Terrain, keeper: str) -> BaseMap:
 
 
 def pack(terrain: Terrain, layer: str, region: int) -> BaseMapTile:
-    """One layer of one region. zlib, because every process has it; byte planes halve what it leaves of floats."""
+    """One layer of one region, packed. zlib, because every process has it; byte planes halve what it leaves of
+    floats.
+
+    Parameters
+    ----------
+    layer : str
+        One of `LAYERS`.
+    region : int
+        0 to grid.regions - 1.
+
+    Raises
+    ------
+    KeyError
+        If there is no such layer.
+    """
     array = layers_of(terrain)[layer]
     values = np.frombuffer(_piece(array, region_window(terrain.grid, region)), np.uint8)
     planes = values.reshape(-1, array.itemsize).T.tobytes()
@@ -100,9 +118,19 @@ def _digest(piece: bytes) -> bytes:
 class BaseMapCopy:
     """A terrain that comes in pieces. Takes only pieces that are as described, and memory only for those.
 
-    Raises TerrainError at once where the description cannot be that of the run's terrain.
+    Parameters
+    ----------
+    described : BaseMap
+        From a keeper.
+    terrain : str
+        Digest of the run's terrain.
+    layers : tuple of str
+        Which to fetch: NEEDED, and "photo" for those who look.
 
-    layers  which to fetch: NEEDED, and "photo" for those who look
+    Raises
+    ------
+    TerrainError
+        If the description cannot be that of the run's terrain, lacks a layer, or has more than `MAX_CELLS` cells.
     """
 
     def __init__(self, described: BaseMap, terrain: str, layers: tuple[str, ...] = NEEDED) -> None:
@@ -131,7 +159,7 @@ class BaseMapCopy:
             self._arrays[layer] = np.empty(shape if kind.depth == 1 else (*shape, kind.depth), kind.dtype)
 
     def missing(self, at_most: int) -> Iterator[tuple[str, list[int]]]:
-        """(layer, regions) still to come, so many of each layer."""
+        """(layer, regions) still to come, at most so many regions of each layer."""
         for layer, regions in self._missing.items():
             if regions:
                 yield layer, list(regions)[:at_most]
@@ -143,7 +171,13 @@ class BaseMapCopy:
         return 1.0 - left / (len(self._missing) * self.grid.regions)
 
     def take(self, tile: BaseMapTile) -> bool:
-        """Put a piece into its place; False if it is there already. Raises ProtocolError on a false one."""
+        """Put a piece into its place; False if it is there already.
+
+        Raises
+        ------
+        ProtocolError
+            If the piece was not asked for, does not unpack to its size, or is not as its digest says.
+        """
         if tile.region not in self._missing.get(tile.layer, {}):
             if tile.layer in self._missing and tile.region < self.grid.regions:
                 return False
@@ -162,7 +196,18 @@ class BaseMapCopy:
         return True
 
     def terrain(self, cost: CostConfig) -> Terrain:
-        """The whole, once nothing is missing. Raises TerrainError if it is not the terrain of the run."""
+        """The whole, once nothing is missing.
+
+        Parameters
+        ----------
+        cost : CostConfig
+            The scenario's own rules: the digest covers the pace that follows from them.
+
+        Raises
+        ------
+        TerrainError
+            If a value is impossible, or the whole is not the terrain of the run.
+        """
         ground, elevation, classes = (self._arrays[layer] for layer in NEEDED)
         if np.isnan(ground).any() or (ground <= 0).any():
             raise TerrainError(f"{self._who} has ground with no possible pace")

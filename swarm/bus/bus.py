@@ -14,7 +14,8 @@ Losses      Nothing is guaranteed to arrive. A sample is dropped where a link is
 Failures    A thread of the bus that ends by an unexpected error ends the process (`Process.run` raises it).
 Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has not taken by then.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
-            logged once per key and minute, and never posted.
+            logged once per key and minute, and never posted. So is what comes without the run's code on a
+            trusted topic, where the bus has an `Authenticator`; such a query is refused.
 Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the
             caller.
 """

@@ -18,6 +18,7 @@ from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
+from swarm.wire.authentication import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.base import Message
 from swarm.wire.topics import Topic
@@ -73,9 +74,9 @@ class MemoryNetwork:
         self._down: set[str] = set()
         """Nodes cut off by `link_changed`."""
 
-    def bus(self, node: str, namespace: str = "swarm") -> MemoryBus:
+    def bus(self, node: str, namespace: str = "swarm", authenticator: Authenticator | None = None) -> MemoryBus:
         """Open a bus. A node that was started again opens a new one."""
-        bus = MemoryBus(self, node, namespace)
+        bus = MemoryBus(self, node, namespace, authenticator)
         self.buses.append(bus)
         return bus
 
@@ -127,10 +128,13 @@ class MemoryNetwork:
 class MemoryBus:
     """A `Bus` of one node of a `MemoryNetwork`. Every post is called by the network's scheduler."""
 
-    def __init__(self, network: MemoryNetwork, node: str, namespace: str) -> None:
+    def __init__(
+        self, network: MemoryNetwork, node: str, namespace: str, authenticator: Authenticator | None = None
+    ) -> None:
         self.network = network
         self.node = node
         self.namespace = namespace
+        self.authenticator = authenticator
         self.closed = False
         """Once true, nothing is sent or posted any more."""
         self.counts: dict[str, int] = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
@@ -150,13 +154,15 @@ class MemoryBus:
             return
         self.counts["messages_out"] += 1
         named = topic.one(fields)
-        sample = _Sample(topic, named, payload)
+        sample = _Sample(topic, named, payload, code_of(self.authenticator, topic, topic.below(named), payload))
         network = self.network
         for subscription in network.subscribers(self.namespace, topic.name, named):
             for when_ns in network.arrivals_ns(self, subscription.bus, topic.name):
                 network.scheduler.at(when_ns, _Arrival(self, subscription, sample))
 
     def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
+        if together and topic.trusted:
+            raise TypeError(f"topic {topic.name} is trusted: each of its messages is checked by itself")
         post = as_batches(post) if together else checking_key(post, self.counts)
         subscriptions = self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions())
         subscriptions.add(declare(self, topic, fields, post))
@@ -202,13 +208,14 @@ class MemoryBus:
         if not queryables:
             scheduler.after(0, asking.finish)
             return
-        payload = encode(request)
+        asking.asked = payload = encode(request)
         parsed = decode(payload, topic.request)
+        code = code_of(self.authenticator, topic, topic.below(wanted), payload)
         for index, queryable in enumerate(queryables):
             for when_ns in self.network.arrivals_ns(self, queryable.bus, topic.name):
                 answerer = MemoryAnswerer(asking, queryable, index, when_ns)
                 event = Asked(topic, wanted, parsed, answerer)
-                scheduler.at(when_ns, _Delivery(self, queryable.bus, topic.name, payload, queryable.post, event))
+                scheduler.at(when_ns, _Delivery(self, queryable.bus, payload, code, queryable.post, event))
         scheduler.after(int(timeout_s * NS_PER_S), asking.time_out)
 
     def declare_alive(self, peer: Peer) -> None:
@@ -275,19 +282,27 @@ class _Watcher:
 
 
 class _Sample:
-    """One put, parsed once: when the first subscription is reached."""
+    """One put, parsed and checked once: when the first subscription is reached."""
 
-    __slots__ = ("_heard", "_parsed", "fields", "payload", "topic")
+    __slots__ = ("_checked_by", "_heard", "_parsed", "code", "fields", "payload", "topic")
 
-    def __init__(self, topic: Topic, fields: dict[str, str], payload: bytes) -> None:
+    def __init__(self, topic: Topic, fields: dict[str, str], payload: bytes, code: bytes | None) -> None:
         self.topic = topic
         self.fields = fields
         self.payload = payload
+        self.code = code
+        self._checked_by: Authenticator | None = None
         self._heard: Heard | None = None
         self._parsed = False
 
-    def heard(self) -> Heard | None:
-        """The event; None if the payload does not parse."""
+    def heard(self, bus: MemoryBus) -> Heard | None:
+        """The event, as a bus takes it; None if the payload does not parse, or the bus does not trust it."""
+        if self._checked_by is not bus.authenticator:
+            try:
+                check_code(bus.authenticator, self.code, self.topic, self.topic.below(self.fields), self.payload)
+            except ProtocolError:
+                return None
+            self._checked_by = bus.authenticator
         if not self._parsed:
             self._parsed = True
             try:
@@ -310,7 +325,7 @@ class _Arrival:
         if not bus.traced(self.source, self.sample.topic.name, self.sample.payload):
             return
         bus.counts["messages_in"] += 1
-        heard = self.sample.heard()
+        heard = self.sample.heard(bus)
         if heard is None:
             bus.counts["payloads_dropped"] += 1
         else:
@@ -323,12 +338,21 @@ class _Delivery:
 
     source: MemoryBus
     to: MemoryBus
-    what: str
     payload: bytes
+    code: bytes | None
     post: Post
-    event: Event
+    event: Asked
 
     def __call__(self) -> None:
-        if self.to.traced(self.source, self.what, self.payload):
-            self.to.counts["messages_in"] += 1
-            self.post(self.event)
+        event, topic = self.event, self.event.topic
+        if not self.to.traced(self.source, topic.name, self.payload):
+            return
+        self.to.counts["messages_in"] += 1
+        try:
+            check_code(self.to.authenticator, self.code, topic, topic.below(event.fields), self.payload)
+        except ProtocolError as error:
+            self.to.counts["payloads_dropped"] += 1
+            event.refuse(f"{topic.name}: {error}")
+            event.end()
+        else:
+            self.post(event)

@@ -98,7 +98,7 @@ def as_batches(post: Post) -> Post:
 
     def batched(event: Event) -> None:
         if isinstance(event, Heard):
-            event = HeardMany(event.topic, [(event.topic.key.format(**event.fields), event.message)])
+            event = HeardMany(event.topic, [(event.topic.below(event.fields), event.message)])
         post(event)
 
     return batched

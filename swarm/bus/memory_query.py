@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 from swarm.bus.bus import AskEnded, Post, Replied
 from swarm.clock import NS_PER_S
+from swarm.errors import ProtocolError
+from swarm.wire.authentication import check_code, code_of
 from swarm.wire.codec import decode_either, encode
 from swarm.wire.messages.base import Message
 from swarm.wire.topics import Topic
@@ -24,6 +26,7 @@ class Asking:
     waiting   queryables that have not ended yet, by number; the query ends with the last
     replies   how many were posted
     failure   the last refusal, or "timeout"
+    asked     the question's payload
     over      whether `AskEnded` was posted: what comes later is dropped
     """
 
@@ -36,6 +39,7 @@ class Asking:
     waiting: set[int] = field(default_factory=set)
     replies: int = 0
     failure: str | None = None
+    asked: bytes = b""
     over: bool = False
 
     def finish(self) -> None:
@@ -82,14 +86,22 @@ class MemoryAnswerer:
             return
         bus.counts["messages_out"] += 1
         payload = encode(message)
+        key = asking.topic.below(named)
+        code = code_of(bus.authenticator, asking.topic, key, payload, asking.asked)
         parsed = decode_either(payload, asking.topic.message, asking.topic.bulk)
         reply = Replied(asking.tag, asking.topic, named, parsed)
 
         def arrive() -> None:
-            if not asking.over:
-                asking.bus.counts["messages_in"] += 1
-                asking.replies += 1
-                asking.post(reply)
+            if asking.over:
+                return
+            try:
+                check_code(asking.bus.authenticator, code, asking.topic, key, payload, asking.asked)
+            except ProtocolError:
+                asking.bus.counts["payloads_dropped"] += 1
+                return
+            asking.bus.counts["messages_in"] += 1
+            asking.replies += 1
+            asking.post(reply)
 
         self._send(payload, arrive)
 

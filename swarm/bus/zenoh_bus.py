@@ -29,10 +29,11 @@ from swarm.bus.bus import (
     Replied,
 )
 from swarm.bus.zenoh_config import session_config
-from swarm.bus.zenoh_threads import guarded, timeout_of, waiting_in
+from swarm.bus.zenoh_threads import attached, guarded, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
+from swarm.wire.authentication import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, decode_either, decode_many, encode
 from swarm.wire.messages.base import Message
 from swarm.wire.readable import decode_parameters, encode_readable
@@ -57,14 +58,18 @@ _CLOSE_S = 3.0
 """How long `close` waits for a router that does not answer."""
 
 
-def open_bus(network: NetworkConfig, *, mode: str = "client") -> ZenohBus:
+def open_bus(
+    network: NetworkConfig, *, mode: str = "client", authenticator: Authenticator | None = None
+) -> ZenohBus:
     """Open a session. Raises BusError when it cannot listen or no router answers.
 
-    mode  "client" connects to `network.connect`; "router" listens on `network.listen` and passes messages on
+    mode           "client" connects to `network.connect`; "router" listens on `network.listen` and passes
+                   messages on
+    authenticator  for who speaks on trusted topics
     """
     endpoints = network.listen if mode == "router" else network.connect
     try:
-        return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace)
+        return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace, authenticator)
     except zenoh.ZError as error:
         reason = str(error).split(" at /")[0]
         what = "listen on" if mode == "router" else "reach a router at"
@@ -80,9 +85,10 @@ class ZenohBus:
     Zenoh's, goes to `threading.excepthook`, by which `Process` ends.
     """
 
-    def __init__(self, session: zenoh.Session, namespace: str) -> None:
+    def __init__(self, session: zenoh.Session, namespace: str, authenticator: Authenticator | None = None) -> None:
         self._session = session
         self._namespace = namespace
+        self._authenticator = authenticator
         self._counts = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
         self._counting = threading.Lock()
         """Held to add to `_counts`."""
@@ -122,20 +128,27 @@ class ZenohBus:
         if self._closed:
             return
         self._count("messages_out")
+        key, payload = topic.keyed(self._namespace, **fields), encode(message)
         self._session.put(
-            topic.keyed(self._namespace, **fields),
-            encode(message),
+            key,
+            payload,
+            attachment=code_of(self._authenticator, topic, key, payload),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=_PRIORITIES[topic.priority],
         )
 
     def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
+        if together and topic.trusted:
+            raise TypeError(f"topic {topic.name} is trusted: each of its messages is checked by itself")
+
         def arrive(sample: zenoh.Sample) -> None:
             self._count("messages_in")
             key = str(sample.key_expr)
             try:
                 named = self._fields(topic, key)
-                message = decode(sample.payload.to_bytes(), topic.message)
+                payload = sample.payload.to_bytes()
+                check_code(self._authenticator, attached(sample), topic, key, payload)
+                message = decode(payload, topic.message)
                 topic.check_key(named, message)
             except ProtocolError as error:
                 self._drop(key, error)
@@ -183,11 +196,11 @@ class ZenohBus:
             answerer = _ZenohAnswerer(self, topic, query, concrete, parameters.get("format") == "json")
             try:
                 answerer.timeout_s = timeout_of(timeout)
-                payload = query.payload
-                if payload is None:
+                check_code(self._authenticator, attached(query), topic, key, answerer.asked)
+                if query.payload is None:
                     request = decode_parameters(parameters, request_type)
                 else:
-                    request = decode(payload.to_bytes(), request_type)
+                    request = decode(answerer.asked, request_type)
             except ProtocolError as error:
                 self._drop(key, error)
                 answerer.refuse(f"{topic.name}: {error}")
@@ -214,6 +227,7 @@ class ZenohBus:
     ) -> None:
         replies = 0
         failure: str | None = None
+        expression, asked = topic.expression(self._namespace, **fields), encode(request)
 
         def arrive(reply: zenoh.Reply) -> None:
             nonlocal replies, failure
@@ -223,7 +237,9 @@ class ZenohBus:
                 return
             key = str(reply.ok.key_expr)
             try:
-                message = decode_either(reply.ok.payload.to_bytes(), topic.message, topic.bulk)
+                payload = reply.ok.payload.to_bytes()
+                check_code(self._authenticator, attached(reply.ok), topic, key, payload, asked)
+                message = decode_either(payload, topic.message, topic.bulk)
                 named = self._fields(topic, key)
             except ProtocolError as error:
                 self._drop(key, error)
@@ -240,12 +256,13 @@ class ZenohBus:
             return
         self._count("messages_out")
         self._session.get(
-            f"{topic.expression(self._namespace, **fields)}?{TIMEOUT_PARAMETER}={timeout_s}",
+            f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
             zenoh.handlers.Callback(guarded(arrive), guarded(finish), indirect=False),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
-            payload=encode(request),
+            payload=asked,
+            attachment=code_of(self._authenticator, topic, expression, asked),
             priority=_PRIORITIES[topic.priority],
         )
 
@@ -342,7 +359,8 @@ class ZenohBus:
 class _ZenohAnswerer:
     """The answers to one query, which arrives when this is made.
 
-    `concrete` are the fields that `serve` was given; `_query` is None after the end.
+    `concrete` are the fields that `serve` was given, `asked` is the question's payload; `_query` is None after the
+    end.
     """
 
     def __init__(
@@ -353,6 +371,7 @@ class _ZenohAnswerer:
         self._query: zenoh.Query | None = query
         self._concrete = concrete
         self._as_json = as_json
+        self.asked = b"" if query.payload is None else query.payload.to_bytes()
         self._arrived_s = time.monotonic()
         self.timeout_s = USUAL_TIMEOUT_S
 
@@ -369,7 +388,9 @@ class _ZenohAnswerer:
         if self._as_json:
             self._query.reply(key, encode_readable(message), encoding=zenoh.Encoding.APPLICATION_JSON)
         else:
-            self._query.reply(key, encode(message))
+            payload = encode(message)
+            code = code_of(self._bus._authenticator, self._topic, key, payload, self.asked)
+            self._query.reply(key, payload, attachment=code)
 
     def refuse(self, reason: str) -> None:
         if self._query is not None and not self._bus._closed:

@@ -1,4 +1,4 @@
-"""Threads of Zenoh and those that read its channels: how they wait and end, and how long a query may take."""
+"""What Zenoh hands over: threads of its own and those that read its channels, timeouts and attachments."""
 
 from __future__ import annotations
 
@@ -36,6 +36,12 @@ def guarded(callback: Callable[..., None]) -> Callable[..., None]:
             threading.excepthook(threading.ExceptHookArgs(what))
 
     return guard
+
+
+def attached(carrier: Any) -> bytes | None:
+    """What was sent beside the payload of a sample or a query."""
+    attachment: bytes | None = None if carrier.attachment is None else carrier.attachment.to_bytes()
+    return attachment
 
 
 def timeout_of(said: str) -> float:

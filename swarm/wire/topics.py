@@ -49,6 +49,7 @@ class Topic:
     request    for a queryable: what is asked; None for a topic that is only published
     bulk       for a queryable: a message that carries many values, if the request asks for it
     published  whether values are put, not only answered
+    trusted    only with a code of the run's secret does a message on it count (`swarm.wire.authentication`)
     newest     each value carries the whole state of its key, so a reader may skip to the newest
     buffer     samples that wait for a slow reader; the oldest are dropped first
     fields     names of the chunks in `key`, in order
@@ -63,6 +64,7 @@ class Topic:
     request: type[Message] | None = None
     bulk: type[Message] | None = None
     published: bool = True
+    trusted: bool = False
     newest: bool = True
     priority: Priority = Priority.DATA
     buffer: int = 1024
@@ -106,6 +108,10 @@ class Topic:
     def keyed(self, namespace: str, **fields: str | int) -> str:
         """The key of one value. Raises as `one`."""
         return f"{namespace}/{self.key.format(**self.one(fields))}"
+
+    def below(self, fields: Mapping[str, str]) -> str:
+        """The key below the namespace, of fields that are chunks already."""
+        return self.key.format(**fields)
 
     def parse(self, namespace: str, key: str) -> dict[str, str] | None:
         """The fields of a key; None if it is not a key of this topic."""
@@ -174,23 +180,23 @@ FLEET = Topic(
 STANDING = Topic(
     "standing", "standing/{plot}/{agent}", Standing,
     "where a host's vehicles are in a plot and where they would go; for its members", "every tick",
-    access(put="agent:agent", hear="agent"), priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
     "table", "table/{plot}/{agent}", Table,
     "which cells the warden of a plot has granted; a member that is asked promises an epoch and answers with what "
     "it has stored", "on change, at least 5 Hz where vehicles are",
     access(put="agent:agent", serve="agent:agent", ask="agent", hear="agent"),
-    request=Claim, priority=Priority.INTERACTIVE,
+    request=Claim, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
     "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file", "per table",
-    access(put="agent:agent", hear="agent"), priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(
     "known", "known/{agent}", Known, "what an agent has on file about another, for a new life of that",
     "asked at a start", access(serve="agent:agent", ask="agent"), request=KnownRequest, published=False,
-    priority=Priority.INTERACTIVE,
+    trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",

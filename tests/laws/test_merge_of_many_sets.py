@@ -51,6 +51,23 @@ def replica() -> tuple[MapReplica, Composite]:
     return MapReplica(GRID, composite), composite
 
 
+def assert_equal_now_and_later(
+    together: MapReplica, many: Composite, singly: MapReplica, single: Composite
+) -> None:
+    """Two replicas and their maps, also once statements have ended."""
+    assert many.same(single)
+    assert together.held.ledger.held() == singly.held.ledger.held()
+    assert together.held.answer(MarksRequest()) == singly.held.answer(MarksRequest())
+    assert (together.held.capacity.sets, together.held.capacity.marks) == (
+        singly.held.capacity.sets,
+        singly.held.capacity.marks,
+    )
+    for now_ns in (5, 9):
+        singly.tick(now_ns)
+        together.tick(now_ns)
+        assert many.same(single)
+
+
 @given(st.lists(mark_sets() | ending_sets(), max_size=30), st.data())
 def test_many_at_once_in_any_order_grouping_and_repetition_are_as_one_by_one(
     sets: list[MarkSet], data: st.DataObject
@@ -67,17 +84,7 @@ def test_many_at_once_in_any_order_grouping_and_repetition_are_as_one_by_one(
         count = data.draw(st.integers(1, len(left)))
         together.merge(left[:count])
         left = left[count:]
-    assert many.same(single)
-    assert together.held.ledger.held() == singly.held.ledger.held()
-    assert together.held.answer(MarksRequest()) == singly.held.answer(MarksRequest())
-    assert (together.held.capacity.sets, together.held.capacity.marks) == (
-        singly.held.capacity.sets,
-        singly.held.capacity.marks,
-    )
-    for now_ns in (5, 9):
-        singly.tick(now_ns)
-        together.tick(now_ns)
-        assert many.same(single)
+    assert_equal_now_and_later(together, many, singly, single)
 
 
 @given(st.lists(mark_sets(), max_size=30))
@@ -210,18 +217,8 @@ def test_messages_of_many_sets_merge_as_these_one_by_one(
         changed = [(each, merge_one(singly, each)) for each in unpacked(message)]
         taken = {(each.tile, each.author): len(cells) for each, cells in changed if cells is not None}
         assert {(e.tile, e.author): n for e, n in zip(merged.sets, merged.changed, strict=True)} == taken
-    assert many.same(single)
-    assert together.held.ledger.held() == singly.held.ledger.held()
     assert together.counts == singly.counts
-    assert together.held.answer(MarksRequest()) == singly.held.answer(MarksRequest())
-    assert (together.held.capacity.sets, together.held.capacity.marks) == (
-        singly.held.capacity.sets,
-        singly.held.capacity.marks,
-    )
-    for now_ns in (5, 9):
-        singly.tick(now_ns)
-        together.tick(now_ns)
-        assert many.same(single)
+    assert_equal_now_and_later(together, many, singly, single)
 
 
 def test_what_has_no_room_for_all_is_taken_in_as_far_as_there_is_room() -> None:

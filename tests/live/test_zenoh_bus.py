@@ -15,7 +15,10 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_behaviour import Box, answering, asked, pose, run_info
+from support.bus_world import Box, answering, asked, pose, run_info
+from support.query_behaviour import *  # noqa: F403
+from support.trusted_behaviour import *  # noqa: F403
+from support.trusted_behaviour import OURS, stored, table
 
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
@@ -26,11 +29,13 @@ from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
+from swarm.wire.authentication import Authenticator
 from swarm.wire.codec import encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import CostReply, CostRequest
-from swarm.wire.topics import COST, POSE, RUN, Topic
+from swarm.wire.messages.traffic import Claim
+from swarm.wire.topics import COST, POSE, RUN, STORED, TABLE, Topic
 
 pytestmark = pytest.mark.network
 
@@ -78,8 +83,8 @@ class ZenohWorld:
     def network(self, namespace: str = "swarm", lease_s: float = 1.0) -> NetworkConfig:
         return NetworkConfig(namespace=namespace, connect=(self.router.endpoint,), lease_s=lease_s)
 
-    def bus(self, name: str, namespace: str = "swarm") -> ZenohBus:
-        self.buses.append(open_bus(self.network(namespace)))
+    def bus(self, name: str, namespace: str = "swarm", authenticator: Authenticator | None = None) -> ZenohBus:
+        self.buses.append(open_bus(self.network(namespace), authenticator=authenticator))
         return self.buses[-1]
 
     def put_bytes(self, bus: ZenohBus, topic: Topic, payload: bytes, **fields: str) -> None:
@@ -336,3 +341,46 @@ def test_a_reader_that_dies_ends_the_process_with_its_reason(world, what):
     with pytest.raises(ZeroDivisionError, match=f"a bug of ours, {what}"):
         process.run()
     assert service.stopped
+
+
+def test_what_is_said_again_under_another_key_or_to_another_question_does_not_count(world):
+    said, heard = [], Box()
+    ours, hears = world.bus("ours", authenticator=OURS), world.bus("hears", authenticator=OURS)
+    thief = world.bus("thief").session
+    listening = thief.declare_subscriber("swarm/stored/**", said.append)
+    hears.subscribe(STORED, heard)
+    world.settle()
+    ours.publish(STORED, stored(), plot=0, agent="a0")
+    world.until(lambda: said and heard)
+    put = (said[0].payload.to_bytes(), said[0].attachment.to_bytes())
+    thief.put("swarm/stored/0/a1", put[0], attachment=put[1])
+    thief.put("swarm/stored/0/a0", put[0], attachment=put[1])
+    world.until(lambda: len(heard) == 2)  # a repetition is nothing new
+    assert hears.counts["payloads_dropped"] == 1
+    listening.undeclare()
+
+    hears.serve(TABLE, answering((table(), {})), plot=0, agent="a0")
+    world.settle()
+    questions = []
+
+    def note_question(query):
+        questions.append((query.payload.to_bytes(), query.attachment.to_bytes()))
+        query.drop()
+
+    spy = thief.declare_queryable("swarm/table/0/a0", note_question)
+    world.settle()
+    assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, agent="a0").of(Replied)) == 1
+    answers = thief.get("swarm/table/0/a0", payload=questions[0][0], attachment=questions[0][1])
+    [answer] = [reply.ok for reply in answers if reply.ok is not None]
+    spy.undeclare()
+    hears.close()
+
+    def again(query):
+        query.reply("swarm/table/0/a0", answer.payload.to_bytes(), attachment=answer.attachment.to_bytes())
+        query.drop()
+
+    spy = thief.declare_queryable("swarm/table/0/a0", again)
+    world.settle()
+    assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, agent="a0").of(Replied)) == 1
+    assert asked(world, ours, TABLE, Claim(epoch=6), plot=0, agent="a0").of(Replied) == []
+    spy.undeclare()

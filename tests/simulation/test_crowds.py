@@ -38,8 +38,8 @@ def test_agents_of_three_vehicles_that_crash_all_the_time(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_of_two_lives_of_one_agent_the_older_stops_and_nobody_is_met(seed):
-    """An agent is cut off, and started again on another machine; then the cut heals."""
+def test_of_two_lives_of_one_agent_the_older_stops_until_the_younger_is_gone_and_nobody_is_met(seed):
+    """An agent is cut off, and started again on another machine; then the cut heals. Later that machine dies."""
     plan = FaultPlan(partitions=(Partition(5, 9, ("agent-a1",)),), twins=(Twin(8, "agent-a1"),))
     simulation = Simulation(seeded(seed), faults=plan)
     laws = Laws(simulation)
@@ -51,6 +51,13 @@ def test_of_two_lives_of_one_agent_the_older_stops_and_nobody_is_met(seed):
     assert older.agent.vehicles == {}
     assert len(younger.agent.vehicles) == 4
     assert any(vehicle.state is not VehicleState.IDLE for vehicle in younger.agent.vehicles.values())
+    simulation.nodes["agent-a1.2"].crash()  # for good: the older one takes over again
+    simulation.run_until(25)
+    before = {id: vehicle.cell for id, vehicle in older.agent.vehicles.items()}
+    simulation.run_until(30)
+    assert len(before) == 4
+    assert sum(older.agent.vehicles[id].cell != cell for id, cell in before.items()) >= 2
+    assert laws.collisions == []
 
 
 @pytest.mark.parametrize("skew_s", [-3600.0, 3600.0, -1_799_999_000.0])

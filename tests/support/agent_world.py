@@ -30,6 +30,32 @@ from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
+SCENARIO = """
+name = "test"
+seed = 3
+[[targets]]
+name = "t"
+walk = "still"
+[[groups]]
+vehicles = {vehicles}
+cells = {cells}
+[vehicles]
+per_agent = {per_agent}
+sense_range_m = 30.0
+capture_range_m = {capture}
+"""
+
+
+def scenario(
+    vehicles: int, cells: list[tuple[int, int]] | None = None, per_agent: int = 2, capture: float = 10.0
+) -> str:
+    given = [list(cell) for cell in cells or []]
+    return SCENARIO.format(vehicles=vehicles, cells=given, per_agent=per_agent, capture=capture)
+
+
+OPEN = ["." * 20] * 20
+"""A picture for `pace_of`: level ground without an obstacle."""
+
 
 def pace_of(picture: Sequence[str], pace: float = 0.1) -> NDArray[np.float32]:
     """Pace from a picture: '#' is lethal, '~' is three times as slow, anything else is level ground."""

@@ -22,6 +22,7 @@ from swarm.config.scenario import Scenario
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
+from swarm.wire.authentication import Authenticator
 from swarm.wire.topics import Topic
 
 START_NS = 1_000 * NS_PER_S
@@ -66,6 +67,7 @@ class SwarmModel:
 
     deliveries  (time, source, destination, topic or question, payload) of all that arrived anywhere
     after_tick  called after every tick of every service, to look at the whole
+    authenticator  what the services' buses share
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class SwarmModel:
         self.terrain = terrain or terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))
         self.scenario = scenario or Scenario()
         self.after_tick: list[Callable[[], None]] = []
+        self.authenticator: Authenticator | None = None
         self.buses: dict[str, MemoryBus] = {}
 
     # --- time -----------------------------------------------------------------------------------------------
@@ -116,8 +119,8 @@ class SwarmModel:
 
     # --- network --------------------------------------------------------------------------------------------
 
-    def bus(self, node: str, namespace: str = "swarm") -> MemoryBus:
-        return self.network.bus(node, namespace)
+    def bus(self, node: str, namespace: str = "swarm", authenticator: Authenticator | None = None) -> MemoryBus:
+        return self.network.bus(node, namespace, authenticator)
 
     def put_bytes(self, bus: MemoryBus, topic: Topic, payload: bytes, **fields: str) -> None:
         bus.publish_bytes(topic, payload, fields)
@@ -134,7 +137,7 @@ class SwarmModel:
         self, node: str, make: Callable[[MemoryBus, Post], S], hz: float = 10.0, phase_ns: int | None = None
     ) -> S:
         """Start a service on a bus of its own; its first tick is after phase_ns, or a whole period."""
-        bus = self.buses[node] = self.bus(node)
+        bus = self.buses[node] = self.bus(node, authenticator=self.authenticator)
         period_ns = int(NS_PER_S / hz)
 
         def post(event: Event) -> None:

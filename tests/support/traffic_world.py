@@ -11,11 +11,12 @@ from functools import cache
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
+from swarm.liveness import Peer
 from swarm.wire.messages.traffic import Known, KnownRequest, Standing, Stored, Table
 from vehicle_agent.traffic.holdings import Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
 
 MS = NS_PER_S // 1000
 TICK_NS = 100 * MS
@@ -58,6 +59,7 @@ class Process:
         # A clock of its own: it may be years off, and leaps.
         self.offset_ns = world.chance.randrange(60 * 60 * NS_PER_S)
         self.ages: dict[str, int] = {}
+        self.tokens: set[Peer] = set()
 
     @property
     def now_ns(self) -> int:
@@ -76,6 +78,8 @@ class Process:
     def perform(self, actions: list[Action]) -> None:
         for action in actions:
             match action:
+                case AskKnown():
+                    self.world.begin(self)
                 case Save(promised, table):
                     self.disk.saved[table.plot] = (promised, table)
                 case AskPromises():
@@ -110,6 +114,7 @@ class Process:
 
     def tick(self) -> None:
         holdings = self.rights.holdings
+        self.see_tokens()
         wishes = {}
         if holdings.life and not holdings.replaced:
             for vehicle in self.world.spawns[self.agent]:
@@ -119,6 +124,15 @@ class Process:
         self.perform(self.rights.tick(wishes, self.now_ns))
         if holdings.replaced:
             self.world.ended(self)
+
+    def see_tokens(self) -> None:
+        """Notice which other processes of this agent are up, and not cut off."""
+        world = self.world
+        twins = [each for each in world.processes if each.agent == self.agent and each is not self]
+        up = {Peer("agent", each.agent, id(each)) for each in twins if not world.is_cut(self, each)}
+        for peer in up ^ self.tokens:
+            self.rights.hear_token(peer, up=peer in up)
+        self.tokens = up
 
     def drive(self, vehicle: str) -> None:
         holdings, chance = self.rights.holdings, self.world.chance
@@ -309,11 +323,10 @@ class TrafficWorld:
     # --- what goes wrong ------------------------------------------------------------------------------------
 
     def start(self, agent: str, disk: Disk) -> None:
-        """A new life asks everybody who can be reached where it is known, then begins."""
+        """Start a process, which begins a life."""
         process = Process(self, agent, disk)
         self.processes.append(process)
-        self.ask_known(process, first=True)
-        self.at(200 * MS, lambda: process.begin() if process.alive else None)
+        self.begin(process)
 
         def tick() -> None:
             if process.alive:
@@ -322,6 +335,11 @@ class TrafficWorld:
                 self.at(TICK_NS, tick)
 
         self.at(self.chance.randrange(TICK_NS), tick)
+
+    def begin(self, process: Process) -> None:
+        """Ask everybody, then begin a life."""
+        self.ask_known(process, first=True)
+        self.at(200 * MS, lambda: process.begin() if process.alive else None)
 
     def crash(self, process: Process) -> None:
         process.alive = False

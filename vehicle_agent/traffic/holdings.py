@@ -57,16 +57,21 @@ class Holdings:
     life      which life of the host this is; 0 before `begin`
     plots     those that concern the host now: it speaks to their members and listens to their tables
     replaced  a later life of this host has spoken: this one must end
+    newest    the greatest life of this host that a table in use names
     """
 
     def __init__(self, plots: Plots, agent: str, vehicles: Collection[str]) -> None:
-        self.life = 0
-        self._dead: list[int] = []
-        self.replaced = False
-        self.plots: dict[int, None] = {}
         self._plots = plots
         self._agent = agent
         self._vehicles = list(vehicles)
+        self.end()
+
+    def end(self) -> None:
+        """Hold nothing and know nothing, as before the first life."""
+        self.life = self.newest = 0
+        self.replaced = False
+        self.plots: dict[int, None] = {}
+        self._dead: list[int] = []
         self._paths: dict[str, list[int]] = {}
         self._cells: set[int] | None = None
         """All cells of our paths; None when they have changed."""
@@ -143,6 +148,7 @@ class Holdings:
             return []
         table = view.tables[stamp]
         life, heard = table.hosts.get(self._agent, (0, 0))
+        self.newest = max(self.newest, life)
         self.replaced = self.replaced or life > self.life
         view.tables = {each: other for each, other in view.tables.items() if each > stamp}
         if life != self.life:

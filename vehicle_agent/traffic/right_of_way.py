@@ -7,11 +7,14 @@ what follows is said.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import msgspec
 from msgspec.structs import replace
 
+from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
+from swarm.liveness import Peer, Roster
 from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Standing, Stored, Table
 from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.member import Member, MemberAction
@@ -21,6 +24,8 @@ from vehicle_agent.traffic.warden import first_life, is_far_ahead
 Place = Callable[[str, Sequence[int]], int]
 
 _LIVES_KEPT = 32
+_ALONE_NS = NS_PER_S // 2
+"""A life that has been replaced begins again once no other process of its agent has been alive for so long."""
 
 
 def _first(vehicle: str, cells: Sequence[int]) -> int:
@@ -42,7 +47,12 @@ class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
     noted_by: list[str] = []
 
 
-Action = MemberAction | Standing | OwnRecord | Known
+@dataclass(frozen=True, slots=True)
+class AskKnown:
+    """Ask the other agents what they have on file about this one, then `begin`."""
+
+
+Action = MemberAction | Standing | OwnRecord | Known | AskKnown
 
 
 class RightOfWay:
@@ -75,6 +85,8 @@ class RightOfWay:
         self._place = place
         self._members: dict[int, Member] = {}
         self._known_life = 0
+        self._twins = Roster()
+        self._alone_since_ns: int | None = None
 
     # --- beginning a life -----------------------------------------------------------------------------------
 
@@ -124,6 +136,22 @@ class RightOfWay:
         self.holdings.watch([plot for plot in (*plots, *home) if plot < self.plots.count])
         self.own = replace(self.own, lives=[*dead[1 - _LIVES_KEPT :], life])
         return [self.own]
+
+    def hear_token(self, peer: Peer, *, up: bool) -> None:
+        """The liveliness token of another process has risen or fallen."""
+        if peer.id == self.agent:
+            (self._twins.appeared if up else self._twins.gone)(peer)
+
+    def _again(self, now_ns: int) -> list[Action]:
+        """Begin another life after this one was replaced, once its successor is gone; nothing while it lives."""
+        if self._twins.is_alive("agent", self.agent) or self._alone_since_ns is None:
+            self._alone_since_ns = now_ns
+        if now_ns - self._alone_since_ns < _ALONE_NS:
+            return []
+        self._alone_since_ns = None
+        self._known_life = max(self._known_life, self.holdings.newest)
+        self.holdings.end()
+        return [AskKnown()]
 
     def _known(self, agent: str) -> tuple[int, list[int]]:
         """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles."""
@@ -185,6 +213,8 @@ class RightOfWay:
             actions += member.tick(now_ns)
         if self.holdings.life:
             actions += self.holdings.standings(wishes)
+        if self.holdings.replaced:
+            actions += self._again(now_ns)
         return actions
 
     def _member(self, plot: int, now_ns: int) -> Member | None:

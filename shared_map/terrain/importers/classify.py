@@ -33,7 +33,15 @@ ROAD_GRADE = np.float32(0.5)
 
 
 class Features:
-    """What rules and learning look at, of one band of rows. Colours are 3 x 3 means, 0..255."""
+    """What rules and learning look at, of one band of rows. Each is float32 (rows, cols).
+
+    red, green, blue, light  mean of 3 x 3 cells, 0..255
+    around, texture          mean and standard deviation of light over 5 x 5 cells, 0..255
+    saturation               0 grey to 1
+    grade                    m/m
+    sharp                    (rows, cols, 3): the photo itself, 0..255
+    rgb                      uint8 (rows, cols, 3): the same
+    """
 
     def __init__(self, rgb: Bytes, grade: Floats) -> None:
         from scipy import ndimage
@@ -53,7 +61,7 @@ class Features:
         self.sharp, self.rgb = colour, rgb
 
     def columns(self) -> Floats:
-        """(cells, features) for a learner."""
+        """float32 (cells, 11) for a learner, row by row; the last column is the grade."""
         total = np.maximum(self.red + self.green + self.blue, np.float32(1))
         parts = (
             *(self.red, self.green, self.blue, self.light, self.around, self.texture, self.saturation),
@@ -69,7 +77,24 @@ def by_rules(
     seen: Bools | None = None,
     progress: Progress = no_progress,
 ) -> Bytes:
-    """Classes of a photo without labels. Where the photo shows nothing (`seen` is false) the class is UNKNOWN."""
+    """Classes of a photo without labels.
+
+    Parameters
+    ----------
+    rgb : uint8 (rows, cols, 3), red, green, blue
+    elevation_m : float32 (rows, cols), m, or None
+        Voids (NaN), and all without an elevation, count as level.
+    resolution_m : float
+        Side of a cell. Roads are looked for on cells of at most `COARSEST_M`.
+    seen : bool (rows, cols), optional
+        Where the photo shows anything; elsewhere the class is UNKNOWN.
+    progress : callable
+        Told what is done and how much of it.
+
+    Returns
+    -------
+    uint8 (rows, cols), TerrainClass
+    """
     rows, cols = rgb.shape[:2]
     classes = np.empty((rows, cols), np.uint8)
     wetness = np.empty((rows, cols), np.uint8)
@@ -192,7 +217,22 @@ def learnt(
     seed: int = 1,
     progress: Progress = no_progress,
 ) -> Bytes:
-    """Classes of a photo learnt from labelled cells (`labels`, UNKNOWN where there is none)."""
+    """Classes of a photo learnt from labelled cells.
+
+    Parameters
+    ----------
+    rgb, elevation_m, resolution_m, seen, progress
+        As in `by_rules`.
+    labels : uint8 (rows, cols), TerrainClass
+        UNKNOWN where there is no label; at least one cell has one.
+    seed : int
+        Of the learner.
+
+    Returns
+    -------
+    uint8 (rows, cols), TerrainClass
+        One of the labelled classes, or UNKNOWN where `seen` is false.
+    """
     rows, cols = rgb.shape[:2]
     model = _model(seed)
     model.fit(*_samples(rgb, elevation_m, resolution_m, labels))
@@ -247,7 +287,19 @@ def held_out(
     groups: NDArray[np.int32],
     seed: int = 1,
 ) -> tuple[Bytes, Bytes]:
-    """(true, predicted) of each labelled cell, predicted by a model that saw nothing of the same polygon."""
+    """What a model says of each labelled cell that saw nothing of the same polygon.
+
+    Parameters
+    ----------
+    rgb, elevation_m, resolution_m, labels, seed
+        As in `learnt`.
+    groups : int32 (rows, cols)
+        Number of the polygon of each labelled cell; at least two.
+
+    Returns
+    -------
+    true, predicted : uint8 (labelled cells,), TerrainClass
+    """
     from sklearn.model_selection import GroupKFold, cross_val_predict
 
     columns, kinds = _samples(rgb, elevation_m, resolution_m, labels)
@@ -260,7 +312,18 @@ def held_out(
 
 
 def confusion(true: Bytes, predicted: Bytes) -> NDArray[np.int64]:
-    """counts[true class, predicted class]."""
+    """How often each class was taken for which.
+
+    Parameters
+    ----------
+    true, predicted : uint8, TerrainClass
+        Of the same shape.
+
+    Returns
+    -------
+    int64 (classes, classes)
+        Counts by true class (row) and predicted class (column).
+    """
     size = max(TerrainClass) + 1
     pairs = true.reshape(-1).astype(np.int64) * size + predicted.reshape(-1)
     return np.bincount(pairs, minlength=size * size).reshape(size, size)

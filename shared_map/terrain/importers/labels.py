@@ -42,7 +42,12 @@ class _File(Section, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """classes uint8, UNKNOWN where there is no label; groups int32, number of polygon or point, -1 elsewhere."""
+    """Labels on a grid.
+
+    classes  uint8 (rows, cols), TerrainClass; UNKNOWN where there is no label
+    groups   int32 (rows, cols), number of the polygon or point; -1 where there is none
+    count    how many polygons and points there are
+    """
 
     classes: Bytes
     groups: NDArray[np.int32]
@@ -50,7 +55,21 @@ class Labels:
 
 
 def read_labels(path: Path, grid: GridSpec) -> Labels:
-    """Labels of a file on a grid. Raises TerrainError with one sentence."""
+    """Labels of a file on a grid; of labels that overlap, the later one counts.
+
+    Parameters
+    ----------
+    path : Path
+        TOML, as the head of this module shows it.
+    grid : GridSpec
+        Of the terrain; metres in the file count from its north-west corner.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read or is not as it must be, if a label covers no cell, or if all labels left are of
+        one class.
+    """
     try:
         found = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
     except OSError as error:

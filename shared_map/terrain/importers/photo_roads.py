@@ -38,9 +38,17 @@ Shorts = NDArray[np.int16]
 
 
 def line_strength(rgb: Bytes) -> Bytes:
-    """uint8 (rows, cols), in tenths of a grey level: the strength of a line whose crest is at that cell, else 0.
+    """How much each cell looks like the crest of a line.
 
-    The outer `REACH` rows are found from less of the photo."""
+    Parameters
+    ----------
+    rgb : uint8 (rows, cols, 3), red, green, blue
+
+    Returns
+    -------
+    uint8 (rows, cols), tenths of a grey level
+        0 where there is no crest. The outer `REACH` rows and columns are found from less of the photo.
+    """
     from scipy import ndimage
 
     # A road is bright in red, unlike forest and meadow, and in blue, unlike bare soil.
@@ -85,7 +93,17 @@ def _moved(array: Shorts, trim: int, down: float, right: float) -> Shorts:
 
 
 def long_lines(strength: Bytes) -> Bools:
-    """The cells of strong lines that are long, over gaps of a cell or two."""
+    """The cells of strong lines that are long, over gaps of a cell or two.
+
+    Parameters
+    ----------
+    strength : uint8 (rows, cols), tenths of a grey level
+        From `line_strength`.
+
+    Returns
+    -------
+    bool (rows, cols)
+    """
     from scipy import ndimage
 
     strong = strength >= _STRONG

@@ -21,7 +21,12 @@ _READ_ROWS = 512
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """Red, green, blue on the terrain's grid; `seen` where the photo shows anything."""
+    """A photo on the terrain's grid.
+
+    rgb    uint8 (rows, cols, 3): red, green, blue; black where it shows nothing
+    seen   bool (rows, cols): where it shows anything
+    notes  what was done to it, for people
+    """
 
     rgb: Bytes
     seen: Bools
@@ -29,7 +34,25 @@ class Photo:
 
 
 def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Progress = no_progress) -> Photo:
-    """The photo on the terrain's grid. Raises TerrainError if the two do not overlap."""
+    """The photo on the terrain's grid.
+
+    Parameters
+    ----------
+    path : Path
+        Whatever rasterio reads. What is not in bytes is stretched from its 2nd to its 98th percentile.
+    grid : GridSpec
+        Of the terrain.
+    given_crs : str or None
+        Coordinate system of a photo that has a place but does not name its system.
+    progress : callable
+        Told what is done and how much of it.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read or names no coordinate system, if it does not overlap the terrain or shows
+        nothing of it, or if one of the two has no place on earth and they differ in size.
+    """
     import rasterio
 
     what = f"photo {path}"
@@ -52,6 +75,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
 
 
 def transform_of(grid: GridSpec) -> Any:
+    """The affine transform from (col, row) to metres, as rasterio wants it."""
     from rasterio.transform import from_origin
 
     return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)

@@ -25,10 +25,12 @@ SCALE_FACTOR = 9.0
 class PlainGrid:
     """What a plain file says.
 
-    heights     float32, NaN is a void; None for a map without heights
-    factor      float32, pace relative to open ground, inf is lethal, NaN unknown; None for open ground
-    step_m      width and height of a cell, in metres, or in degrees if `degrees`
-    west, north outer corner of cell (0, 0), in the same unit
+    heights      float32 (rows, cols) in the file's unit, NaN is a void; None for a map without heights
+    factor       float32 (rows, cols), pace relative to open ground; inf is lethal, NaN unknown; None if all is open
+    step         width and height of a cell, in metres, or in degrees if `degrees`; (0, 0) if the file does not say
+    west, north  outer corner of cell (0, 0), in the same unit
+    photo        uint8 (rows, cols, 3), red, green, blue
+    notes        what was found, for people
     """
 
     heights: Floats | None
@@ -51,12 +53,22 @@ def _text(path: Path) -> str:
 
 
 def check_cells(rows: int, cols: int, path: Path) -> None:
+    """Raises TerrainError unless there are 1 to `MAX_CELLS` cells."""
     if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
         raise TerrainError(f"terrain {path}: its header says {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed")
 
 
 def read_asc(path: Path) -> PlainGrid:
-    """ESRI ASCII grid: six header lines, then one line per row from the north."""
+    """ESRI ASCII grid: header lines, then one line per row from the north.
+
+    The header says `ncols`, `nrows`, `cellsize`, `xllcorner` or `xllcenter`, `yllcorner` or `yllcenter`, and
+    `nodata_value`, -9999 unless given. Metres and degrees look alike in it: `degrees` is False.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, or its rows are not what its header says.
+    """
     lines = _text(path).splitlines()
     header: dict[str, float] = {}
     first = 0
@@ -102,8 +114,18 @@ def read_asc(path: Path) -> PlainGrid:
 
 
 def read_npz(path: Path) -> PlainGrid:
-    """`elevation` (rows, cols), row 0 north, with `resolution_m`, or with `dx`, `dy`, `xmin` and the north latitude
-    `ymin` in degrees as in matplotlib's samples; optional `photo` (rows, cols, 3)."""
+    """Arrays in an archive of NumPy's.
+
+    elevation           (rows, cols), numbers; row 0 is in the north
+    resolution_m        side of a cell, or
+    dx, dy, xmin, ymin  in degrees, as in matplotlib's samples; `ymin` is the north latitude
+    photo               uint8 (rows, cols, 3), optional
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, an array would unpack to more than 5 * `MAX_CELLS` bytes, or is not as above.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             _check_promises(archive, path)
@@ -154,7 +176,13 @@ def _check_promises(archive: zipfile.ZipFile, path: Path) -> None:
 
 
 def read_map(path: Path) -> PlainGrid:
-    """MovingAI grid map: `.` `G` `S` can be driven, `@` `O` `T` `W` cannot."""
+    """MovingAI grid map: `.` `G` `S` can be driven, `@` `O` `T` `W` cannot. Its `factor` is 1 or inf.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, its rows are not what its header says, or a letter is unknown.
+    """
     lines = _text(path).splitlines()
     words = [line.split() for line in lines[:4]]
     try:
@@ -190,7 +218,16 @@ def read_map(path: Path) -> PlainGrid:
 
 
 def read_ros(path: Path) -> PlainGrid:
-    """ROS map_server: a yaml that names an image, its resolution, origin and thresholds."""
+    """ROS map_server: a yaml that names a PGM image, its resolution, origin and thresholds.
+
+    Its `factor` is 1 on free, inf on occupied cells. Between the thresholds it is NaN in the mode `trinary`, and
+    rises from 1 to 1 + `SCALE_FACTOR` in the modes `scale` and `raw`; in `raw`, values above 100 are NaN.
+
+    Raises
+    ------
+    TerrainError
+        If a file cannot be read, a key is missing or out of range, or the origin is turned.
+    """
     values = _flat_yaml(path)
     try:
         image = path.parent / values["image"]
@@ -251,7 +288,20 @@ def _flat_yaml(path: Path) -> dict[str, str]:
 
 
 def read_pgm(path: Path) -> tuple[NDArray[np.int32], int]:
-    """(pixels, brightest) of a P2 or P5 image, comments and 16 bits included. Row 0 is on top."""
+    """A P2 or P5 image, comments and 16 bits included.
+
+    Returns
+    -------
+    pixels : int32 (rows, cols)
+        Row 0 is on top.
+    brightest : int
+        The value that stands for white, 1 to 65535.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, is no PGM, or is shorter than its header says.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -34,7 +34,11 @@ _READ_ROWS = 512
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """Heights on the terrain's grid; a void is NaN."""
+    """Heights on the terrain's grid.
+
+    elevation_m  float32 (rows, cols), m; NaN is a void
+    notes        what was done to them, for people
+    """
 
     grid: GridSpec
     elevation_m: Floats
@@ -43,7 +47,13 @@ class Raster:
 
 @contextmanager
 def opened(path: Path, what: str) -> Iterator[Any]:
-    """A rasterio dataset. Raises TerrainError with one sentence, also for what goes wrong while it is read."""
+    """A rasterio dataset; `what` names it in errors.
+
+    Raises
+    ------
+    TerrainError
+        If the file is missing, no raster or truncated; also for what goes wrong while it is read.
+    """
     import warnings
 
     import rasterio
@@ -81,7 +91,22 @@ def _size(length: int) -> str:
 
 
 def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_progress) -> Raster:
-    """Heights of a file on a square metric grid. Bilinear; averaged where cells grow by half or more."""
+    """Heights of a file on a square metric grid. Bilinear; averaged where cells grow by half or more.
+
+    Parameters
+    ----------
+    path : Path
+        One band of heights; scale, offset and feet that the file declares are applied.
+    config : TerrainConfig
+        `crs`, `resolution_m` and `height_scale` count.
+    progress : callable
+        Told what is done and how much of it.
+
+    Raises
+    ------
+    TerrainError
+        If the file cannot be read, holds no heights, or does not fit a grid (see `plan_grid`).
+    """
     with opened(path, "terrain") as dataset:
         if dataset.count >= 3:
             raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
@@ -159,7 +184,7 @@ def _read_warped(dataset: Any, crs: Any, grid: GridSpec, target: Any, row0: int,
 
 
 def resampling(dataset: Any, crs: Any, grid: GridSpec, target: Any) -> Any:
-    """Average where the grid is at least half as coarse again as the file, bilinear else."""
+    """rasterio's `average` where the grid is at least half as coarse again as the file, `bilinear` else."""
     from rasterio.warp import Resampling
 
     width, height = _pixel_m(dataset.transform, dataset.height, dataset.width, crs, target)
@@ -170,7 +195,10 @@ def resampling(dataset: Any, crs: Any, grid: GridSpec, target: Any) -> Any:
 
 
 def crs_of(found: Any, given: str | None, what: str) -> Any:
-    """The coordinate system of a file, or the one that the scenario names for it."""
+    """The coordinate system that the scenario names for a file (`given`), else the file's own (`found`).
+
+    Raises TerrainError if `given` is not one, or if there is neither; `what` names the file.
+    """
     import rasterio
     from rasterio.errors import CRSError
 
@@ -190,7 +218,10 @@ def crs_of(found: Any, given: str | None, what: str) -> Any:
 
 def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) -> Any:
     """The same system if its unit is a true metre, else a local one: equidistant cylindrical while its scale is
-    right within 1 % (no voids at the corners), transverse Mercator beyond."""
+    right within 1 % (no voids at the corners), transverse Mercator beyond.
+
+    `lon_deg`, `lat_deg` are the middle of the terrain; `lat_span_deg` is its extent from south to north.
+    """
     import rasterio
 
     if crs.is_projected and crs.to_dict().get("proj", "") not in ("merc", "webmerc"):
@@ -231,7 +262,10 @@ def _border(transform: Any, rows: int, cols: int) -> tuple[list[float], list[flo
 
 
 def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any, what: str) -> tuple[float, ...]:
-    """(west, south, east, north) of a raster in another coordinate system."""
+    """(west, south, east, north) of a raster of rows x cols, in units of the system `target`.
+
+    Raises TerrainError if `crs` is not defined everywhere on its border.
+    """
     from rasterio.warp import transform as to_crs
 
     xs, ys = _border(transform, rows, cols)
@@ -256,7 +290,31 @@ def _pixel_m(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tup
 def plan_grid(
     transform: Any, rows: int, cols: int, crs: Any, resolution_m: float | None, what: str
 ) -> tuple[GridSpec, Any, list[str]]:
-    """The terrain's grid, the coordinate system to warp to (None if the file has that grid already), and notes."""
+    """The grid for a raster: metric, north-up, with square cells.
+
+    Parameters
+    ----------
+    transform, rows, cols, crs
+        Of the raster, as rasterio gives them.
+    resolution_m : float or None
+        Side of a cell; None keeps that of the raster.
+    what : str
+        Names the raster in errors.
+
+    Returns
+    -------
+    grid : GridSpec
+    target : rasterio.CRS or None
+        What to warp to; None if the raster has that grid already.
+    notes : list of str
+        What is done, for people.
+
+    Raises
+    ------
+    TerrainError
+        If the georeference is damaged, has neither metres nor degrees, is too near a pole or too wide for one flat
+        grid; if no cell fits, or more than `MAX_CELLS` do.
+    """
     import rasterio
 
     if transform.determinant == 0 or not np.isfinite(list(transform)[:6]).all():
@@ -309,6 +367,7 @@ def plan_grid(
 
 
 def check_size(rows: int, cols: int, what: str) -> None:
+    """Raises TerrainError if there are more than `MAX_CELLS` cells."""
     if rows * cols > MAX_CELLS:
         at_least = math.sqrt(rows * cols / MAX_CELLS)
         raise TerrainError(
@@ -318,7 +377,10 @@ def check_size(rows: int, cols: int, what: str) -> None:
 
 
 def mask_of(path: Path, grid: GridSpec) -> NDArray[np.bool_]:
-    """A painted mask: an image as large as the terrain, everything but 0 is painted."""
+    """A painted mask, bool (rows, cols): true wherever the first band of the image is not 0.
+
+    Raises TerrainError if the image cannot be read or is not as large as the grid.
+    """
     with opened(path, "mask") as dataset:
         if (dataset.height, dataset.width) != (grid.rows, grid.cols):
             raise TerrainError(

@@ -8,7 +8,21 @@ from shared_map.arrays import Floats
 
 
 def resample(values: Floats, rows: int, cols: int, row_step: float, col_step: float) -> Floats:
-    """From the same north-west corner; steps are source cells per cell. A void (NaN) spreads to what it touches."""
+    """Heights on another grid with the same north-west corner.
+
+    Parameters
+    ----------
+    values : float32 (source rows, source cols), m
+        NaN is a void; it spreads to what it touches.
+    rows, cols : int
+        Cells of the result, within the extent of the source.
+    row_step, col_step : float
+        Source cells per cell. From 1.5 on cells are averaged, below that interpolated.
+
+    Returns
+    -------
+    float32 (rows, cols), m
+    """
     return np.ascontiguousarray(_along_rows(_along_rows(values, rows, row_step).T, cols, col_step).T)
 
 

@@ -26,10 +26,11 @@ SYNTHETIC_RESOLUTION_M = 30.0
 class Source:
     """Everything known about the ground on one grid.
 
-    elevation_m  float32  NaN is a void
-    classes      uint8    TerrainClass
-    photo, seen  the colour photo, and where it shows anything
-    factor       float32  pace relative to open ground that the file itself states; inf is lethal
+    elevation_m  float32 (rows, cols), m; NaN is a void
+    classes      uint8 (rows, cols), TerrainClass
+    photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
+    factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
+    notes        where it comes from and what was done to it, for people
     """
 
     grid: GridSpec
@@ -42,7 +43,23 @@ class Source:
 
 
 def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progress) -> Source:
-    """Read or make what the scenario names. Raises TerrainError with one sentence."""
+    """Read or make what the scenario names.
+
+    Parameters
+    ----------
+    config : TerrainConfig
+        The section `[terrain]`. Paths are relative to the working folder unless they are absolute.
+    seed : int
+        Of what is made up, and of learning from labels.
+    progress : callable
+        Told what is done and how much of it.
+
+    Raises
+    ------
+    TerrainError
+        With one sentence: a file is missing, damaged, of an unknown kind or without heights, a key that it needs is
+        not set, photo and terrain do not overlap, or memory does not suffice.
+    """
     try:
         return _loaded(config, seed, progress)
     except MemoryError as error:
@@ -240,7 +257,7 @@ FILE_KINDS = ", ".join(_READERS)
 
 
 def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
-    """Length of one degree of latitude and of longitude on WGS 84, to the millimetre."""
+    """Metres in one degree of latitude and of longitude on WGS 84, to the millimetre."""
     phi = math.radians(latitude_deg)
     lat = 111132.954 - 559.822 * math.cos(2 * phi) + 1.175 * math.cos(4 * phi)
     lon = 111412.84 * math.cos(phi) - 93.5 * math.cos(3 * phi)

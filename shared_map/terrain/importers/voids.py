@@ -13,7 +13,18 @@ _SEARCH_CELLS = 64
 
 
 def voids_of(elevation_m: Floats) -> int:
-    """Make NaN of whatever is no height, in place; returns how many cells are void."""
+    """Make NaN of whatever is no height, and count it.
+
+    Parameters
+    ----------
+    elevation_m : float32 (rows, cols), m
+        Changed in place: infinities, and what lies beyond `HIGHEST_M` up or down, become NaN.
+
+    Returns
+    -------
+    int
+        Cells that are NaN now.
+    """
     count = 0
     for row0, row1 in bands(elevation_m.shape[0]):
         band = elevation_m[row0:row1]
@@ -26,7 +37,18 @@ def voids_of(elevation_m: Floats) -> int:
 
 
 def fill_voids(elevation_m: Floats) -> Floats:
-    """Voids filled from their surroundings (GDAL's inverse distance), far from any height by the nearest one."""
+    """Voids filled from their surroundings (GDAL's inverse distance), far from any height by the nearest one.
+
+    Parameters
+    ----------
+    elevation_m : float32 (rows, cols), m
+        NaN is a void; at least one cell has a height. It is not changed.
+
+    Returns
+    -------
+    float32 (rows, cols), m
+        A copy without NaN.
+    """
     from rasterio.fill import fillnodata
     from scipy import ndimage
 

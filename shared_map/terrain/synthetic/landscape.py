@@ -32,7 +32,21 @@ TINT = np.array(
 
 
 def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Floats:
-    """Mountains with sharp crests, broad valleys and plains, `relief_m` from lowest to highest."""
+    """Mountains with sharp crests, broad valleys and plains.
+
+    Parameters
+    ----------
+    rows, cols : int
+        Cells; at least 1 each.
+    relief_m : float
+        From the lowest cell, which is at 0, to the highest.
+    seed : int
+        Not negative.
+
+    Returns
+    -------
+    float32 (rows, cols), m
+    """
     rng = np.random.default_rng([seed, 1])
     broad = max(min(rows, cols) / 2.5, 8.0)
     ridges = mountains(rng, rows, cols, broad, ridged=True)
@@ -49,7 +63,22 @@ def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Flo
 def landscape(
     rows: int, cols: int, resolution_m: float, relief_m: float, seed: int, rivers: int = 0
 ) -> tuple[Floats, Bytes]:
-    """Heights and classes of a synthetic terrain."""
+    """Heights and classes of a synthetic terrain.
+
+    Parameters
+    ----------
+    rows, cols, relief_m, seed
+        As in `synthetic_elevation`.
+    resolution_m : float
+        Side of a cell.
+    rivers : int
+        How many cross the terrain; see `carve`.
+
+    Returns
+    -------
+    elevation_m : float32 (rows, cols), m
+    classes : uint8 (rows, cols), TerrainClass
+    """
     elevation_m = synthetic_elevation(rows, cols, relief_m, seed)
     if rivers == 0:
         return elevation_m, cover(elevation_m, resolution_m, seed)
@@ -62,7 +91,21 @@ def landscape(
 
 def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
     """Plausible classes without a photo: rock on what is steep, forest on slopes, grass between, bare soil here and
-    there."""
+    there.
+
+    Parameters
+    ----------
+    elevation_m : float32 (rows, cols), m
+        NaN is a void; its class is UNKNOWN.
+    resolution_m : float
+        Side of a cell.
+    seed : int
+        Of where forest and soil are.
+
+    Returns
+    -------
+    uint8 (rows, cols), TerrainClass
+    """
     rows, cols = elevation_m.shape
     rng = np.random.default_rng([seed, 2])
     east, north = gradient(elevation_m, resolution_m)
@@ -83,7 +126,19 @@ def flat_water(elevation_m: Floats, at_least: int = 4) -> Bools:
     """Level patches: cells exactly as high as all eight neighbours, in patches of `at_least`, and their shores.
 
     Elevation models are levelled on lakes; real ground is never as flat as that. A plain (more than a third of the
-    terrain) is no lake."""
+    terrain) is no lake.
+
+    Parameters
+    ----------
+    elevation_m : float32 (rows, cols), m
+        As in the file: after resampling no lake is level any more.
+    at_least : int
+        Cells of the smallest patch, without its shore.
+
+    Returns
+    -------
+    bool (rows, cols)
+    """
     from scipy import ndimage
 
     level = ndimage.maximum_filter(elevation_m, 3) == ndimage.minimum_filter(elevation_m, 3)
@@ -101,7 +156,19 @@ LEVEL_LIGHT = 0.70710678
 
 
 def shade(east: Floats, north: Floats, exaggeration: float = 1.0) -> Floats:
-    """Light from the north-west, 45 degrees high, on a gradient: 0 dark to 1 bright."""
+    """Light from the north-west, 45 degrees high, on a gradient.
+
+    Parameters
+    ----------
+    east, north : float32 (rows, cols), m/m
+        Rise to the east and to the north.
+    exaggeration : float
+        How many times higher the ground is made.
+
+    Returns
+    -------
+    float32 (rows, cols), 0 dark to 1 bright
+    """
     east = east * np.float32(exaggeration)
     north = north * np.float32(exaggeration)
     light = (east - north) * np.float32(0.5) + np.float32(LEVEL_LIGHT)
@@ -110,14 +177,31 @@ def shade(east: Floats, north: Floats, exaggeration: float = 1.0) -> Floats:
 
 
 def hillshade(elevation_m: Floats, resolution_m: float, exaggeration: float = 1.0) -> Floats:
-    """`shade` of heights; a void is level."""
+    """`shade` of heights: float32 (rows, cols) in m, in which a void (NaN) is level, on cells of `resolution_m`."""
     return shade(*gradient(elevation_m, resolution_m), exaggeration)
 
 
 def paint_photo(
     elevation_m: Floats, classes: Bytes, resolution_m: float, seed: int, progress: Progress = no_progress
 ) -> Bytes:
-    """A photograph of what covers the ground, lit from the north-west, paler in the heights."""
+    """A photograph of what covers the ground, lit from the north-west, paler in the heights.
+
+    Parameters
+    ----------
+    elevation_m : float32 (rows, cols), m
+        NaN is a void, which is black; not all may be voids.
+    classes : uint8 (rows, cols), TerrainClass
+    resolution_m : float
+        Side of a cell.
+    seed : int
+        Of the grain.
+    progress : callable
+        Told what is done and how much of it.
+
+    Returns
+    -------
+    uint8 (rows, cols, 3), red, green, blue
+    """
     rows, cols = elevation_m.shape
     texture = fractal(np.random.default_rng([seed, 3]), rows, cols, 16.0)
     low, high = float(np.nanmin(elevation_m)), float(np.nanmax(elevation_m))

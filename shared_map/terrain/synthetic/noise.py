@@ -14,13 +14,31 @@ from shared_map.arrays import Floats
 
 
 def fractal(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
-    """Smooth noise of many scales, roughly -1..1, the broadest hills `coarsest` cells wide. Ridged has sharp crests
-    and broad valleys."""
+    """Smooth noise of many scales.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        It is advanced.
+    rows, cols : int
+        Cells; at least 1 each.
+    coarsest : float
+        Cells across the broadest hills. Below 2 there is no noise: all is 0.
+    ridged : bool
+        Whether crests are sharp and valleys broad.
+
+    Returns
+    -------
+    float32 (rows, cols), within -1..1
+    """
     return _octaves(_lattice_noise, 0.5, rng, rows, cols, coarsest, ridged)
 
 
 def mountains(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Floats:
-    """As `fractal`, of gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the work."""
+    """As `fractal`, of gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the work.
+
+    Values are roughly within -1..1.
+    """
     return _octaves(_gradient_noise, 0.45, rng, rows, cols, coarsest, ridged)
 
 

@@ -19,7 +19,26 @@ Course = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 def carve(elevation_m: Floats, count: int, resolution_m: float, seed: int) -> tuple[Floats, Bools, Bools]:
-    """(heights with valleys cut, water, fords) for `count` rivers, three cells wide."""
+    """Rivers, three cells wide, and the valleys that they cut.
+
+    Parameters
+    ----------
+    elevation_m : float32 (rows, cols), m
+        Without voids; it is not changed.
+    count : int
+        Rivers; every other one flows between the northern and southern border, the others between west and east.
+    resolution_m : float
+        Side of a cell.
+    seed : int
+        Not negative.
+
+    Returns
+    -------
+    elevation_m : float32 (rows, cols), m
+        Nowhere higher than before.
+    water, fords : bool (rows, cols)
+        Deep cells, and shallow ones every `FORD_EVERY` cells along a river. No cell is both.
+    """
     from scipy import ndimage
 
     rng = np.random.default_rng([seed, 6])

@@ -14,7 +14,28 @@ _COARSE_CELLS = 1_000_000
 
 def lay_roads(pace: Floats, count: int, grid: GridSpec, seed: int) -> Bools:
     """Cells of `count` roads. Each leads from a new place to the nearest place that has one already, every fourth
-    to another place instead, so that there are ways around. A road is cheap to follow, so later ones join it."""
+    to another place instead, so that there are ways around. A road is cheap to follow, so later ones join it.
+
+    Parameters
+    ----------
+    pace : float32 (rows, cols), s/m
+        inf is lethal; no road crosses it.
+    count : int
+        Roads wanted. There are fewer where places do not connect, or do not suffice.
+    grid : GridSpec
+        Of `pace`.
+    seed : int
+        Not negative.
+
+    Returns
+    -------
+    bool (rows, cols)
+
+    Raises
+    ------
+    TerrainError
+        If no two places are connected.
+    """
     from skimage.graph import MCP_Geometric
 
     stride = 1

@@ -11,7 +11,7 @@ from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import nodes_of
-from launch_scripts.simulation.worlds import seeded
+from launch_scripts.simulation.worlds import WIDE_TERRAIN, seeded
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.tiles import region_tiles
@@ -73,15 +73,9 @@ def test_within_its_regions_it_equals_one_that_holds_all(
     assert near.missing(everything.held.ledger.held()) == []
 
 
-NEAR: Scenario = parse_scenario("""
+NEAR: Scenario = parse_scenario(f"""
 name = "near"
-time_scale = 40
-[terrain]
-source = "synthetic"
-rows = 280
-cols = 800
-resolution_m = 30
-relief_m = 200
+{WIDE_TERRAIN}
 [terrain.hidden]
 rubble_fields = 12
 flooded_share = 0.02

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import pytest
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_behaviour import Box, answering, asked, note, pose, run_info
+from support.bus_world import Box, answering, asked, note, pose, run_info
+from support.query_behaviour import *  # noqa: F403
 from support.swarm_model import START_NS, SwarmModel
+from support.trusted_behaviour import *  # noqa: F403
 
 from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
 from swarm.bus.memory_bus import PerfectLinks

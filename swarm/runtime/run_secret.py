@@ -1,0 +1,60 @@
+"""The secret by which the processes of one user on one machine know each other's words (decision 32)."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import tempfile
+from pathlib import Path
+
+from swarm.config.scenario import NetworkConfig
+from swarm.errors import ConfigError
+from swarm.wire.authentication import Authenticator
+
+_SECRET_BYTES = 32
+
+
+def authenticator_of(network: NetworkConfig, run_id: str) -> Authenticator | None:
+    """What makes and checks the codes of a run; None where certificates say who speaks.
+
+    Raises ConfigError where the secret cannot be read or made, or others may read it.
+    """
+    return None if network.tls is not None else Authenticator(_secret(_path()), run_id)
+
+
+def _path() -> Path:
+    state = os.environ.get("XDG_STATE_HOME", "")
+    base = Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state"
+    return base / "terrain-swarm" / "secret"
+
+
+def _secret(path: Path) -> bytes:
+    """The secret in a file, which is made if there is none: by one of several processes that begin at once."""
+    try:
+        if not path.exists():
+            _make(path)
+        if path.stat().st_mode & 0o077:
+            raise ConfigError(f"{path}: others may read this secret: chmod 600, or delete it to get a new one")
+        secret = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot keep the secret of this user's swarms there: {error.strerror}"
+        ) from error
+    if len(secret) != _SECRET_BYTES:
+        raise ConfigError(
+            f"{path}: {len(secret)} bytes, where {_SECRET_BYTES} were expected: delete it to get a new one"
+        )
+    return secret
+
+
+def _make(path: Path) -> None:
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    handle, draft = tempfile.mkstemp(dir=path.parent)  # readable by this user only
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(secrets.token_bytes(_SECRET_BYTES))
+        os.link(draft, path)
+    except FileExistsError:
+        pass  # another process was first
+    finally:
+        os.unlink(draft)

@@ -1,0 +1,79 @@
+"""A network under test, and what the rules of a bus are told with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from swarm.bus.bus import Asked, AskEnded, Bus, Event
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.processes import Note, RunInfo
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.topics import Topic
+
+
+class World(Protocol):
+    """A network under test.
+
+    until   waits until `true()` is; fails after `within_s`
+    settle  waits until declarations have reached all buses
+    cut     takes the link of one bus down; `heal` brings it back
+    """
+
+    def bus(self, name: str, namespace: str = "swarm") -> Bus: ...
+    def put_bytes(self, bus: Bus, topic: Topic, payload: bytes, **fields: str) -> None: ...
+    def until(self, true: Callable[[], object], within_s: float = 5.0) -> None: ...
+    def settle(self) -> None: ...
+    def cut(self, bus: Bus) -> None: ...
+    def heal(self, bus: Bus) -> None: ...
+
+
+class Box(list[Any]):
+    """A `Post` that keeps the events."""
+
+    def __call__(self, event: Event) -> None:
+        self.append(event)
+
+    def of(self, kind: type) -> list[Any]:
+        return [event for event in self if isinstance(event, kind)]
+
+
+def pose(target: str = "t0", seq: int = 1) -> TargetPose:
+    return TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
+
+
+def note(text: str, id: str = "a0") -> Note:
+    return Note(role="agent", id=id, stamp_ns=1, kind="test", text=text)
+
+
+def run_info(id: str) -> RunInfo:
+    return RunInfo(
+        run_id="r", role="agent", id=id, incarnation=1, scenario="s", terrain="0", rows=1, cols=1, resolution_m=1.0,
+        started_ns=0,
+    )  # fmt: skip
+
+
+def marks(author: str, tile: int) -> MarkSet:
+    return MarkSet(
+        author=author, group="all", tile=tile, epoch=1, seq=1, cells=b"", kinds=b"", paces=b"", stamps_ns=b""
+    )
+
+
+def answering(*replies: Any) -> Callable[[Event], None]:
+    """A `Post` for `serve` that answers with these (message, fields) and ends."""
+
+    def post(event: Event) -> None:
+        assert isinstance(event, Asked)
+        for message, fields in replies:
+            event.answer(message, **fields)
+        event.end()
+
+    return post
+
+
+def asked(world: World, bus: Bus, topic: Topic, request: Any, **options: Any) -> Box:
+    """The events of one query, once it has ended."""
+    box = Box()
+    bus.ask(topic, request, box, tag="q", **options)
+    world.until(lambda: box.of(AskEnded))
+    return box

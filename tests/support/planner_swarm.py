@@ -1,0 +1,155 @@
+"""Planners on a simulated network: a tracker of targets, an agent that marks, and somebody who asks and hears."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from support.slow_twins import cost_to_go
+from support.swarm_model import SwarmModel
+
+from planner_service.service import PlannerService
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import AskEnded, Event, Heard, Replied
+from swarm.bus.scheduler import InlineWorker
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import PlannerConfig, Scenario, Strategy, TargetConfig
+from swarm.grid import GridSpec, walk
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.planning import RouteReply, RouteRequest
+from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import Fleet, VehicleState
+from swarm.wire.routes import Route
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import FLEET, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS, Topic
+
+ROWS, COLS, RES = 40, 50, 10.0
+GRID = GridSpec(ROWS, COLS, RES)
+TICK = NS_PER_S // 10
+
+
+def flat() -> NDArray[np.float32]:
+    return np.full((ROWS, COLS), 0.1, np.float32)
+
+
+def rough(seed: int, lethal: float = 0.2) -> NDArray[np.float32]:
+    rng = np.random.default_rng(seed)
+    pace = rng.uniform(0.05, 0.6, (ROWS, COLS)).astype(np.float32)
+    pace[rng.random((ROWS, COLS)) < lethal] = np.inf
+    pace[ROWS // 2] = 0.1
+    return pace
+
+
+def optimum_s(pace: NDArray[np.float32], target: int) -> NDArray[np.float64]:
+    """Travel time of every cell to the target, by an independent Dijkstra."""
+    return cost_to_go(pace, target).ravel() * RES
+
+
+def driven_s(pace: NDArray[np.float32], route: Route) -> float:
+    """Cost recomputed along the cells of a whole route."""
+    cells = walk(GRID, route.start, route.directions)
+    metres = [RES * (math.sqrt(2) if code % 2 else 1.0) for code in route.directions]
+    return sum(float(pace.flat[cell]) * m for cell, m in zip(cells[1:], metres, strict=True))
+
+
+class Ear:
+    """Somebody who asks, and hears everything."""
+
+    def __init__(self, world: SwarmModel) -> None:
+        self.world = world
+        self.bus = world.bus("ear")
+        self.heard: list[Message] = []
+        self.replies: list[Message] = []
+        self.ended: list[AskEnded] = []
+        for topic in (PUSHED_ROUTE, STATUS, STATS):
+            self.bus.subscribe(topic, self._post)
+
+    def _post(self, event: Event) -> None:
+        match event:
+            case Heard(message=message):
+                self.heard.append(message)
+            case Replied(message=message):
+                self.replies.append(message)
+            case AskEnded():
+                self.ended.append(event)
+            case _:
+                raise AssertionError(event)
+
+    def ask(self, topic: Topic, request: Message, **fields: Any) -> list[Any]:
+        self.replies = []
+        self.bus.ask(topic, request, self._post, tag="q", **fields)
+        self.world.run(0.01)
+        return self.replies
+
+    def routes(self, *cells: int, target: str = "t", **fields: Any) -> RouteReply:
+        (reply,) = self.ask(ROUTE, RouteRequest(cells=list(cells), **fields), target=target)
+        assert isinstance(reply, RouteReply)
+        return reply
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [message for message in self.heard if isinstance(message, kind)]
+
+    def last_stats(self, role: str = "planner") -> Stats:
+        return [stats for stats in self.of(Stats) if stats.role == role][-1]  # type: ignore[no-any-return]
+
+
+class Swarm(SwarmModel):
+    """A terrain, planners, a tracker of targets, and an agent that marks."""
+
+    def __init__(
+        self, pace: NDArray[np.float32] | None = None, strategy: Strategy = "auto", targets: int = 1
+    ) -> None:
+        self.pace = flat() if pace is None else pace
+        scenario = Scenario(
+            targets=(TargetConfig(count=targets),), planner=PlannerConfig(strategy=strategy, k_min=1, full_every=3)
+        )
+        super().__init__(terrain=terrain_of_pace(self.pace, RES), scenario=scenario)
+        self.ear = Ear(self)
+        self.planners = {id: self.planner(id) for id in self.scenario.target_ids}
+        self.cells: dict[str, int] = {}
+        self._seq = 0
+        self._track()
+        self.author = self.writer("a0.1")
+
+    def planner(self, target: str, incarnation: int = 1) -> PlannerService:
+        setup = self.setup("planner", target, incarnation)
+        worker = InlineWorker(self.scheduler)
+        return self.start(
+            f"planner-{target}-{incarnation}",
+            lambda bus, post: PlannerService(setup, self.terrain, bus, post, worker),
+            phase_ns=0,
+        )
+
+    def _track(self) -> None:
+        """Ten poses a second of every target that has been put somewhere."""
+        self._seq += 1
+        for id, cell in self.cells.items():
+            pose = TargetPose(target=id, incarnation=1, seq=self._seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
+            self.ear.bus.publish(POSE, pose, target=id)
+        self.scheduler.after(TICK, self._track)
+
+    def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:
+        self.author.sync.publish(self.author.replica.write(list(cells), kind, pace, self.now_ns))
+
+    def report(self, *vehicles: tuple[str, int], target: str = "t", seq: int = 1) -> None:
+        count = len(vehicles)
+        fleet = Fleet(
+            author="a0.1",
+            group="all",
+            region=0,
+            seq=seq,
+            stamp_ns=self.now_ns,
+            ids=[id for id, _ in vehicles],
+            target_ids=[target],
+            cells=pack_column([cell for _, cell in vehicles], "<u4"),
+            east_m=pack_column([0.0] * count, "<f4"),
+            south_m=pack_column([0.0] * count, "<f4"),
+            heading_rad=pack_column([0.0] * count, "<f4"),
+            states=bytes([VehicleState.FOLLOWING] * count),
+            targets=bytes([0] * count),
+        )
+        self.ear.bus.publish(FLEET, fleet, region=0, author="a0.1")

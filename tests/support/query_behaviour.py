@@ -1,0 +1,152 @@
+"""The rules of `swarm.bus.bus.Bus` for questions and answers; run where `support.bus_behaviour` is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from support.bus_world import Box, World, answering, asked, marks, run_info
+
+from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.marks import MarksRequest
+from swarm.wire.messages.traffic import Claim, Table
+from swarm.wire.topics import MARKS, RUN, TABLE
+
+
+def test_a_query_that_nobody_serves_ends_empty(world: World):
+    a = world.bus("a")
+    world.settle()
+    assert asked(world, a, RUN, Nothing()) == [AskEnded("q", RUN, 0, None)]
+
+
+def test_a_query_is_answered_once(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    b.serve(RUN, answering((run_info("b"), {})), role="agent", id="b")
+    world.settle()
+    assert asked(world, a, RUN, Nothing(), role="agent", id="b") == [
+        Replied("q", RUN, {"role": "agent", "id": "b"}, run_info("b")),
+        AskEnded("q", RUN, 1, None),
+    ]
+
+
+def test_a_wildcard_query_is_answered_by_everybody_ourselves_included(world: World):
+    buses = {name: world.bus(name) for name in ("a", "b", "c")}
+    for name, bus in buses.items():
+        bus.serve(RUN, answering((run_info(name), {})), role="agent", id=name)
+    world.settle()
+    box = asked(world, buses["a"], RUN, Nothing(), role="agent")
+    assert sorted(event.message.id for event in box.of(Replied)) == ["a", "b", "c"]
+    assert box[-1] == AskEnded("q", RUN, 3, None)
+
+
+def test_one_queryable_may_give_many_replies_in_order(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    replies = [(marks("x.1", tile), {"region": 0, "tile": tile, "author": "x.1"}) for tile in range(50)]
+    b.serve(MARKS, answering(*replies))
+    world.settle()
+    box = asked(world, a, MARKS, MarksRequest())
+    assert [event.message.tile for event in box.of(Replied)] == list(range(50))
+    assert box[0].fields == {"region": "0", "tile": "0", "author": "x.1"}
+    assert box[-1].replies == 50
+
+
+def test_replies_outside_the_asked_key_are_not_sent(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    replies = [(marks("x.1", tile), {"region": 0, "tile": tile, "author": "x.1"}) for tile in range(5)]
+    b.serve(MARKS, answering(*replies))
+    world.settle()
+    box = asked(world, a, MARKS, MarksRequest(), tile=3)
+    assert [event.message.tile for event in box.of(Replied)] == [3]
+
+
+def test_the_asked_fields_tell_what_was_asked_and_the_request_arrives(world: World):
+    a, b, seen = world.bus("a"), world.bus("b"), Box()
+
+    def post(event: Event) -> None:
+        seen(event)
+        answering()(event)
+
+    b.serve(MARKS, post, author="x.1")
+    world.settle()
+    asked(world, a, MARKS, MarksRequest(tiles=[7]), tile=7)
+    assert seen[0].fields == {"region": "*", "tile": "7", "author": "*"}
+    assert seen[0].request == MarksRequest(tiles=[7])
+
+
+def test_a_refusal_reaches_who_asked(world: World):
+    a, b = world.bus("a"), world.bus("b")
+
+    def refuse(event: Any) -> None:
+        event.refuse("not today")
+        event.end()
+
+    b.serve(TABLE, refuse, agent="a0")
+    world.settle()
+    assert asked(world, a, TABLE, Claim(epoch=1), agent="a0") == [AskEnded("q", TABLE, 0, "not today")]
+
+
+def test_a_query_that_is_never_ended_times_out_with_what_came(world: World):
+    a, b, kept = world.bus("a"), world.bus("b"), Box()
+
+    def forget(event: Any) -> None:
+        event.answer(run_info("b"))
+        kept(event)
+
+    b.serve(RUN, forget, role="agent", id="b")
+    world.settle()
+    box = asked(world, a, RUN, Nothing(), timeout_s=0.3)
+    assert [event.message.id for event in box.of(Replied)] == ["b"]
+    assert box[-1] == AskEnded("q", RUN, 1, "timeout")
+
+
+def test_answers_may_come_later_than_the_event(world: World):
+    a, b, kept, box = world.bus("a"), world.bus("b"), Box(), Box()
+    b.serve(RUN, kept, role="agent", id="b")
+    world.settle()
+    a.ask(RUN, Nothing(), box, tag="q")
+    world.until(lambda: kept)
+    world.settle()
+    assert box == []
+    kept[0].answer(run_info("b"))
+    kept[0].end()
+    world.until(lambda: box.of(AskEnded))
+    assert len(box.of(Replied)) == 1
+
+
+def test_who_serves_learns_how_long_the_asker_waits_and_that_it_has_left(world: World):
+    a, b, kept, box = world.bus("a"), world.bus("b"), Box(), Box()
+    b.serve(RUN, kept, role="agent", id="b")
+    world.settle()
+    a.ask(RUN, Nothing(), box, tag="q", timeout_s=0.7)
+    world.until(lambda: kept)
+    assert kept[0].timeout_s == 0.7
+    assert not kept[0].expired
+    assert 0 <= kept[0].waited_s < 0.7
+    world.until(lambda: box)
+    world.settle()
+    assert kept[0].expired
+
+
+def test_an_answer_after_the_end_is_a_bug_that_raises(world: World):
+    a, b, kept = world.bus("a"), world.bus("b"), Box()
+    b.serve(RUN, kept, role="agent", id="b")
+    world.settle()
+    a.ask(RUN, Nothing(), Box(), tag="q")
+    world.until(lambda: kept)
+    kept[0].end()
+    kept[0].end()
+    with pytest.raises(RuntimeError, match="after the end"):
+        kept[0].answer(run_info("b"))
+
+
+def test_one_that_hears_a_topic_may_serve_it_too(world: World):
+    a, b, heard = world.bus("a"), world.bus("b"), Box()
+    table = Table(plot=0, agent="a0", epoch=1, seq=1, hosts={}, grants={})
+    b.subscribe(TABLE, heard)
+    b.serve(TABLE, answering((table, {"plot": 0, "agent": "a0"})))
+    world.settle()
+    a.publish(TABLE, table, plot=0, agent="a0")
+    world.until(lambda: heard)
+    claim = Claim(epoch=1)
+    assert [event.message for event in asked(world, a, TABLE, claim, plot=0, agent="a0").of(Replied)] == [table]

@@ -1,0 +1,157 @@
+"""The planner without a bus or a worker: what it answers, and to whom it pushes routes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from support.scripted_planner import COLS, GRID, World
+
+from planner_service.followers import route_cells
+from planner_service.planner import FOLLOWER_LEASE_NS
+from planner_service.target_tree import Update
+from swarm.clock import NS_PER_S
+from swarm.grid import Window, walk
+from swarm.wire.fields import column
+from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute
+from swarm.wire.routes import Route, RouteStatus
+
+
+def test_a_person_asks_by_row_and_col(ready: World) -> None:
+    reply = ready.ask(row=10, col=17)
+    (route,) = reply.routes
+    assert (route.start, list(route.directions)) == (GRID.cell(10, 17), [2, 2, 2])
+
+
+def test_outside_is_a_status(ready: World) -> None:
+    assert ready.ask(row=10, col=COLS).routes[0].status is RouteStatus.OUTSIDE
+    statuses = [route.status for route in ready.ask(-1, GRID.cells, 2**31, 0).routes]
+    assert statuses == [RouteStatus.OUTSIDE] * 3 + [RouteStatus.OK]
+
+
+def test_costs_come_as_a_column_with_inf_outside(ready: World) -> None:
+    reply = ready.planner.answer(CostRequest(cells=[3, GRID.cells]), ready.now_ns)
+    assert isinstance(reply, CostReply)
+    assert column(reply.cost_to_go_s, "<f4").tolist() == [3.0, math.inf]
+
+
+def test_asking_again_gives_the_same_answer(ready: World) -> None:
+    assert ready.ask(3, 4, force=True) == ready.ask(3, 4, force=True)
+
+
+def test_the_range_is_forced_once_between_two_changes_of_the_tree(ready: World) -> None:
+    ready.ask(3, 4, force=True)
+    ready.ask(4, 5, 3, force=True)
+    ready.ask(4, 9)
+    ready.ask(GRID.cells, force=True)
+    assert ready.tree.named("force") == [("force", [3, 4]), ("force", [5])]
+    ready.pose(10, 21, seq=2)
+    ready.tick()
+    ready.ask(4, force=True)
+    assert ready.tree.named("force")[-1] == ("force", [4])
+    assert ready.counters.counts["window_growths"] == 3
+
+
+def test_the_trees_age_is_since_the_last_exact_growth(ready: World) -> None:
+    ready.tree.answers = [Update("window", Window(0, 0, 5, 5), 25)] * 3
+    for seq in range(2, 5):
+        ready.pose(10, 20 + seq, seq)
+        ready.tick()
+    assert ready.ask(0).tree_age_ms == 300.0
+    ready.pose(10, 28, 9)
+    ready.tick()
+    assert ready.ask(0).tree_age_ms == 0.0
+
+
+def test_a_follower_inside_the_updated_window_is_pushed_a_newer_route(ready: World) -> None:
+    ready.ask(GRID.cell(10, 5), GRID.cell(0, 0), vehicles=["near", "far"])
+    ready.now_ns += NS_PER_S
+    ready.tree.answers = [Update("window", Window(8, 0, 12, 30), 100)]
+    ready.pose(11, 20, seq=2)
+    (push,) = ready.tick()
+    assert isinstance(push, PushedRoute)
+    assert (push.vehicle, push.target, push.incarnation) == ("near", "t0", 7)
+    assert walk(GRID, push.route.start, push.route.directions)[-1] == GRID.cell(11, 20)
+
+
+def test_a_follower_whose_route_a_map_change_crosses_is_pushed_a_newer_route(ready: World) -> None:
+    ready.ask(GRID.cell(10, 5), GRID.cell(0, 20), vehicles=["crossed", "clear"])
+    ready.now_ns += NS_PER_S
+    ready.tree.answers = [Update("repair", Window(9, 12, 12, 13), 3)]
+    ready.mark(GRID.cell(10, 12))
+    ready.tick()
+    follower, _ = ready.planner.followers.all()
+    # The scripted tree knows no way around: the steps are the old ones, which is no news.
+    assert not follower.stale
+    ready.fleet(("crossed", GRID.cell(11, 6), "t0"), ("clear", GRID.cell(1, 20), "t0"))
+    ready.tree.answers = [Update("repair", Window(9, 12, 12, 13), 3)]
+    ready.mark(GRID.cell(9, 12))
+    (push,) = ready.tick()
+    assert isinstance(push, PushedRoute)
+    assert push.vehicle == "crossed"
+    assert push.route.start == GRID.cell(11, 6)
+
+
+def test_routes_are_pushed_to_a_vehicle_at_most_every_push_s(ready: World) -> None:
+    ready.ask(GRID.cell(10, 0), vehicles=["v"])
+    pushed_ns: list[int] = []
+    for seq in range(2, 42):
+        ready.pose(10 + seq % 2, 20, seq)
+        pushed_ns += [ready.now_ns for action in ready.tick() if isinstance(action, PushedRoute)]
+    assert len(pushed_ns) >= 2
+    assert all(np.diff([0, *pushed_ns]) >= NS_PER_S)
+
+
+def test_a_route_that_only_says_what_the_vehicle_knows_is_not_pushed(ready: World) -> None:
+    ready.ask(GRID.cell(10, 0), vehicles=["v"])
+    ready.fleet(("v", GRID.cell(10, 3), "t0"))
+    for _ in range(30):
+        ready.mark(GRID.cell(0, 29))
+        ready.mark(GRID.cell(0, 28))
+        assert ready.tick() == []
+
+
+def test_reports_tell_where_a_follower_is_now_and_who_else_follows(ready: World) -> None:
+    ready.ask(GRID.cell(10, 0), vehicles=["v"])
+    ready.fleet(("v", GRID.cell(10, 3), "t0"), ("w", GRID.cell(3, 3), "t0"), ("x", 5, "t1"), ("y", 6, None))
+    assert ready.planner.followers.cells.tolist() == [GRID.cell(10, 3), GRID.cell(3, 3)]
+    assert ready.planner.status(0).following == 2
+
+
+def test_who_chases_another_target_is_dropped_at_once(ready: World) -> None:
+    ready.ask(0, 1, vehicles=["v", "w"])
+    ready.fleet(("v", 0, "t1"), ("w", 1, None))
+    assert len(ready.planner.followers) == 0
+
+
+def test_an_older_report_changes_nothing(ready: World) -> None:
+    ready.fleet(("v", 5, "t0"), stamp_ns=200)
+    ready.fleet(("v", 4, "t0"), stamp_ns=100)
+    ready.fleet(("v", 4, "t1"), stamp_ns=100)
+    assert ready.planner.followers.cells.tolist() == [5]
+
+
+def test_who_is_silent_for_five_seconds_is_dropped(ready: World) -> None:
+    ready.ask(0, vehicles=["v"])
+    asked_ns = ready.now_ns
+    while ready.now_ns < asked_ns + FOLLOWER_LEASE_NS:
+        ready.tick()
+        assert len(ready.planner.followers) == 1
+    ready.tick()
+    assert len(ready.planner.followers) == 0
+
+
+def test_after_a_restart_those_who_report_to_follow_are_pushed_routes_without_asking(world: World) -> None:
+    world.fleet(("v", GRID.cell(10, 0), "t0"))
+    world.pose(10, 20)
+    (push,) = world.tick()
+    assert isinstance(push, PushedRoute)
+    assert push.vehicle == "v"
+
+
+def test_the_cells_of_a_route_are_those_walked() -> None:
+    start, directions = GRID.cell(5, 5), bytes([0, 1, 2, 3, 4, 5, 6, 7, 2])
+    rows, cols = route_cells(GRID, Route(status=RouteStatus.OK, start=start, directions=directions, cost_s=1.0))
+    assert [GRID.cell(r, c) for r, c in zip(rows.tolist(), cols.tolist(), strict=True)] == walk(
+        GRID, start, directions
+    )
