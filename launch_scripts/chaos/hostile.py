@@ -39,35 +39,35 @@ class Hostile:
         self._chance = random.Random(f"hostile/{seed}")
         self._spared = [topic for topic in TOPICS if topic.name in spared]
         self._topics = [topic for topic in TOPICS if topic.published and topic.name not in spared]
-        self._heard: dict[str, deque[bytes]] = {}
-        """Key -> what was said under it lately."""
+        self._heard: dict[str, deque[tuple[bytes, bytes | None]]] = {}
+        """Key -> what was said under it lately, each with its code."""
         self._keys: list[str] = []
 
-    def heard(self, key: str, payload: bytes) -> None:
-        """Keep a genuine message as material."""
+    def heard(self, key: str, payload: bytes, code: bytes | None = None) -> None:
+        """Keep a genuine message as material. `code` came with it, and proves who said it."""
         kept = self._heard.get(key)
         if kept is None:
             if len(self._keys) >= _KEYS or any(topic.parse(self._namespace, key) for topic in self._spared):
                 return
             kept = self._heard[key] = deque(maxlen=_KEPT)
             self._keys.append(key)
-        kept.append(payload)
+        kept.append((payload, code))
 
-    def next(self) -> tuple[str, str, bytes]:
-        """Kind, key and payload of one message."""
+    def next(self) -> tuple[str, str, bytes, bytes | None]:
+        """Kind, key, payload and code of one message. A thief has the codes of what he heard, and no other."""
         chance = self._chance
         kind = chance.choice(self._kinds)
         if kind == "lies" or not self._keys:
             topic = chance.choice(self._topics)
             message = self._lies.lie(topic.message)
-            return "lies", topic.keyed(self._namespace, **self._lies.fields(topic, message)), encode(message)
+            return "lies", topic.keyed(self._namespace, **self._lies.fields(topic, message)), encode(message), None
         key = chance.choice(self._keys)
-        payload = chance.choice(self._heard[key])
+        payload, code = chance.choice(self._heard[key])
         if kind == "flipped":
             payload = self._flipped(payload)
         elif kind == "numbers":
             payload = self._with_numbers(payload)
-        return kind, key, payload
+        return kind, key, payload, code
 
     def _flipped(self, payload: bytes) -> bytes:
         bits = bytearray(payload)

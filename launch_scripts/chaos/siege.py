@@ -274,12 +274,13 @@ class Siege:
         with stranger.listening_to_all() as last:
             self._listen(stranger, _MATERIAL_S)
         for key, sample in sorted(last.items()):
-            self._hostile.heard(key, sample.payload.to_bytes())
+            code = None if sample.attachment is None else sample.attachment.to_bytes()
+            self._hostile.heard(key, sample.payload.to_bytes(), code)
         began_s, many = self._now_s, 0
         while self._now_s < began_s + lasts_s and not self._finished():
             for _ in range(_AT_ONCE):
-                kind, key, payload = self._hostile.next()
-                stranger.say(key, payload)
+                kind, key, payload, code = self._hostile.next()
+                stranger.say(key, payload, code)
                 self.tally.messages[kind] = self.tally.messages.get(kind, 0) + 1
                 many += 1
             self._listen(stranger, max(began_s + many / _MESSAGES_PER_S - self._now_s, 0.0))

@@ -63,9 +63,10 @@ class Stranger:
         finally:
             ear.undeclare()
 
-    def say(self, key: str, payload: bytes) -> None:
+    def say(self, key: str, payload: bytes, code: bytes | None) -> None:
         # As our own processes put: to block would wait for the slowest reader of the run.
-        self._bus.session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
+        dropping = zenoh.CongestionControl.DROP
+        self._bus.session.put(key, payload, congestion_control=dropping, attachment=code)
 
     def close(self) -> None:
         self._fleets.undeclare()

@@ -60,8 +60,8 @@ def hostile(seed: int = 1, **options: object) -> Hostile:
 def test_hostile_messages_are_of_all_kinds_and_the_same_for_the_same_seed() -> None:
     one, same, other = ([made.next() for _ in range(200)] for made in (hostile(1), hostile(1), hostile(2)))
     assert one == same != other
-    assert {kind for kind, _, _ in one} == set(KINDS)
-    assert all(key.startswith("swarm/") for _, key, _ in one)
+    assert {kind for kind, *_ in one} == set(KINDS)
+    assert all(key.startswith("swarm/") for _, key, *_ in one)
 
 
 def test_nothing_hostile_is_said_under_a_topic_that_is_spared() -> None:
@@ -72,8 +72,8 @@ def test_nothing_hostile_is_said_under_a_topic_that_is_spared() -> None:
 
 def test_a_replay_is_byte_for_byte_what_was_said() -> None:
     made = Hostile("swarm", Lies(10, 1), 1, ["replayed"])
-    made.heard("swarm/x", b"said")
-    assert made.next() == ("replayed", "swarm/x", b"said")
+    made.heard("swarm/x", b"said", b"code")
+    assert made.next() == ("replayed", "swarm/x", b"said", b"code")
 
 
 def test_recovery_counts_from_when_the_blow_is_over_and_takes_the_last_vehicle() -> None:
