@@ -19,8 +19,8 @@ from support.live_swarm import Hands, client
 from support.processes import eventually, session_of
 from support.silent_link import SilentLink
 
-from launch_scripts.launcher.options import host_port, listening
 from swarm.bus.bus import Event, Heard
+from swarm.bus.endpoints import host_port, listening
 from swarm.bus.zenoh_bus import ZenohBus
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 from swarm.wire.topics import FLEET

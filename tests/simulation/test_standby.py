@@ -7,10 +7,11 @@ from typing import Any
 
 import msgspec
 import pytest
-from support.simulated_swarm import SMALL, Laws, seeded
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition
+from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Node, Simulation
+from launch_scripts.simulation.worlds import SMALL, seeded
 from planner_service.service import PlannerService
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.config.scenario import Scenario, StandbyConfig
