@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import sys
@@ -13,8 +14,8 @@ from typing import Annotated, Any
 import typer
 
 from launch_scripts.commands import query, roles
-from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Tls, spread
-from swarm.errors import SwarmError
+from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Runs, Tls, spread
+from swarm.errors import StoreError, SwarmError
 from swarm.ranks import HIGHEST_RANK
 
 
@@ -186,9 +187,20 @@ def _up(
 
 @app.command()
 def simulate(
-    scenario: ScenarioArgument,
+    scenario: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="SCENARIO",
+            help="A .toml file or a built-in name; with --seeds also a small world: small, wide, open, doors, "
+            "corridor, maze. With --seeds and without a name each seed takes the next of these worlds.",
+        ),
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = None,
+    seeds: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Try the seeds A to B - 1, each with faults of every kind.")
+    ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Simulated seconds.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="With --seeds: seeds that run at the same time.")] = 1,
     trace: Annotated[
         Path | None, typer.Option(help="Write the event log here; the same seed writes the same log.")
     ] = None,
@@ -197,8 +209,92 @@ def simulate(
     """Run the same swarm in one process, on a memory bus and a manual clock, and print the same report.
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
+
+    With --seeds, processes crash and hang, links are cut, also one way, clocks are set, agents run twice, messages
+    are lost, late, repeated and out of order. Exit code 1 if a law broke in any seed: a collision, a lethal entry,
+    an acknowledged mark lost, replicas that differ, a wait of ten seconds without a reason, a vehicle without a
+    route.
+
+    swarm simulate --seeds 0:100 --jobs 2
+
+    swarm simulate doors --seeds 17:18
     """
-    query.simulate(scenario, seed, seconds, trace, as_json)
+    from launch_scripts.commands.simulate import simulate_once, simulate_seeds
+    from swarm.errors import ConfigError
+
+    if seeds is None:
+        if scenario is None:
+            raise ConfigError("give a SCENARIO, or --seeds A:B to try many seeds of small worlds")
+        simulate_once(scenario, seed, seconds, trace, as_json)
+        return
+    if seed is not None or trace is not None:
+        raise ConfigError("--seeds goes with neither --seed nor --trace")
+    if not simulate_seeds(scenario, seeds, seconds, jobs, as_json):
+        raise typer.Exit(1)
+
+
+@app.command()
+def chaos(
+    scenario: Annotated[
+        str, typer.Argument(metavar="SCENARIO", help="A .toml file, or the name of a built-in scenario.")
+    ] = "besieged",
+    seconds: Annotated[float | None, typer.Option(min=1, help="End after so many seconds.")] = None,
+    messages: Annotated[
+        int | None, typer.Option(min=1, help="End once so many hostile messages have been sent.")
+    ] = None,
+    blow: Annotated[
+        list[str] | None, typer.Option(help="Only this: kill, hang or messages; may be given several times.")
+    ] = None,
+    hostile: Annotated[
+        list[str] | None,
+        typer.Option(help="Only these messages: flipped, numbers, replayed or lies; may be given several times."),
+    ] = None,
+    spare: Annotated[
+        list[str] | None, typer.Option(help="Say nothing hostile under this topic; may be given several times.")
+    ] = None,
+    every: Annotated[float, typer.Option(min=1, help="Seconds from one blow to the next, at least.")] = 10.0,
+    within: Annotated[
+        float, typer.Option(min=0.1, help="Recovering later than so many seconds breaks a law.")
+    ] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, max=2**53, help="Decides the blows and their order.")] = 1,
+    runs: Runs = Path("runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Start a swarm on this machine, strike it, and measure how soon it recovers.
+
+    Processes are killed (kill -9 of one or two) or stopped for a while, and messages are said with flipped bits,
+    hostile numbers, replayed, or as well-formed lies. Lasts a minute unless --seconds or --messages say more. Exit
+    code 1 if a process ended by itself, vehicles did not recover in time or met, or memory grew. Leaves chaos.json
+    and chaos.png in the run's folder.
+
+    swarm chaos --seconds 60
+
+    swarm chaos --blow kill --every 10 --seconds 3600
+
+    swarm chaos --blow messages --messages 1000000
+    """
+    from launch_scripts.chaos.blows import BLOWS
+    from launch_scripts.chaos.hostile import KINDS
+    from launch_scripts.chaos.siege import SiegeOptions
+    from launch_scripts.commands import chaos as command
+    from swarm.wire.topics import TOPICS
+
+    if seconds is None and messages is None:
+        seconds = 60.0
+    options = SiegeOptions(
+        scenario=scenario,
+        seconds=seconds,
+        messages=messages,
+        seed=seed,
+        every_s=every,
+        kinds=command.check_kinds("--blow", blow, BLOWS),
+        hostile=command.check_kinds("--hostile", hostile, KINDS),
+        spared=command.check_kinds("--spare", spare, tuple(topic.name for topic in TOPICS)) if spare else (),
+        within_s=within,
+        runs=runs,
+    )
+    if not command.chaos(options, as_json):
+        raise typer.Exit(1)
 
 
 app.add_typer(roles.app)
@@ -240,10 +336,27 @@ _mount(
 def main() -> int:
     """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
     try:
-        app(prog_name="swarm")
+        try:
+            app(prog_name="swarm")
+        finally:
+            sys.stdout.flush()
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
+        _leave_output()
         return 0
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
+            raise
+        _leave_output()
+        print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
+        return StoreError.exit_code
     return 0
+
+
+def _leave_output() -> None:
+    """Send what still waits to be printed nowhere: the interpreter would complain about it at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)

@@ -199,10 +199,10 @@ class AgentService:
             self._agent.place(vehicles)
             log.info("%d vehicles have their places", len(self._agent.vehicles))
 
-    def _warn(self, text: str) -> None:
-        log.warning("refused: %s", text)
-        self.counters.count("refused")
-        self._member.note(self._now_ns, "refused", text)
+    def _warn(self, kind: str, text: str) -> None:
+        log.warning("%s: %s", kind, text)
+        self.counters.count(kind)
+        self._member.note(self._now_ns, kind, text)
 
     def _stand_down(self, now_ns: int) -> None:
         """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""

@@ -1,4 +1,4 @@
-"""Sub-commands that ask a running swarm, and the simulated one."""
+"""Sub-commands that ask a running swarm."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 import time
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -288,32 +287,3 @@ def _print_status(
                 gap,
             )
         console.print(trees)
-
-
-def simulate(name: str, seed: int | None, seconds: float | None, trace: Path | None, as_json: bool) -> None:
-    """Runs `swarm simulate`."""
-    import contextlib
-
-    from launch_scripts.launcher.options import find_scenario
-    from launch_scripts.launcher.terminal import Terminal
-    from launch_scripts.simulation.simulate import simulate as run_simulation
-    from swarm.errors import StoreError
-
-    scenario = find_scenario(name)
-    terminal = Terminal(as_json, plain=True)
-    with contextlib.ExitStack() as stack:
-        try:
-            log = None if trace is None else stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
-        except OSError as error:
-            raise StoreError(f"cannot write {trace}: {error.strerror or error}") from error
-        result = run_simulation(scenario, seed=seed, seconds=seconds, trace=log)
-    if as_json:
-        typer.echo(json.dumps(result.report, indent=2))
-    else:
-        terminal.report(result.report)
-    terminal.say(
-        f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
-        f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
-    )
-    if result.trace_cut is not None:
-        raise StoreError(f"the event log {trace} has no end: {result.trace_cut}")

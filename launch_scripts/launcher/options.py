@@ -15,6 +15,7 @@ import msgspec
 
 from launch_scripts.process_table import certificate_name
 from swarm.bus.endpoints import host_port
+from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
@@ -101,6 +102,7 @@ def own_certificate(tls: TlsConfig | None, name: str) -> TlsConfig | None:
         own = file / f"{name}.{suffix}" if file.is_dir() else file
         if not own.is_file():
             raise ConfigError(f"no file {own}, which {name} needs: `swarm deploy certs` makes it")
+        check_bytes(own, FileKind.CERTIFICATE)
         files.append(str(own))
     return TlsConfig(ca=tls.ca, certificate=files[0], key=files[1])
 

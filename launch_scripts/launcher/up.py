@@ -45,7 +45,8 @@ from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
 
-PRELOAD = ("launch_scripts.launcher.warm_kernels",)
+_WARM_ROLES = "launch_scripts.launcher.warm_roles"
+_WARM_KERNELS = "launch_scripts.launcher.warm_kernels"
 
 _TURN_S = 0.05
 _LISTEN_WITHIN_S = 20.0
@@ -74,7 +75,6 @@ class UpOptions:
     as_json: bool = False
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
-    preload: tuple[str, ...] = PRELOAD
     table: tuple[ProcessSpec, ...] | None = None
 
 
@@ -173,7 +173,7 @@ class _Run:
     def run(self) -> int:
         # One thread each: the processes share the cores already, and idle threads make a fork unsafe.
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
-        warm_up = WarmUp(list(self._options.preload))
+        warm_up = WarmUp([_WARM_KERNELS if "planner" in self._options.roles else _WARM_ROLES])
         warm_up.begin()
         with self._stop_asked.interrupting():
             self._terrain, self._truth = self._prepared()
@@ -351,7 +351,7 @@ class _Run:
         )
         numbers = {name: value for name, value in report.items() if name != "series"}
         if self._options.as_json:
-            print(json.dumps(numbers, indent=2))
+            self._terminal.print_json(json.dumps(numbers, indent=2))
         else:
             self._terminal.report(numbers)
         # The figures come first: a full disk keeps nobody from them.

@@ -85,15 +85,19 @@ def _plot_gaps(axes: Axes, samples: list[Sample]) -> None:
     series: dict[str, list[tuple[float, float]]] = {}
     for sample in samples:
         for id, gap in sample.gaps.items():
-            series.setdefault(id, []).append((sample.time_s, (gap - 1) * 100))
+            if np.isfinite(gap):  # of a route without a proven bound it is infinite
+                series.setdefault(id, []).append((sample.time_s, (gap - 1) * 100))
     if not series:
         _nothing(axes)
         return
     for points in series.values():
         axes.plot(*zip(*points, strict=True), color=SKY, linewidth=0.7, alpha=0.7)
-    told = [sample for sample in samples if sample.gaps]
-    time_s = [sample.time_s for sample in told]
-    values = [(np.array(list(sample.gaps.values())) - 1) * 100 for sample in told]
+    at: dict[float, list[float]] = {}
+    for points in series.values():
+        for when_s, gap in points:
+            at.setdefault(when_s, []).append(gap)
+    time_s = sorted(at)
+    values = [np.array(at[when_s]) for when_s in time_s]
     axes.plot(time_s, [np.percentile(gaps, 95) for gaps in values], color=ORANGE, linewidth=1.4)
     axes.plot(time_s, [gaps.mean() for gaps in values], color=BLUE, linewidth=2.2)
     axes.set_ylim(0, max(float(np.percentile(np.concatenate(values), 99.5)) * 1.1, 0.1))

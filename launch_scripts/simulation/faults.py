@@ -20,11 +20,16 @@ _NS_PER_MS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Partition:
-    """Cuts these nodes off from all others for a while. Among themselves they stay connected."""
+    """Cuts these nodes off from all others for a while. Among themselves they stay connected.
+
+    one_way  the others do not hear them, but they hear the others; a session that stays half open for longer than
+             the lease ends, and then the cut is one of both ways
+    """
 
     from_s: float
     until_s: float
     nodes: tuple[str, ...]
+    one_way: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +39,32 @@ class Crash:
     at_s: float
     node: str
     for_good: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Hang:
+    """Stops a process's loop for a while. Its session lives on, and what comes meanwhile waits."""
+
+    from_s: float
+    until_s: float
+    node: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """Sets the clock of a process's machine. Seen by its next life: a process reads the clock at its start."""
+
+    at_s: float
+    node: str
+    by_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Twin:
+    """Starts a second life of an agent on another machine, while the first may live."""
+
+    at_s: float
+    node: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +88,9 @@ class FaultPlan:
     partitions: tuple[Partition, ...] = ()
     crashes: tuple[Crash, ...] = ()
     skews_ms: Mapping[str, float] = field(default_factory=dict)
+    hangs: tuple[Hang, ...] = ()
+    clock_steps: tuple[ClockStep, ...] = ()
+    twins: tuple[Twin, ...] = ()
 
 
 class FaultyLinks:
@@ -78,7 +112,10 @@ class FaultyLinks:
         if OBSERVER in (source, destination):
             return (_NS_PER_MS,)
         at_s = (now_ns - self._began_ns) / NS_PER_S
-        if any(_apart(each, source, destination) and self._cut(each, at_s) for each in plan.partitions):
+        if any(
+            _apart(each, source, destination) and self._cut(each, at_s, source in each.nodes)
+            for each in plan.partitions
+        ):
             return ()
         quiet = plan.quiet_s is not None and at_s >= plan.quiet_s
         if not quiet and plan.drop and chance.random() < plan.drop:
@@ -101,13 +138,19 @@ class FaultyLinks:
             if OBSERVER not in (source, destination)
         )
 
+    def any_cut(self, at_s: float) -> bool:
+        """Whether anybody is cut off at a time, in seconds since the run began."""
+        return any(self._cut(each, at_s, outwards=True) for each in self._plan.partitions)
+
     def noticed(self, partition: Partition) -> bool:
         """Whether a partition outlasts the lease, so that sessions end and liveliness tokens fall."""
         return partition.until_s - partition.from_s > self._lease_s
 
-    def _cut(self, partition: Partition, at_s: float) -> bool:
+    def _cut(self, partition: Partition, at_s: float, outwards: bool) -> bool:
+        """Whether messages from the nodes (`outwards`), or to them, are lost now."""
         back_s = partition.until_s + (RELINK_S if self.noticed(partition) else 0.0)
-        return partition.from_s <= at_s < back_s
+        half_open = partition.one_way and at_s < min(partition.from_s + self._lease_s, partition.until_s)
+        return partition.from_s <= at_s < back_s and (outwards or not half_open)
 
     def _known_cut(self, partition: Partition, at_s: float) -> bool:
         return partition.from_s + self._lease_s <= at_s < partition.until_s + RELINK_S
@@ -118,26 +161,52 @@ def _apart(partition: Partition, source: str, destination: str) -> bool:
 
 
 def random_plan(seed: int, nodes: Sequence[str], seconds: float) -> FaultPlan:
-    """Draws a plan for a run of these nodes: faults in the first two thirds, none in the last."""
+    """Draws a plan for a run of these nodes: everything at once in the first three fifths, nothing in the rest.
+
+    Crashes of any process; cuts that nobody notices, cuts that all do, also of one way; hangs; clocks that are
+    wrong and steps of them; second lives of agents; messages lost, late, repeated and out of order. A seed may
+    leave any of them out, so that a failure shows what it needs.
+    """
     chance = random.Random(f"faults/{seed}")
-    quiet_s = seconds * 2 / 3
-    partitions = []
-    for _ in range(chance.randrange(3)):
+    names = sorted(nodes)
+    agents = [name for name in names if name.startswith("agent-")]
+    quiet_s = seconds * 3 / 5
+
+    def span(lasts_s: float) -> tuple[float, float]:
         from_s = chance.uniform(0.1, 0.7) * quiet_s
-        lasts_s = min(chance.choice((0.5, 4.0)), quiet_s - from_s)
-        cut_off = chance.sample(sorted(nodes), chance.randint(1, max(1, len(nodes) // 3)))
-        partitions.append(Partition(from_s, from_s + lasts_s, tuple(sorted(cut_off))))
-    crashes = [
-        Crash(chance.uniform(0.1, 0.95) * quiet_s, chance.choice(sorted(nodes))) for _ in range(chance.randrange(4))
-    ]
+        return from_s, min(from_s + lasts_s, quiet_s)
+
+    partitions, hangs, twins, clock_steps = [], [], [], []
+    for _ in range(chance.randrange(4)):
+        cut_off = chance.sample(names, chance.randint(1, max(1, len(names) // 3)))
+        one_way = chance.random() < 0.4
+        partitions.append(Partition(*span(chance.choice((0.5, 2.0, 4.0))), tuple(sorted(cut_off)), one_way))
+    crashes = [Crash(chance.uniform(0.1, 0.95) * quiet_s, chance.choice(names)) for _ in range(chance.randrange(7))]
+    for _ in range(chance.randrange(3)):
+        hangs.append(Hang(*span(chance.choice((0.3, 1.5, 4.0))), chance.choice(names)))
+    # Of fewer than three agents no plot has a majority without the one that is cut off.
+    if len(agents) >= 3 and chance.random() < 0.3:
+        name = chance.choice(agents)
+        from_s, until_s = span(4.0)
+        partitions.append(Partition(from_s, until_s, (name,), chance.random() < 0.3))
+        twins.append(Twin(chance.uniform(from_s, until_s), name))
+    for crash in crashes:
+        if chance.random() < 0.3:
+            by_s = chance.choice((-3600.0, 3600.0, -43_200.0, 43_200.0, 5.0, -5.0))
+            clock_steps.append(ClockStep(crash.at_s, crash.node, by_s))
     return FaultPlan(
         drop=chance.choice((0.0, 0.01, 0.1)),
         duplicate=chance.choice((0.0, 0.01, 0.1)),
         reorder=chance.choice((0.0, 0.01, 0.1)),
-        delay_ms=chance.choice((0.2, 5.0)),
+        delay_ms=chance.choice((0.2, 5.0, 20.0, 100.0)),
         jitter_ms=chance.choice((0.0, 1.0, 30.0)),
         quiet_s=quiet_s,
         partitions=tuple(partitions),
         crashes=tuple(sorted(crashes, key=lambda crash: (crash.at_s, crash.node))),
-        skews_ms={node: chance.uniform(-200, 200) for node in sorted(nodes) if chance.random() < 0.3},
+        skews_ms={
+            node: chance.choice((200, 3.6e6)) * chance.uniform(-1, 1) for node in names if chance.random() < 0.3
+        },
+        hangs=tuple(hangs),
+        clock_steps=tuple(clock_steps),
+        twins=tuple(twins),
     )

@@ -14,28 +14,19 @@ from typing import Any, TextIO
 
 import msgspec
 
-from launch_scripts.process_table import STOP_ORDER, ProcessSpec, processes_of
+from launch_scripts.process_table import STOP_ORDER, processes_of
 from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
-from launch_scripts.world.service import TargetsService
-from planner_service.service import PlannerService
-from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
+from launch_scripts.simulation.node import EPOCH_NS, Node
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
-from swarm.bus.bus import Appeared, Disappeared, Event, Heard, Post
-from swarm.bus.memory_bus import MemoryBus, MemoryNetwork
-from swarm.bus.scheduler import InlineWorker, Scheduler
+from swarm.bus.bus import Appeared, Disappeared, Event, Heard
+from swarm.bus.memory_bus import MemoryNetwork
+from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import Scenario
-from swarm.runtime.process import Service
-from swarm.runtime.role import RoleSetup
 from swarm.wire.authentication import Authenticator
-from vehicle_agent.promise_store import MemoryPromiseStore
-from vehicle_agent.service import AgentService
 
-EPOCH_NS = 1_800_000_000 * NS_PER_S
-"""Start of every simulation: a date, so that times look as in a real run."""
 SIMULATED_ROLES = ("keeper", "planner", "targets", "agent")
 BOOT_SPREAD_S = 0.3
 BACKOFF_S = 0.5
@@ -67,101 +58,11 @@ class SimulationResult:
         return self.seconds / self.wall_s
 
 
-class Node:
-    """A simulated process: service, bus, ticks, clock, and the store that survives a crash."""
-
-    def __init__(self, simulation: Simulation, spec: ProcessSpec, phase_ns: int, skew_ns: int) -> None:
-        self.spec = spec
-        self.name = spec.name
-        self.ticking = True
-        self.crashes = 0
-        self.service: Service | None = None
-        self.bus: MemoryBus | None = None
-        self.store: KeeperStore | None = None
-        self.promises: MemoryPromiseStore | None = None
-        self._simulation = simulation
-        self._clock = simulation.scheduler.clock
-        self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))
-        self._phase_ns = phase_ns % self._tick_ns
-        self.skew_ns = skew_ns
-        self._worker: InlineWorker | None = None
-
-    def now_ns(self) -> int:
-        """Time of this node's clock, its skew included."""
-        return self._clock.now_ns() + self.skew_ns
-
-    def boot(self) -> None:
-        """Start a new incarnation."""
-        simulation = self._simulation
-        simulation.log.event(self._clock.now_ns(), "boot", self.name)
-        namespace = simulation.scenario.network.namespace
-        bus = self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)
-        worker = self._worker = InlineWorker(simulation.scheduler)
-
-        def post(event: Event) -> None:
-            if self.bus is bus and self.service is not None:
-                self.service.handle(event, self.now_ns())
-
-        setup = RoleSetup(
-            scenario=simulation.scenario,
-            run_id=simulation.run_id,
-            role=self.spec.role,
-            id=self.spec.id,
-            incarnation=self.now_ns(),
-            started_ns=EPOCH_NS,
-        )
-        self.service = self._build(setup, bus, post, worker)
-        self.service.start(self.now_ns())
-        simulation.scheduler.after(self._phase_ns, lambda: self._tick(bus))
-
-    def _build(self, setup: RoleSetup, bus: MemoryBus, post: Post, worker: InlineWorker) -> Service:
-        terrain, truth = self._simulation.terrain, self._simulation.truth
-        match self.spec.role:
-            case "keeper":
-                self.store = self.store or KeeperStore(":memory:")
-                return KeeperService(setup, terrain, bus, post, self.store)
-            case "planner":
-                return PlannerService(setup, terrain, bus, post, worker)
-            case "targets":
-                return TargetsService(setup, terrain, truth, bus, post)
-            case "agent":
-                self.promises = self.promises or MemoryPromiseStore(self._phase_ns + setup.incarnation)
-                return AgentService(setup, terrain, truth, bus, post, self.promises)
-        raise ValueError(f"no simulation of role {self.spec.role}")
-
-    def _tick(self, bus: MemoryBus) -> None:
-        if self.bus is not bus or self.service is None:
-            return
-        if self.ticking:
-            self.service.tick(self.now_ns())
-            for look in self._simulation.after_tick:
-                look(self)
-        self._simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
-
-    def crash(self) -> None:
-        """Ends the process as kill -9 does: nothing is published or saved."""
-        if self.bus is None:
-            return
-        self._simulation.log.event(self._clock.now_ns(), "crash", self.name)
-        self.crashes += 1
-        self.service = None
-        self._leave()
-
-    def stop(self) -> None:
-        if self.service is not None:
-            self.service.stop(self.now_ns())
-
-    def _leave(self) -> None:
-        if self.bus is not None and self._worker is not None:
-            self._worker.close()
-            self.bus.close()
-            self.bus = None
-
-
 class Simulation:
     """A run that tests advance, inspect and disturb. `simulate` runs one to its end.
 
     after_tick  called with a node after each of its ticks
+    after_boot  called with a node after each of its starts
     """
 
     def __init__(
@@ -186,7 +87,8 @@ class Simulation:
         self.network = MemoryNetwork(self.scheduler, self.links, self.log.delivery)
         self.nodes: dict[str, Node] = {}
         self.after_tick: list[Callable[[Node], None]] = []
-        phases = random.Random(f"phases/{scenario.seed}")
+        self.after_boot: list[Callable[[Node], None]] = []
+        self._phases = phases = random.Random(f"phases/{scenario.seed}")
         for spec in processes_of(scenario, SIMULATED_ROLES):
             skew_ns = int(self.faults.skews_ms.get(spec.name, 0.0) * 1e6)
             node = Node(self, spec, phases.randrange(NS_PER_S), skew_ns)
@@ -213,6 +115,10 @@ class Simulation:
             return
         backoff_s = min(BACKOFF_S * 2 ** (node.crashes - 1), 10.0)
         self.scheduler.after(int(backoff_s * NS_PER_S), node.boot)
+
+    def disturbed(self) -> bool:
+        """Whether a process is dead, hangs or is cut off now."""
+        return not all(node.works for node in self.nodes.values()) or self.links.any_cut(self.now_s)
 
     def finish(self) -> None:
         """Asks every node to stop, in order, and lets their last messages arrive."""
@@ -248,10 +154,31 @@ class Simulation:
             bus.subscribe(topic, post)
         bus.watch_alive(post)
 
+    def twin(self, name: str) -> None:
+        """Starts a second life of an agent now, on another machine: with another file, and a clock of its own."""
+        first = self.nodes[name]
+        others = sum(node.spec == first.spec for node in self.nodes.values())
+        node = Node(self, first.spec, self._phases.randrange(NS_PER_S), -first.skew_ns, f"{name}.{others + 1}")
+        self.nodes[node.name] = node
+        node.boot()
+
+    def step_clock(self, name: str, by_s: float) -> None:
+        """Sets the clock of a node's machine; the process that runs there has read it already."""
+        self._note("clock", (name,))
+        self.nodes[name].skew_ns += int(by_s * NS_PER_S)
+
     def _plan_faults(self) -> None:
-        for crash in self.faults.crashes:
+        plan = self.faults
+        for crash in plan.crashes:
             self._at(crash.at_s, lambda each=crash: self.crash(each.node, for_good=each.for_good))  # type: ignore[misc]
-        for partition in self.faults.partitions:
+        for hang in plan.hangs:
+            self._at(hang.from_s, self.nodes[hang.node].hang)
+            self._at(hang.until_s, self.nodes[hang.node].wake)
+        for step in plan.clock_steps:
+            self._at(step.at_s, lambda step=step: self.step_clock(step.node, step.by_s))  # type: ignore[misc]
+        for twin in plan.twins:
+            self._at(twin.at_s, lambda name=twin.node: self.twin(name))  # type: ignore[misc]
+        for partition in plan.partitions:
             nodes = partition.nodes
             self._at(partition.from_s, lambda nodes=nodes: self._note("cut", nodes))  # type: ignore[misc]
             self._at(partition.until_s, lambda nodes=nodes: self._note("heal", nodes))  # type: ignore[misc]
@@ -267,10 +194,6 @@ class Simulation:
 
     def _note(self, what: str, nodes: tuple[str, ...]) -> None:
         self.log.event(self.scheduler.clock.now_ns(), what, ",".join(nodes))
-
-
-def _tick_hz(role: str, scenario: Scenario) -> float:
-    return {"planner": scenario.planner.tick_hz, "agent": scenario.vehicles.tick_hz}.get(role, 10.0)
 
 
 def simulate(

@@ -179,7 +179,8 @@ FLEET = Topic(
 )  # fmt: skip
 STANDING = Topic(
     "standing", "standing/{plot}/{agent}", Standing,
-    "where a host's vehicles are in a plot and where they would go; for its members", "every tick",
+    "where a host's vehicles are in a plot and where they would go; for its members",
+    "on change, else 5 Hz",
     access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
@@ -190,7 +191,8 @@ TABLE = Topic(
     request=Claim, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
-    "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file", "per table",
+    "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file",
+    "per table by one member, 5 Hz by the other",
     access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(

@@ -7,9 +7,9 @@ import random
 
 import pytest
 from msgspec.structs import replace
-from support.simulated_swarm import seeded
 
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import seeded
 from swarm.bus.bus import Event, Heard
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode

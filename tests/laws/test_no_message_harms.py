@@ -7,9 +7,10 @@ import random
 import numpy as np
 import pytest
 import rerun as rr
-from support.liar import ROLES, Liar, asked, published
+from support.liar import Liar, asked, published
 from support.swarm_model import SwarmModel
 
+from launch_scripts.chaos.lies import ROLES
 from launch_scripts.launcher.router import RouterService
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.world.service import TargetsService

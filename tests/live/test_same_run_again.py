@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -23,15 +24,16 @@ def sets_in(store: Path) -> int:
     return int(json.loads(done.stdout)["sets"])
 
 
+@pytest.mark.parametrize("kill", [os.kill, os.killpg], ids=["launcher", "all"])
 def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_with_the_keepers_store(
-    tmp_path: Path,
+    tmp_path: Path, kill: Callable[[int, int], None]
 ) -> None:
     first = LiveSwarm(tmp_path, "--run-id", "again", "--no-live")
     try:
         first.wait_until_up()
         store = tmp_path / "runs" / "again" / "map.sqlite"
         eventually(lambda: store.exists() and sets_in(store) > 0, 60, "marks in the store")
-        os.killpg(first.process.pid, signal.SIGKILL)
+        kill(first.process.pid, signal.SIGKILL)  # with it or after it all that it started ends
         first.process.wait(10)
         eventually(lambda: not session_of(first.process.pid), 10, "the end of all")
         before = sets_in(store)

@@ -8,10 +8,11 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from support.simulated_swarm import Laws, seeded
 from support.wire_strategies import EXAMPLES, MESSAGES
 
+from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import seeded
 from swarm.bus.bus import Event
 from swarm.wire.codec import encode
 from swarm.wire.messages.base import Message

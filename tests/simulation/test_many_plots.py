@@ -3,34 +3,15 @@
 from __future__ import annotations
 
 import pytest
-from support.simulated_swarm import WIDE_TERRAIN, Laws, names, seeded
 
 from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
+from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
-from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
+from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.worlds import WIDE, seeded
 from vehicle_agent.service import AgentService
 
 SECONDS = 24.0
-WIDE: Scenario = parse_scenario(f"""
-name = "wide"
-{WIDE_TERRAIN}
-[terrain.hidden]
-rubble_fields = 6
-[cost]
-max_slope_deg = 25
-[[targets]]
-count = 3
-speed_m_per_s = 3
-[[groups]]
-vehicles = 24
-[vehicles]
-per_agent = 3
-sense_range_m = 120
-capture_range_m = 60
-reassign_s = 2
-""")
-"""Eight regions, the vehicles of eight agents, ten cells a second: they cross borders all the time."""
 
 
 def service_of(simulation: Simulation, name: str) -> AgentService | None:
@@ -62,7 +43,7 @@ def test_agents_listen_to_the_plots_near_their_vehicles_and_keep_every_law():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_nobody_meets_under_seeded_faults(seed):
-    simulation = Simulation(seeded(seed, WIDE), faults=random_plan(seed, names(WIDE), SECONDS))
+    simulation = Simulation(seeded(seed, WIDE), faults=random_plan(seed, nodes_of(WIDE), SECONDS))
     laws = Laws(simulation)
     simulation.run_until(SECONDS)
     simulation.finish()

@@ -6,20 +6,23 @@ import io
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from support.simulated_swarm import SMALL, planned, seeded
 
+from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import simulate
+from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.worlds import SMALL, seeded
 
 RUN = """
 import json, sys
-sys.path.insert(0, sys.argv[1])
-from support.simulated_swarm import SMALL, planned
+from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.worlds import SMALL
 from launch_scripts.simulation.simulate import simulate
-with open(sys.argv[2], "w") as trace:
-    result = simulate(SMALL, seed=int(sys.argv[3]), seconds=12, faults=planned(int(sys.argv[3]), 12), trace=trace)
+with open(sys.argv[1], "w") as trace:
+    seed = int(sys.argv[2])
+    result = simulate(SMALL, seed, 12, random_plan(seed, nodes_of(SMALL), 12), trace)
 print(json.dumps(result.report))
 """
 
@@ -31,7 +34,7 @@ def test_a_run_is_the_same_byte_for_byte_whatever_the_hash_seed_is(seed, tmp_pat
         trace = tmp_path / f"{hash_seed}.log"
         runs.append(
             subprocess.Popen(
-                [sys.executable, "-c", RUN, str(Path(__file__).parents[1]), str(trace), str(seed)],
+                [sys.executable, "-c", RUN, str(trace), str(seed)],
                 env={**os.environ, "PYTHONHASHSEED": hash_seed},
                 stdout=subprocess.PIPE,
             )
@@ -57,8 +60,9 @@ def test_another_seed_is_another_run():
 def test_watching_a_run_does_not_change_it():
     trace = io.StringIO()
     told: list[float] = []
-    one = simulate(seeded(3), seconds=4, faults=planned(3, 4), trace=trace, progress=told.append)
-    other = simulate(seeded(3), seconds=4, faults=planned(3, 4))
+    plan = random_plan(3, nodes_of(SMALL), 4)
+    one = simulate(seeded(3), seconds=4, faults=plan, trace=trace, progress=told.append)
+    other = simulate(seeded(3), seconds=4, faults=plan)
     assert one.report == other.report
     assert told == [1.0, 2.0, 3.0, 4.0]
     assert trace.getvalue().splitlines()[0].startswith("0.")

@@ -7,30 +7,19 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from support.simulated_swarm import SMALL, Laws, missing, planned, replica_of, seeded
 
 from launch_scripts.simulation import simulate as simulate_module
-from launch_scripts.simulation.faults import Crash, FaultPlan, Partition
+from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
+from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation, simulate
+from launch_scripts.simulation.trial import Trial, nodes_of
+from launch_scripts.simulation.worlds import SMALL, seeded
 from swarm.config.load import load_scenario
 from vehicle_agent.agent import Agent
 from vehicle_agent.service import AgentService
 
 SCENARIOS = Path(simulate_module.__file__).parents[1] / "scenarios"
 SECONDS = 24.0
-SETTLED_S = 4.0
-"""What was said so long ago has reached everybody, once all is quiet."""
-
-
-def run_with_laws(simulation: Simulation) -> Laws:
-    """Run to the end; what agents had said a while before must be everywhere then."""
-    laws = Laws(simulation)
-    simulation.run_until(SECONDS - SETTLED_S)
-    said = laws.said()
-    simulation.run_until(SECONDS)
-    for name, held in laws.held().items():
-        assert missing(held, said) == [], name
-    return laws
 
 
 def agent_of(simulation: Simulation, name: str) -> Agent:
@@ -39,38 +28,22 @@ def agent_of(simulation: Simulation, name: str) -> Agent:
     return service.agent
 
 
-def silence_agents(simulation: Simulation) -> None:
-    for node in simulation.nodes.values():
-        if node.spec.role == "agent":
-            node.crash()
-
-
-def check_all(simulation: Simulation, laws: Laws) -> None:
-    assert laws.collisions == []
-    assert laws.lethal == []
-    assert missing(laws.stored(), laws.acknowledged) == []
-    # With nobody left who says anything new, all who remain come to hold the same.
-    silence_agents(simulation)
-    simulation.run_until(SECONDS + 6)
-    left = {
-        node.name: replica
-        for node in simulation.nodes.values()
-        if node.service is not None and (replica := replica_of(node)) is not None
-    }
-    assert sorted(left) == ["keeper-0", "planner-t0", "planner-t1"]
-    assert len({replica.held.fingerprint() for replica in left.values()}) == 1
-    assert missing(laws.stored(), laws.acknowledged) == []
+def check_all(simulation: Simulation) -> Laws:
+    """Run to the end; every law holds."""
+    trial = Trial(simulation)
+    assert trial.run(SECONDS) == []
     planners: list[np.ndarray] = [
         simulation.nodes[name].service._cost_map.pace_s_per_m  # type: ignore[union-attr]
         for name in ("planner-t0", "planner-t1")
     ]
     np.testing.assert_array_equal(*planners)
     simulation.finish()
+    return trial.laws
 
 
 def test_a_run_in_which_nothing_goes_wrong_keeps_every_law_and_does_its_work():
     simulation = Simulation(seeded(1))
-    check_all(simulation, run_with_laws(simulation))
+    check_all(simulation)
     report = simulation.report(SECONDS)
     assert report["vehicles_routed"] == report["vehicles"] == 10
     assert report["captures"] > 0
@@ -84,8 +57,8 @@ def test_a_run_in_which_nothing_goes_wrong_keeps_every_law_and_does_its_work():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_the_laws_hold_under_seeded_faults(seed):
-    simulation = Simulation(seeded(seed), faults=planned(seed, SECONDS))
-    check_all(simulation, run_with_laws(simulation))
+    simulation = Simulation(seeded(seed), faults=random_plan(seed, nodes_of(SMALL), SECONDS))
+    check_all(simulation)
     report = simulation.report(SECONDS)
     assert report["vehicles_routed"] == 10
     assert report["captures"] > 0
@@ -96,8 +69,7 @@ def test_nothing_acknowledged_is_lost_though_the_keeper_dies_again_and_again():
     crashes = tuple(Crash(2 + 1.3 * n, "keeper-0") for n in range(8))
     plan = FaultPlan(drop=0.05, duplicate=0.05, jitter_ms=10, quiet_s=16, crashes=crashes)
     simulation = Simulation(seeded(5), faults=plan)
-    laws = run_with_laws(simulation)
-    check_all(simulation, laws)
+    laws = check_all(simulation)
     assert sum(seq for _, seq in laws.acknowledged.values()) > 10
     assert simulation.nodes["keeper-0"].crashes >= 4
 
@@ -106,7 +78,7 @@ def test_agents_that_die_again_and_again_collide_with_nobody():
     crashes = tuple(Crash(3 + 0.9 * n, f"agent-a{n % 3}") for n in range(12))
     plan = FaultPlan(drop=0.05, jitter_ms=20, reorder=0.05, quiet_s=16, crashes=crashes)
     simulation = Simulation(seeded(6), faults=plan)
-    check_all(simulation, run_with_laws(simulation))
+    check_all(simulation)
 
 
 def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():

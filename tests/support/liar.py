@@ -1,81 +1,39 @@
-"""A sender of well-formed lies: any message that `decode` accepts, made of the bounds in its type."""
+"""A sender of well-formed lies on a memory bus."""
 
 from __future__ import annotations
 
-import functools
-import math
 import random
-import typing
 from collections.abc import Callable, Iterator
-from enum import Enum
-from types import NoneType
-from typing import Any, TypeVar
 
-import msgspec
-import numpy as np
-from support.wire_strategies import EXAMPLES
-
-from shared_map.replication.mark_sets import packed
+from launch_scripts.chaos.lies import Lies
 from swarm.bus.bus import Asked, Event
 from swarm.bus.memory_bus import MemoryBus
-from swarm.errors import ProtocolError
-from swarm.liveness import Peer
-from swarm.wire.codec import decode, encode
-from swarm.wire.fields import OR_INFINITE, Characters, Column, taken_apart
-from swarm.wire.messages.base import Message
-from swarm.wire.messages.marks import DIGEST_ROW, MarkSet, MarkSets
-from swarm.wire.routes import Route, RouteBatch, Routes
-from swarm.wire.statements import PACE_LEAST, PACE_MOST
 from swarm.wire.topics import TOPICS, Topic
-
-BY_TYPE = {type(example): example for example in EXAMPLES}
-NAMES = (
-    "t0",
-    "t1",
-    "a0",
-    "a1",
-    "a0-00",
-    "a0-01",
-    "all.a0.1",
-    "a0.1",
-    "all",
-    "0",
-    "agent",
-    "keeper",
-    "planner",
-    "t0.r1",
-    "x" * 64,
-)
-ROLES = ("agent", "planner", "keeper", "targets", "monitor", "router")
-
-M = TypeVar("M")
 
 
 class Liar:
-    """Makes lies, and tells them from a bus of its own.
-
-    cells  how many the grid has: lies name cells in it, at its end and beyond
-    """
+    """Tells lies from a bus of its own. `cells` is how many the grid has."""
 
     def __init__(self, bus: MemoryBus, cells: int, seed: int) -> None:
         self.bus = bus
-        self._cells = cells
-        self._chance = random.Random(seed)
+        self.lies = Lies(cells, seed)
+        self._chance = random.Random(f"liar/{seed}")
         self.told = 0
         self.serving = True
 
-    # --- telling --------------------------------------------------------------------------------------------
-
     def put(self, topic: Topic) -> None:
         """A lie on its own key: access is granted by key, so this is what a sender may do at worst."""
-        message = self.lie(topic.message)
-        self.bus.publish(topic, message, **self._fields(topic, message))
+        message = self.lies.lie(topic.message)
+        self.bus.publish(topic, message, **self.lies.fields(topic, message))
         self.told += 1
 
     def ask(self, topic: Topic, post: Callable[[Event], None]) -> None:
         assert topic.request is not None
-        fields = {name: self._name() for name in topic.fields if self._chance.random() < 0.5}
-        self.bus.ask(topic, self.lie(topic.request), post, tag="lie", timeout_s=0.5, **fields)
+        request = self.lies.lie(topic.request)
+        fields = {
+            name: value for name, value in self.lies.fields(topic, request).items() if self._chance.random() < 0.5
+        }
+        self.bus.ask(topic, request, post, tag="lie", timeout_s=0.5, **fields)
         self.told += 1
 
     def serve(self, topics: tuple[Topic, ...]) -> None:
@@ -85,8 +43,8 @@ class Liar:
             assert isinstance(event, Asked)
             for _ in range(self._chance.randrange(4) if self.serving else 0):
                 kind = self._chance.choice([each for each in (event.topic.message, event.topic.bulk) if each])
-                message = self.lie(kind)
-                event.answer(message, **self._fields(event.topic, message))
+                message = self.lies.lie(kind)
+                event.answer(message, **self.lies.fields(event.topic, message))
                 self.told += 1
             if self._chance.random() < 0.2:
                 event.refuse("no")
@@ -96,123 +54,7 @@ class Liar:
             self.bus.serve(topic, answer)
 
     def token(self, role: str) -> None:
-        self.bus.declare_alive(Peer(role, self._name(), self._whole(0, (1 << 62) - 1)))
-
-    def _fields(self, topic: Topic, message: Message) -> dict[str, Any]:
-        named = {name: getattr(message, name, None) for name in topic.fields}
-        return {name: self._name() if value is None else value for name, value in named.items()}
-
-    # --- making ---------------------------------------------------------------------------------------------
-
-    def lie(self, kind: type[M]) -> M:
-        """A message of this type which `decode` accepts."""
-        for _ in range(30):
-            try:
-                made = self._made(kind)
-                return decode(encode(made), kind)  # type: ignore[type-var]
-            except (ProtocolError, ValueError):
-                continue  # fields that contradict each other
-        return typing.cast(M, BY_TYPE[kind])  # type: ignore[index]
-
-    def _made(self, kind: type[Any]) -> Any:
-        if kind is Routes:
-            return RouteBatch.of([self._made(Route) for _ in range(self._chance.randrange(4))]).columns()
-        if kind is MarkSets:
-            sets = [msgspec.structs.replace(self._made(MarkSet), author="a1", group="all") for _ in range(3)]
-            return next(iter(packed({each.tile: each for each in sets}.values())))
-        hints = _hints(kind)
-        fields = {name: self._value(name, hint) for name, hint in hints.items() if not _per(hint)}
-        for name, hint in hints.items():
-            if rule := _per(hint):
-                fields[name] = self._column(rule, len(fields[rule.per]))
-        if kind is MarkSet:
-            fields |= self._statements()
-        return kind(**fields)
-
-    def _statements(self) -> dict[str, bytes]:
-        many = self._chance.choice([0, 1, 3, 40])
-        where = sorted(self._chance.sample(range(1024), many))
-        paces = [self._chance.choice([PACE_LEAST, PACE_MOST, 1.0]) for _ in where]
-        stamps = [self._whole(0, (1 << 62) - 1) for _ in where]
-        return {
-            "cells": np.array(where, "<u2").tobytes(),
-            "kinds": bytes(self._chance.randrange(3) for _ in where),
-            "paces": np.array(paces, "<f4").tobytes(),
-            "stamps_ns": np.array(stamps, "<i8").tobytes(),
-            "untils_ns": self._chance.choice([b"", np.array(stamps, "<i8").tobytes()]),
-        }
-
-    def _value(self, name: str, hint: Any) -> Any:
-        bare, notes = taken_apart(hint)
-        args = typing.get_args(bare)
-        origin = typing.get_origin(bare) or bare
-        metas = [note for note in notes if isinstance(note, msgspec.Meta)]
-        if NoneType in args:
-            return None if self._chance.random() < 0.3 else self._value(name, args[0])
-        if origin is int:
-            return self._whole(*_limits(metas), cell="cell" in name or name in ("start", "held"))
-        if origin is float:
-            least, most = (float(limit) for limit in _limits(metas))
-            some = [least, 0.0 if least <= 0 else least, 5e-324 if least <= 0 else least, 1.0, min(most, 1e300)]
-            return self._chance.choice([*some, math.inf] if OR_INFINITE in notes else some)
-        if origin is bool:
-            return self._chance.random() < 0.5
-        if origin is str:
-            is_id = any(isinstance(note, Characters) for note in notes)
-            return self._name() if is_id else self._chance.choice(["", "a/b", "ü" * 90, *NAMES])
-        if origin is bytes:
-            rule = next((note for note in notes if isinstance(note, Column)), None)
-            return b"" if rule is None else self._column(rule, self._chance.choice([0, 1, 2, 40]))
-        if origin is list:
-            return [self._value(name, args[0]) for _ in range(self._chance.choice([0, 1, 2, 9]))]
-        if origin is tuple:
-            return tuple(self._value(name, arg) for arg in args)
-        if origin is dict:
-            return {self._value(name, args[0]): self._value(name, args[1]) for _ in range(3)}
-        if isinstance(origin, type) and issubclass(origin, Enum):
-            return self._chance.choice(list(origin))
-        return self._made(origin)
-
-    def _column(self, rule: Column, many: int) -> bytes:
-        dtype = np.dtype(rule.dtype)
-        if dtype.names:
-            rows = [
-                (self._chance.randrange(9), self._whole(0, (1 << 62)), self._whole(0, 1 << 62)) for _ in range(many)
-            ]
-            return np.array(rows, DIGEST_ROW).tobytes()
-        if dtype.kind == "f":
-            assert rule.least is not None
-            assert rule.most is not None
-            some = [rule.least, rule.most, max(rule.least, 0.0), 1.0]
-            return np.array([self._chance.choice(some) for _ in range(many)], dtype).tobytes()
-        info = np.iinfo(dtype)
-        least, most = (int(rule.least or info.min), int(info.max if rule.most is None else rule.most))
-        return np.array([self._whole(least, most, cell=True) for _ in range(many)], dtype).tobytes()
-
-    def _whole(self, least: int, most: int, cell: bool = False) -> int:
-        near = [self._chance.randrange(self._cells), self._cells - 1, self._cells, 0, 1, 2]
-        some = [*near, *([] if cell else [10**12, 1 << 45]), least, most, most - 1]
-        return min(max(self._chance.choice(some), least), most)
-
-    def _name(self) -> str:
-        return self._chance.choice(NAMES)
-
-
-@functools.cache
-def _hints(kind: type[Any]) -> dict[str, Any]:
-    return typing.get_type_hints(kind, include_extras=True)
-
-
-def _per(hint: Any) -> Column | None:
-    return next((note for note in taken_apart(hint)[1] if isinstance(note, Column) and note.per), None)
-
-
-def _limits(metas: list[msgspec.Meta]) -> tuple[Any, Any]:
-    least = next((meta.ge for meta in metas if meta.ge is not None), 0)
-    most: Any = next((meta.le for meta in metas if meta.le is not None), None)
-    if most is None:
-        most = next((meta.lt - 1 for meta in metas if meta.lt is not None), 1e300)
-    return least, most
+        self.bus.declare_alive(self.lies.token(role))
 
 
 def published() -> Iterator[Topic]:

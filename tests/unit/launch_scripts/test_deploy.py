@@ -8,11 +8,11 @@ from typing import Any
 
 import msgspec
 import pytest
-from support.simulated_swarm import SMALL
 
 from launch_scripts.deploy.zenohd import zenohd_config
 from launch_scripts.process_table import certificate_name, certificate_names
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import SMALL
 from swarm.bus.access_control import access_control, bearer, common_name
 from swarm.bus.memory_bus import MemoryBus
 from swarm.config.scenario import GroupConfig, NetworkConfig, Scenario, StandbyConfig, TargetConfig, TlsConfig

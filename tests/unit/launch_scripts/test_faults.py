@@ -76,12 +76,30 @@ def test_the_observer_hears_everything():
     assert model.connected("a", OBSERVER, at(50))
 
 
+def test_of_a_one_way_cut_one_side_hears_until_the_lease_ends_the_session():
+    model = links(partitions=(Partition(5, 9, ("a",), one_way=True),))
+    assert [bool(model.delays_ns("a", "b", "x", at(t))) for t in (4.9, 5.1, 8.9, 9 + RELINK_S)] == [
+        True, False, False, True,
+    ]  # fmt: skip
+    assert [bool(model.delays_ns("b", "a", "x", at(t))) for t in (5.1, 6.9, 7.1, 9 + RELINK_S)] == [
+        True, True, False, True,
+    ]  # fmt: skip
+    short = links(partitions=(Partition(5, 6, ("a",), one_way=True),))
+    assert all(short.delays_ns("b", "a", "x", at(5 + n / 10)) for n in range(20))
+
+
 def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
-    nodes = ["keeper-0", "planner-t0", "agent-a0"]
+    nodes = ["keeper-0", "planner-t0", "agent-a0", "agent-a1", "agent-a2"]
     assert random_plan(3, nodes, 30) == random_plan(3, nodes[::-1], 30)
-    for seed in range(200):
-        plan = random_plan(seed, nodes, 30)
-        assert plan.quiet_s == 20
-        assert all(crash.at_s < 20 and crash.node in nodes for crash in plan.crashes)
-        assert all(part.until_s <= 20 and set(part.nodes) < set(nodes) for part in plan.partitions)
-    assert len({str(random_plan(seed, nodes, 30)) for seed in range(20)}) == 20
+    plans = [random_plan(seed, nodes, 30) for seed in range(200)]
+    for plan in plans:
+        assert plan.quiet_s == 18
+        assert all(crash.at_s < 18 and crash.node in nodes for crash in plan.crashes)
+        assert all(cut.until_s <= 18 and set(cut.nodes) < set(nodes) for cut in plan.partitions)
+        assert all(hang.until_s <= 18 for hang in plan.hangs)
+        assert all(step.at_s < 18 for step in plan.clock_steps)
+        assert all(twin.at_s < 18 and twin.node.startswith("agent-") for twin in plan.twins)
+    assert len({str(plan) for plan in plans[:20]}) == 20
+    kinds = [[plan.crashes, plan.partitions, plan.hangs, plan.clock_steps, plan.twins] for plan in plans]
+    assert any(all(some) for some in kinds)  # everything at once
+    assert any(cut.one_way for plan in plans for cut in plan.partitions)

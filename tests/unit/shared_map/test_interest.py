@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.simulated_swarm import WIDE_TERRAIN, Laws, names, seeded
 
 from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.worlds import WIDE_TERRAIN, seeded
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.tiles import region_tiles
@@ -115,7 +117,7 @@ def check_interest(simulation: Simulation) -> tuple[int, int]:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_agents_hold_what_is_near_their_vehicles_and_all_of_it(seed: int) -> None:
-    faults = random_plan(seed, names(NEAR), 20.0)
+    faults = random_plan(seed, nodes_of(NEAR), 20.0)
     simulation = Simulation(seeded(seed, NEAR), faults=faults)
     laws = Laws(simulation)
     simulation.run_until(18)

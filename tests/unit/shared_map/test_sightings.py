@@ -5,9 +5,10 @@ from __future__ import annotations
 import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
-from support.simulated_swarm import SMALL, Laws
 
+from launch_scripts.simulation.laws import Laws
 from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import SMALL
 from shared_map.keeper.store import KeeperStore
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import LONGEST_NS, Sightings, pose_of

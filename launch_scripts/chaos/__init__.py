@@ -1,0 +1,1 @@
+"""A live swarm under blows: killed and stopped processes, hostile messages; how soon it recovers."""

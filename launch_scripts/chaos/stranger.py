@@ -1,0 +1,73 @@
+"""A stranger on the router: hears everything that is said, and says anything at all."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import zenoh
+
+from swarm.bus.zenoh_bus import open_bus
+from swarm.config.scenario import NetworkConfig
+from swarm.wire.topics import FLEET
+
+_WAITING = 10_000
+"""Most reports that wait to be looked at; the oldest are dropped."""
+_KEYS = 5000
+
+
+class Stranger:
+    """A session of its own. What it says itself it does not hear, so what it hears is genuine."""
+
+    def __init__(self, network: NetworkConfig) -> None:
+        # The router may be dead for a while: a stranger waits longer than a process.
+        self._bus = open_bus(msgspec.structs.replace(network, connect_timeout_s=60.0))
+        self._waiting: deque[bytes] = deque(maxlen=_WAITING)
+        self._there = threading.Event()
+        self._last: dict[str, Any] = {}
+        """Key -> the last sample under it."""
+        self._namespace = network.namespace
+        self._fleets = self._subscribe(FLEET.expression(network.namespace), self._hear_fleet)
+
+    def _subscribe(self, key: str, hear: Callable[[Any], None]) -> Any:
+        return self._bus.session.declare_subscriber(key, hear, allowed_origin=zenoh.Locality.REMOTE)
+
+    def _hear_fleet(self, sample: Any) -> None:
+        self._waiting.append(sample.payload.to_bytes())
+        self._there.set()
+
+    def _hear(self, sample: Any) -> None:
+        key = str(sample.key_expr)
+        if key in self._last or len(self._last) < _KEYS:
+            self._last[key] = sample
+
+    def reports(self, timeout_s: float) -> list[bytes]:
+        """All reports about vehicles since the last time; waits for one."""
+        if not self._waiting:
+            self._there.clear()
+            self._there.wait(timeout_s)
+        return [self._waiting.popleft() for _ in range(len(self._waiting))]
+
+    @contextlib.contextmanager
+    def listening_to_all(self) -> Iterator[dict[str, Any]]:
+        """Key -> the last sample under it, filled while the block lasts: thousands of messages a second, for which
+        a busy machine has no time all along."""
+        self._last = {}
+        ear = self._subscribe(f"{self._namespace}/**", self._hear)
+        try:
+            yield self._last
+        finally:
+            ear.undeclare()
+
+    def say(self, key: str, payload: bytes, code: bytes | None) -> None:
+        # As our own processes put: to block would wait for the slowest reader of the run.
+        dropping = zenoh.CongestionControl.DROP
+        self._bus.session.put(key, payload, congestion_control=dropping, attachment=code)
+
+    def close(self) -> None:
+        self._fleets.undeclare()
+        self._bus.close()

@@ -1,0 +1,192 @@
+"""The laws that hold in every simulation, whatever goes wrong in it: what no process could see."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from launch_scripts.simulation.faults import OBSERVER
+from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.simulate import Simulation
+from shared_map.replication.replica import MapReplica
+from swarm.bus.bus import Event, Heard
+from swarm.config.agents import plan_agents
+from swarm.wire.messages.marks import DIGEST_ROW, Digest
+from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.topics import DIGEST
+from vehicle_agent.placement import spawn_cells
+from vehicle_agent.service import AgentService
+
+Stamp = tuple[int, int]
+Sets = dict[tuple[str, int], Stamp]
+"""(author, tile) -> (epoch, seq)."""
+
+
+def sets_of(held: Mapping[str, bytes]) -> Sets:
+    """What a digest says."""
+    rows = ((author, row) for author, packed in held.items() for row in np.frombuffer(packed, DIGEST_ROW))
+    return {(author, int(row["tile"])): (int(row["epoch"]), int(row["seq"])) for author, row in rows}
+
+
+def missing(has: Sets, wanted: Sets) -> list[tuple[str, int]]:
+    return [key for key, stamp in wanted.items() if has.get(key, (-1, -1)) < stamp]
+
+
+def replica_of(node: Node) -> MapReplica | None:
+    service: Any = node.service
+    replica = getattr(service, "replica", None) or getattr(service, "_replica", None)
+    assert replica is None or isinstance(replica, MapReplica)
+    return replica
+
+
+class Laws:
+    """Looks at everything in a simulation that no process could see.
+
+    collisions    (when, vehicle, vehicle, cell), by where vehicles truly are; those of a dead process stay put
+    lethal        (when, vehicle, cell), of cells that are lethal in truth
+    acknowledged  the newest of each set that a keeper ever said it had committed
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.collisions: list[tuple[float, str, str, int]] = []
+        self.lethal: list[tuple[float, str, int]] = []
+        self.acknowledged: Sets = {}
+        spawns = spawn_cells(
+            simulation.scenario, simulation.terrain.grid, simulation.terrain.pace_s_per_m, simulation.truth
+        )
+        self._unmoved = {id: cell for each in spawns.values() for id, cell in each.items()}
+        """Vehicle -> cell, of those that no process has placed yet."""
+        self._bodies: dict[str, dict[str, int]] = {}
+        """Node -> vehicle -> cell. A body stands where it is when its process dies."""
+        self._last: dict[str, Node] = {}
+        """Agent -> the node on which its newest life began."""
+        self._passable = np.isfinite(simulation.truth).ravel()
+        simulation.after_tick.append(self._look)
+        simulation.after_boot.append(self._began)
+        bus = simulation.network.bus(OBSERVER, simulation.scenario.network.namespace)
+        bus.subscribe(DIGEST, self._hear)
+
+    def _began(self, node: Node) -> None:
+        if self._last.get(node.spec.id, node) is not node:
+            self._bodies.pop(node.name, None)  # they have been driven from elsewhere since
+        self._last[node.spec.id] = node
+
+    def _look(self, node: Node) -> None:
+        if not isinstance(node.service, AgentService):
+            return
+        now_s = self.simulation.now_s
+        agent = node.service.agent
+        bodies = self._bodies.setdefault(node.name, {})
+        for id, vehicle in agent.vehicles.items():
+            if bodies.get(id) != vehicle.cell and not self._passable[vehicle.cell]:
+                self.lethal.append((now_s, id, vehicle.cell))
+            bodies[id] = vehicle.cell
+            self._unmoved.pop(id, None)
+        if agent.holdings.replaced:
+            bodies.clear()  # the younger life drives them
+        on: dict[int, str] = {}
+        for each in (self._unmoved, *self._bodies.values()):
+            for id, cell in each.items():
+                if on.setdefault(cell, id) != id:
+                    self.collisions.append((now_s, *sorted((on[cell], id)), cell))  # type: ignore[arg-type]
+
+    def _hear(self, event: Event) -> None:
+        assert isinstance(event, Heard)
+        digest = event.message
+        if isinstance(digest, Digest) and digest.role == "keeper":
+            for key, stamp in sets_of(digest.held).items():
+                self.acknowledged[key] = max(stamp, self.acknowledged.get(key, (-1, -1)))
+
+    def said(self) -> Sets:
+        """The newest of each set that a living agent has said itself."""
+        told: Sets = {}
+        for node in self.simulation.nodes.values():
+            replica = replica_of(node)
+            if node.spec.role == "agent" and replica is not None:
+                told |= sets_of(replica.own_digest())
+        return told
+
+    def held(self) -> dict[str, Sets]:
+        """What each living process holds."""
+        nodes = self.simulation.nodes.values()
+        replicas = {node.name: replica_of(node) for node in nodes if node.service is not None}
+        return {
+            name: sets_of(replica.held.ledger.held()) for name, replica in replicas.items() if replica is not None
+        }
+
+    def stored(self) -> Sets:
+        """What is on the keeper's disk."""
+        store = self.simulation.nodes["keeper-0"].store
+        assert store is not None
+        return {(each.author, each.tile): (each.epoch, each.seq) for each in store.load()}
+
+
+class Waits:
+    """How long vehicles stand on one cell although they have somewhere to go and nothing is down.
+
+    A second counts if every process works: one that is dead, hung or cut off is a reason to stand, as it may hold
+    the cell ahead, or be the planner or a warden that a vehicle waits for. Messages that are lost or late are none.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.longest_s = 0.0
+        self.longest: tuple[float, str, int] | None = None
+        """When the longest wait ended or was last seen, vehicle and cell."""
+        self._simulation = simulation
+        self._waited_s: dict[str, tuple[int, float]] = {}
+        """Vehicle -> its cell, and the seconds that count since it came there."""
+        self._looked_s: dict[str, float] = {}
+        simulation.after_tick.append(self._look)
+
+    def _look(self, node: Node) -> None:
+        if not isinstance(node.service, AgentService):
+            return
+        now_s = self._simulation.now_s
+        passed_s = now_s - self._looked_s.get(node.name, now_s)
+        self._looked_s[node.name] = now_s
+        counts_s = 0.0 if self._simulation.disturbed() else passed_s
+        for vehicle in node.service.agent.vehicles.values():
+            cell, waited_s = self._waited_s.get(vehicle.id, (-1, 0.0))
+            waits = vehicle.state in (VehicleState.FOLLOWING, VehicleState.WAITING)
+            waited_s = waited_s + counts_s if waits and cell == vehicle.cell else 0.0
+            self._waited_s[vehicle.id] = (vehicle.cell, waited_s)
+            if waited_s > self.longest_s:
+                self.longest_s, self.longest = waited_s, (now_s, vehicle.id, vehicle.cell)
+
+
+class Routed:
+    """When vehicles have a route, or their target within reach, once nothing goes wrong any more.
+
+    whole_s  when all processes worked for the first time since the quiet began; None until then
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.whole_s: float | None = None
+        self._simulation = simulation
+        self._at_s: dict[str, float] = {}
+        simulation.after_tick.append(self._look)
+
+    def _look(self, node: Node) -> None:
+        simulation, now_s = self._simulation, self._simulation.now_s
+        if self.whole_s is None and now_s >= (simulation.faults.quiet_s or 0.0) and not simulation.disturbed():
+            self.whole_s = now_s
+        if self.whole_s is None or not isinstance(node.service, AgentService):
+            return
+        for vehicle in node.service.agent.vehicles.values():
+            if vehicle.state in (VehicleState.FOLLOWING, VehicleState.ARRIVED):
+                self._at_s.setdefault(vehicle.id, now_s)
+
+    def missing(self) -> list[str]:
+        """Vehicles that have had no route since."""
+        every = [id for plan in plan_agents(self._simulation.scenario) for id in plan.vehicle_ids]
+        return [id for id in every if id not in self._at_s]
+
+    @property
+    def after_s(self) -> float | None:
+        """Seconds from `whole_s` until the last vehicle had a route; None if one has none."""
+        if self.whole_s is None or self.missing():
+            return None
+        return max(self._at_s.values()) - self.whole_s

@@ -1,0 +1,164 @@
+"""A simulated process: service, bus, ticks, clock, and the files that survive a crash."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from launch_scripts.process_table import ProcessSpec
+from launch_scripts.world.service import TargetsService
+from planner_service.service import PlannerService
+from shared_map.keeper.service import KeeperService
+from shared_map.keeper.store import KeeperStore
+from swarm.bus.bus import Event, Post
+from swarm.bus.memory_bus import MemoryBus
+from swarm.bus.scheduler import InlineWorker
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import Scenario
+from swarm.runtime.process import Service
+from swarm.runtime.role import RoleSetup
+from vehicle_agent.promise_store import MemoryPromiseStore
+from vehicle_agent.service import AgentService
+
+if TYPE_CHECKING:
+    from launch_scripts.simulation.simulate import Simulation
+
+EPOCH_NS = 1_800_000_000 * NS_PER_S
+"""Start of every simulation: a date, so that times look as in a real run."""
+
+
+class Node:
+    """One process, and the place where it is started again.
+
+    name      in the network; a second life of an agent on another machine has a name of its own
+    skew_ns   by how much the machine's clock is wrong; a process reads it once, at its start
+    """
+
+    def __init__(
+        self, simulation: Simulation, spec: ProcessSpec, phase_ns: int, skew_ns: int, name: str | None = None
+    ) -> None:
+        self.spec = spec
+        self.name = name or spec.name
+        self.ticking = True
+        self.crashes = 0
+        self.service: Service | None = None
+        self.bus: MemoryBus | None = None
+        self.store: KeeperStore | None = None
+        self.promises: MemoryPromiseStore | None = None
+        self.skew_ns = skew_ns
+        self._simulation = simulation
+        self._clock = simulation.scheduler.clock
+        self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))
+        self._phase_ns = phase_ns % self._tick_ns
+        self._offset_ns = skew_ns
+        self._life = 0
+        self._waiting: list[Event] | None = None
+        """Events since the process hangs; None if it does not."""
+        self._worker: InlineWorker | None = None
+
+    @property
+    def works(self) -> bool:
+        """Whether it runs and does not hang."""
+        return self.service is not None and self._waiting is None
+
+    def now_ns(self) -> int:
+        """Time of this process's clock."""
+        return self._clock.now_ns() + self._offset_ns
+
+    def boot(self) -> None:
+        """Start a new incarnation."""
+        if self.bus is not None:
+            return
+        simulation = self._simulation
+        simulation.log.event(self._clock.now_ns(), "boot", self.name)
+        self._offset_ns = self.skew_ns
+        self._waiting = None
+        # As the launcher counts lives: a restart is the later one although the clock was put back meanwhile.
+        self._life = max(self.now_ns(), self._life + 1)
+        namespace = simulation.scenario.network.namespace
+        bus = self.bus = simulation.network.bus(self.name, namespace, simulation.authenticator)
+        worker = self._worker = InlineWorker(simulation.scheduler)
+
+        def post(event: Event) -> None:
+            if self.bus is not bus or self.service is None:
+                return
+            if self._waiting is not None:
+                self._waiting.append(event)
+            else:
+                self.service.handle(event, self.now_ns())
+
+        setup = RoleSetup(
+            scenario=simulation.scenario,
+            run_id=simulation.run_id,
+            role=self.spec.role,
+            id=self.spec.id,
+            incarnation=self._life,
+            started_ns=EPOCH_NS,
+        )
+        self.service = self._build(setup, bus, post, worker)
+        self.service.start(self.now_ns())
+        for look in simulation.after_boot:
+            look(self)
+        simulation.scheduler.after(self._phase_ns, lambda: self._tick(bus))
+
+    def _build(self, setup: RoleSetup, bus: MemoryBus, post: Post, worker: InlineWorker) -> Service:
+        terrain, truth = self._simulation.terrain, self._simulation.truth
+        match self.spec.role:
+            case "keeper":
+                self.store = self.store or KeeperStore(":memory:")
+                return KeeperService(setup, terrain, bus, post, self.store)
+            case "planner":
+                return PlannerService(setup, terrain, bus, post, worker)
+            case "targets":
+                return TargetsService(setup, terrain, truth, bus, post)
+            case "agent":
+                self.promises = self.promises or MemoryPromiseStore(self._phase_ns + setup.incarnation)
+                return AgentService(setup, terrain, truth, bus, post, self.promises)
+        raise ValueError(f"no simulation of role {self.spec.role}")
+
+    def _tick(self, bus: MemoryBus) -> None:
+        if self.bus is not bus or self.service is None:
+            return
+        if self.ticking and self._waiting is None:
+            self.service.tick(self.now_ns())
+            for look in self._simulation.after_tick:
+                look(self)
+        self._simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
+
+    def crash(self) -> None:
+        """Ends the process as kill -9 does: nothing is published or saved."""
+        if self.bus is None:
+            return
+        self._simulation.log.event(self._clock.now_ns(), "crash", self.name)
+        self.crashes += 1
+        self.service = None
+        self._leave()
+
+    def hang(self) -> None:
+        """Stops the process's loop, as a stalled disk does: its session lives, its inbox fills."""
+        if self.works:
+            self._simulation.log.event(self._clock.now_ns(), "hang", self.name)
+            self._waiting = []
+
+    def wake(self) -> None:
+        """Ends a hang: everything that has come meanwhile is read at once."""
+        waiting, self._waiting = self._waiting or (), None
+        bus = self.bus
+        if waiting:
+            self._simulation.log.event(self._clock.now_ns(), "wake", self.name)
+        for event in waiting:
+            if self.bus is bus and self.service is not None:
+                self.service.handle(event, self.now_ns())
+
+    def stop(self) -> None:
+        if self.service is not None:
+            self.service.stop(self.now_ns())
+
+    def _leave(self) -> None:
+        if self.bus is not None and self._worker is not None:
+            self._worker.close()
+            self.bus.close()
+            self.bus = None
+
+
+def _tick_hz(role: str, scenario: Scenario) -> float:
+    return {"planner": scenario.planner.tick_hz, "agent": scenario.vehicles.tick_hz}.get(role, 10.0)

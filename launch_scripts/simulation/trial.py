@@ -1,0 +1,166 @@
+"""One seed of a world with everything at once, and what it breaks."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from typing import Any
+
+import msgspec
+
+from launch_scripts.process_table import processes_of
+from launch_scripts.simulation.faults import FaultPlan, random_plan
+from launch_scripts.simulation.laws import Laws, Routed, Waits, missing, replica_of
+from launch_scripts.simulation.simulate import SIMULATED_ROLES, Simulation
+from launch_scripts.simulation.worlds import world
+from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.config.scenario import Scenario
+
+SECONDS = 30.0
+"""Faults in the first 18, quiet in the rest: a wait of ten seconds has its place in it."""
+LONGEST_WAIT_S = 10.0
+ROUTED_WITHIN_S = 5.0
+SETTLED_S = 4.0
+"""What was said so long before the end has reached everybody."""
+LAST_WORDS_S = 6.0
+"""Once nobody says anything new, all hold the same after so long."""
+_SHOWN = 3
+
+
+class Verdict(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of one seed.
+
+    broken          a sentence per law that did not hold
+    longest_wait_s  see `laws.Waits`
+    routed_after_s  from when all processes work again until every vehicle has a route; None if one never has
+    faults          how many of each kind there were
+    """
+
+    world: str
+    seed: int
+    seconds: float
+    broken: list[str]
+    longest_wait_s: float = 0.0
+    routed_after_s: float | None = None
+    captures: int = 0
+    deliveries: int = 0
+    faults: dict[str, int] = {}
+    wall_s: float = 0.0
+
+    @property
+    def replay(self) -> str:
+        """The command that runs this seed again."""
+        return f"swarm simulate {self.world} --seeds {self.seed}:{self.seed + 1}" + (
+            "" if self.seconds == SECONDS else f" --seconds {self.seconds:g}"
+        )
+
+
+def nodes_of(scenario: Scenario) -> list[str]:
+    return [spec.name for spec in processes_of(scenario, SIMULATED_ROLES)]
+
+
+def try_seed(name: str, seed: int, seconds: float = SECONDS, given: Scenario | None = None) -> Verdict:
+    """Run a world with all faults of a seed. A service that raises is a broken law, too.
+
+    given  the scenario of that name, where it is none of `WORLDS`
+    """
+    scenario, terrain = world(name, seed) if given is None else _seeded(given, seed)
+    plan = random_plan(seed, nodes_of(scenario), seconds)
+    simulation = Simulation(scenario, faults=plan, terrain=terrain)
+    began_s = time.perf_counter()
+    trial = Trial(simulation)
+    try:
+        broken = trial.run(seconds)
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{type(error).__name__}: {error} in {where.filename.rpartition('/')[2]}:{where.lineno}"
+        broken = [f"a service raised at {simulation.now_s:.1f} s: {text}"]
+    return Verdict(
+        world=name,
+        seed=seed,
+        seconds=seconds,
+        broken=broken,
+        longest_wait_s=trial.waits.longest_s,
+        routed_after_s=trial.routed.after_s,
+        captures=simulation.report(seconds)["captures"] or 0,
+        deliveries=simulation.log.deliveries,
+        faults=_count(plan),
+        wall_s=time.perf_counter() - began_s,
+    )
+
+
+class Trial:
+    """Runs a simulation to its end and holds it against every law."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.laws, self.waits, self.routed = Laws(simulation), Waits(simulation), Routed(simulation)
+
+    def run(self, seconds: float) -> list[str]:
+        """Returns a sentence per law that broke. At the end the agents die, so that nothing new is said."""
+        simulation, laws = self.simulation, self.laws
+        broken: list[str] = []
+        simulation.run_until(seconds - SETTLED_S)
+        said = laws.said()
+        simulation.run_until(seconds)
+        if simulation.scenario.map.interest == "all":
+            for name, held in laws.held().items():
+                if lacks := missing(held, said):
+                    first = f"{len(lacks)} sets that were said {SETTLED_S:g} s ago, such as {lacks[0]}"
+                    broken.append(f"{name} lacks {first}")
+        for node in simulation.nodes.values():
+            if node.spec.role == "agent":
+                node.crash()
+        simulation.run_until(seconds + LAST_WORDS_S)
+        for when_s, one, other, cell in laws.collisions[:_SHOWN]:
+            broken.append(f"collision at {when_s:.2f} s: {one} and {other} on cell {cell}")
+        for when_s, vehicle, cell in laws.lethal[:_SHOWN]:
+            broken.append(f"lethal entry at {when_s:.2f} s: {vehicle} on cell {cell}")
+        if lost := missing(laws.stored(), laws.acknowledged):
+            broken.append(f"{len(lost)} acknowledged sets are lost, such as {lost[0]}")
+        return broken + self._replicas() + self._waited() + self._routes()
+
+    def _replicas(self) -> list[str]:
+        prints: dict[object, list[str]] = {}
+        for node in self.simulation.nodes.values():
+            replica = replica_of(node)
+            if node.service is not None and replica is not None:
+                prints.setdefault(replica.held.fingerprint(), []).append(node.name)
+        apart = " | ".join(", ".join(names) for names in prints.values())
+        return [f"replicas differ: {apart}"] if len(prints) > 1 else []
+
+    def _waited(self) -> list[str]:
+        waits = self.waits
+        if waits.longest is None or waits.longest_s <= LONGEST_WAIT_S:
+            return []
+        when_s, vehicle, cell = waits.longest
+        text = f"{vehicle} waits {waits.longest_s:.1f} s on cell {cell} without a reason, until {when_s:.1f} s"
+        return [text]
+
+    def _routes(self) -> list[str]:
+        routed = self.routed
+        if routed.whole_s is None:
+            return ["a process did not start again"]
+        late = routed.missing()
+        if late:
+            return [f"{len(late)} vehicles have no route any more, such as {', '.join(late[:_SHOWN])}"]
+        if routed.after_s is not None and routed.after_s > ROUTED_WITHIN_S:
+            return [f"the last vehicle has a route {routed.after_s:.1f} s after the last fault"]
+        return []
+
+
+def _seeded(scenario: Scenario, seed: int) -> tuple[Scenario, Terrain]:
+    scenario = msgspec.structs.replace(scenario, seed=seed)
+    return scenario, build_terrain(scenario)
+
+
+def _count(plan: FaultPlan) -> dict[str, int]:
+    faults: dict[str, Any] = {
+        "crashes": plan.crashes,
+        "cuts": plan.partitions,
+        "one_way_cuts": [cut for cut in plan.partitions if cut.one_way],
+        "hangs": plan.hangs,
+        "clock_steps": plan.clock_steps,
+        "second_lives": plan.twins,
+    }
+    return {name: len(some) for name, some in faults.items()}

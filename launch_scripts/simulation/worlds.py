@@ -1,0 +1,137 @@
+"""Small worlds in which swarms are tried: hills with hidden obstacles, several regions, crowds.
+
+A crowd is 8 agents with 200 vehicles on 40 x 40 cells: a hall, rooms with doors, halls joined by corridors of one
+cell, pillars.
+"""
+
+from __future__ import annotations
+
+import random
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.terrain.terrain import Terrain, build_terrain, terrain_of_pace
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+
+CROWDS = ("open", "doors", "corridor", "maze")
+SMALL = parse_scenario("""
+name = "small"
+time_scale = 10
+[terrain]
+source = "synthetic"
+rows = 48
+cols = 64
+resolution_m = 30
+relief_m = 200
+roads = 3
+[terrain.hidden]
+closed_roads = 2
+rubble_fields = 4
+flooded_share = 0.02
+[cost]
+max_slope_deg = 25
+[[targets]]
+count = 2
+speed_m_per_s = 3
+[[groups]]
+vehicles = 10
+[vehicles]
+per_agent = 4
+sense_range_m = 120
+capture_range_m = 60
+""")
+"""Three agents on a hill with hidden obstacles: marks are made all the time."""
+WIDE_TERRAIN = """
+time_scale = 40
+[terrain]
+source = "synthetic"
+rows = 280
+cols = 800
+resolution_m = 30
+relief_m = 200
+"""
+"""Begins a scenario with eight regions, in which vehicles drive ten cells a second and cross borders."""
+WIDE = parse_scenario(f"""
+name = "wide"
+{WIDE_TERRAIN}
+[terrain.hidden]
+rubble_fields = 6
+[cost]
+max_slope_deg = 25
+[[targets]]
+count = 3
+speed_m_per_s = 3
+[[groups]]
+vehicles = 24
+[vehicles]
+per_agent = 3
+sense_range_m = 120
+capture_range_m = 60
+reassign_s = 2
+""")
+"""Eight agents, whose vehicles cross borders of plots and regions all the time."""
+WORLDS = ("small", "wide", *CROWDS)
+_CROWD = """
+name = "crowd"
+time_scale = 10
+seed = {seed}
+[terrain]
+source = "synthetic"
+rows = {side}
+cols = {side}
+resolution_m = 10
+[[targets]]
+count = 4
+speed_m_per_s = 2
+walk = "random"
+[[groups]]
+vehicles = {vehicles}
+[vehicles]
+per_agent = {per_agent}
+sense_range_m = 40
+capture_range_m = 15
+"""
+
+
+def crowd(kind: str, seed: int, vehicles: int, per_agent: int, side: int = 40) -> tuple[Scenario, Terrain]:
+    """A scenario, and its terrain: one cell takes a vehicle a tenth of a second."""
+    chance = random.Random(f"{kind}/{seed}")
+    pace = np.full((side, side), 0.1, np.float32)
+    if kind == "doors":
+        _rooms(pace, chance)
+    elif kind == "corridor":
+        pace[:, 3 * side // 10 : 7 * side // 10] = np.inf
+        for row in (side // 7, side // 2, 5 * side // 6):
+            pace[row] = 0.1
+    elif kind == "maze":
+        for _ in range(side * side // 5):
+            pace[chance.randrange(side), chance.randrange(side)] = np.inf
+    text = _CROWD.format(seed=seed, side=side, vehicles=vehicles, per_agent=per_agent)
+    return parse_scenario(text), terrain_of_pace(pace, 10.0)
+
+
+def _rooms(pace: NDArray[np.float32], chance: random.Random) -> None:
+    """Rooms of ten by ten cells, each with doors of one cell to its neighbours."""
+    side = len(pace)
+    walls = range(9, side - 1, 10)
+    for wall in walls:
+        pace[wall, :] = pace[:, wall] = np.inf
+    for wall in walls:
+        for room in range(0, side, 10):
+            pace[wall, min(room + chance.randrange(1, 8), side - 1)] = 0.1
+            pace[min(room + chance.randrange(1, 8), side - 1), wall] = 0.1
+
+
+def seeded(seed: int, scenario: Scenario = SMALL) -> Scenario:
+    return msgspec.structs.replace(scenario, seed=seed)
+
+
+def world(name: str, seed: int) -> tuple[Scenario, Terrain]:
+    """A world of `WORLDS` with a seed."""
+    if name in CROWDS:
+        return crowd(name, seed, vehicles=200, per_agent=25)
+    scenario = seeded(seed, {"small": SMALL, "wide": WIDE}[name])
+    return scenario, build_terrain(scenario)

@@ -1,0 +1,86 @@
+"""`swarm simulate --seeds`: what a seed does depends on its world and number alone, and each law can break."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+import pytest
+
+from launch_scripts.commands.simulate import parse_seeds, simulate_seeds
+from launch_scripts.simulation.campaign import MIX, run_seeds, world_of
+from launch_scripts.simulation.faults import FaultPlan
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trial import Trial, Verdict, try_seed
+from launch_scripts.simulation.worlds import SMALL, WORLDS, seeded
+from swarm.errors import ConfigError
+
+
+def same(verdict: Verdict) -> Verdict:
+    return msgspec.structs.replace(verdict, wall_s=0.0)
+
+
+def test_seeds_do_the_same_one_by_one_and_side_by_side():
+    alone = {v.seed: same(v) for v in run_seeds("small", range(2), jobs=1, seconds=4)}
+    beside = {v.seed: same(v) for v in run_seeds("small", range(2), jobs=2, seconds=4)}
+    assert alone == beside
+    assert alone[0] != alone[1]
+
+
+def test_the_mix_takes_every_world_in_turn_and_a_replay_names_it():
+    assert [world_of(MIX, seed) for seed in range(6)] == list(WORLDS)
+    verdict = Verdict(world=world_of(MIX, 9), seed=9, seconds=30.0, broken=[])
+    assert verdict.replay == "swarm simulate doors --seeds 9:10"
+    assert msgspec.structs.replace(verdict, seconds=5.0).replay.endswith("--seconds 5")
+
+
+def test_a_scenario_of_ones_own_is_tried_too():
+    given = msgspec.structs.replace(SMALL, name="mine")
+    [verdict] = run_seeds("mine", range(3, 4), jobs=1, seconds=4, given=given)
+    assert same(verdict) == same(msgspec.structs.replace(try_seed("small", 3, 4), world="mine"))
+
+
+@pytest.mark.parametrize("text", ["5", "5:5", "6:5", "-1:3", "a:b", "1:2:3", "1:" + "9" * 40])
+def test_seeds_that_are_no_range_are_refused_with_what_was_expected(text):
+    with pytest.raises(ConfigError, match="is not A:B with A < B"):
+        parse_seeds(text)
+    assert list(parse_seeds("5:8")) == [5, 6, 7]
+
+
+def test_a_process_that_never_comes_back_breaks_a_law():
+    simulation = Simulation(seeded(1), faults=FaultPlan(quiet_s=4))
+    trial = Trial(simulation)
+    simulation.run_until(3)
+    simulation.nodes["agent-a1"].crash()
+    assert "a process did not start again" in trial.run(10)
+
+
+def test_each_law_has_its_sentence():
+    simulation = Simulation(seeded(1), faults=FaultPlan(quiet_s=4))
+    trial = Trial(simulation)
+    trial.laws.collisions.append((1.0, "v", "w", 3))
+    trial.laws.lethal.append((2.0, "v", 4))
+    trial.laws.acknowledged["nobody.a9.1", 0] = (1, 1)
+    trial.waits.longest_s, trial.waits.longest = 11.0, (12.0, "v", 5)
+    assert trial.run(10) == [
+        "collision at 1.00 s: v and w on cell 3",
+        "lethal entry at 2.00 s: v on cell 4",
+        "1 acknowledged sets are lost, such as ('nobody.a9.1', 0)",
+        "v waits 11.0 s on cell 5 without a reason, until 12.0 s",
+    ]
+
+
+def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
+    assert simulate_seeds("small", "3:4", 4, 1, as_json=True)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["seeds"] == 1
+    assert printed["failing"] == []
+    assert printed["deliveries"] > 1000
+    broken = Verdict(world="small", seed=3, seconds=30.0, broken=["it broke"])
+    monkeypatch.setattr("launch_scripts.simulation.campaign.try_seed", lambda *_: broken)
+    assert not simulate_seeds("small", "3:4", None, 1, as_json=False)
+    out = capsys.readouterr().out
+    assert "FAILED small seed 3" in out
+    assert "it broke" in out
+    assert "failed: swarm simulate small --seeds 3:4" in out
+    assert "1 of 1 seeds broke a law" in out

@@ -1,0 +1,145 @@
+"""What `swarm chaos` is made of: blows by seed, hostile messages, recovery, and the laws of a siege."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import pytest
+
+from launch_scripts.chaos.blows import BLOWS, CALM, blows
+from launch_scripts.chaos.hostile import KINDS, Hostile
+from launch_scripts.chaos.lies import Lies
+from launch_scripts.chaos.picture import draw
+from launch_scripts.chaos.recovery import Recovery
+from launch_scripts.chaos.tally import Ended, Outcome, Sample, Tally
+from swarm.wire.codec import decode, encode
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.topics import POSE, TOPICS
+
+NAMES = ["agent-a0", "agent-a1", "keeper-0", "router-0"]
+
+
+def fleet(places: dict[str, tuple[float, VehicleState]]) -> Fleet:
+    n = len(places)
+    return Fleet(
+        author="all.a0.1", group="all", region=0, seq=1, stamp_ns=1, ids=list(places), target_ids=[],
+        cells=pack_column([0] * n, "<u4"), east_m=pack_column([east for east, _ in places.values()], "<f4"),
+        south_m=pack_column([0.0] * n, "<f4"), heading_rad=pack_column([0.0] * n, "<f4"),
+        states=bytes([state for _, state in places.values()]), targets=bytes([NO_TARGET] * n),
+    )  # fmt: skip
+
+
+def test_a_seed_decides_the_blows_and_their_order() -> None:
+    one, same, other = (list(islice(blows(seed, NAMES, BLOWS, 5.0), 60)) for seed in (1, 1, 2))
+    assert one == same != other
+    assert one[0].kind == CALM
+    assert {blow.kind for blow in one} == {CALM, *BLOWS}
+    assert {len(blow.whom) for blow in one if blow.kind == "kill"} == {1, 2}
+    assert {blow.kind for blow in islice(blows(1, NAMES, ["kill"], 5.0), 1, 20)} == {"kill"}
+
+
+@pytest.mark.parametrize("kind", sorted({k for t in TOPICS for k in (t.message, t.request, t.bulk) if k}, key=str))
+def test_there_is_a_lie_of_every_message_and_it_passes_the_door(kind: type[Message]) -> None:
+    lies = Lies(cells=1600, seed=3)
+    for _ in range(20):
+        lie = lies.lie(kind)
+        assert decode(encode(lie), kind) == lie
+
+
+def hostile(seed: int = 1, **options: object) -> Hostile:
+    made = Hostile("swarm", Lies(1600, seed), seed, **options)  # type: ignore[arg-type]
+    lies = Lies(1600, 9)
+    for _ in range(50):
+        pose = lies.lie(POSE.message)
+        made.heard(POSE.keyed("swarm", **lies.fields(POSE, pose)), encode(pose))
+    return made
+
+
+def test_hostile_messages_are_of_all_kinds_and_the_same_for_the_same_seed() -> None:
+    one, same, other = ([made.next() for _ in range(200)] for made in (hostile(1), hostile(1), hostile(2)))
+    assert one == same != other
+    assert {kind for kind, *_ in one} == set(KINDS)
+    assert all(key.startswith("swarm/") for _, key, *_ in one)
+
+
+def test_nothing_hostile_is_said_under_a_topic_that_is_spared() -> None:
+    made = hostile(spared=("pose", "true-pose"))
+    keys = [made.next()[1] for _ in range(300)]
+    assert not any(POSE.parse("swarm", key) for key in keys)
+
+
+def test_a_replay_is_byte_for_byte_what_was_said() -> None:
+    made = Hostile("swarm", Lies(10, 1), 1, ["replayed"])
+    made.heard("swarm/x", b"said", b"code")
+    assert made.next() == ("replayed", "swarm/x", b"said", b"code")
+
+
+def test_recovery_counts_from_when_the_blow_is_over_and_takes_the_last_vehicle() -> None:
+    recovery = Recovery(["v", "w"])
+    following, waiting, arrived = VehicleState.FOLLOWING, VehicleState.WAITING, VehicleState.ARRIVED
+    recovery.hear(fleet({"v": (0.0, following), "w": (0.0, following)}), 1.0)
+    assert recovery.reported
+    recovery.over(2.0)
+    assert recovery.routed_s() is None
+    recovery.hear(fleet({"v": (0.0, following), "w": (0.0, waiting)}), 2.1)
+    assert recovery.unrouted() == ["w"]
+    assert recovery.standing() == ["v", "w"]
+    recovery.hear(fleet({"v": (1.0, following), "w": (0.0, following)}), 2.5)
+    assert recovery.routed_s() == 2.5
+    assert recovery.moving_s() is None
+    recovery.hear(fleet({"w": (0.0, arrived)}), 3.5)  # it is where it wanted to be
+    assert recovery.moving_s() == 3.5
+
+
+def tally(seconds: float = 100.0, **fields: object) -> Tally:
+    return Tally(scenario="x", seed=1, within_s=10.0, seconds=seconds, **fields)  # type: ignore[arg-type]
+
+
+def outcome(kind: str = "kill", routed_s: float | None = 1.0, moving_s: float | None = 1.5) -> Outcome:
+    return Outcome(at_s=5.0, kind=kind, whom=("agent-a0",), routed_s=routed_s, moving_s=moving_s, late=("a0-00",))
+
+
+def samples(seconds: float, grows: float) -> list[Sample]:
+    times = range(int(seconds))
+    return [Sample(at_s=float(t), rss_mb=100 * (1 + grows * t / seconds), threads=50, files=90) for t in times]
+
+
+def test_a_siege_in_which_all_recovers_breaks_no_law() -> None:
+    assert tally(outcomes=[outcome(), outcome("hang")]).broken() == []
+    assert tally(outcomes=[outcome(CALM, None, None)]).broken() == []  # nothing was done to it
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"outcomes": [outcome(routed_s=None)]}, "after kill of agent-a0 at 5 s not recovered: 1 vehicles"),
+        ({"outcomes": [outcome(moving_s=12.0)]}, "recovered after 12.0 s"),
+        ({"ended": [Ended(at_s=3.0, name="planner-t0", reason="why")]}, "planner-t0 ended by itself at 3 s: why"),
+        ({"collisions": ["v and w"]}, "collision: v and w"),
+        ({"lethal_entries": ["v"]}, "lethal entry: v"),
+        ({"left_behind": ["agent-a0"]}, "agent-a0 was left behind"),
+    ],
+)
+def test_each_law_of_a_siege_can_break(fields: dict[str, object], says: str) -> None:
+    [sentence] = tally(**fields).broken()
+    assert says in sentence
+
+
+def test_growth_is_held_against_long_runs_only() -> None:
+    grown = tally(3600.0, samples=samples(3600, 0.5))
+    assert [sentence.split()[0] for sentence in grown.broken()] == ["rss_mb"]
+    assert tally(3600.0, samples=samples(3600, 0.02)).broken() == []
+    assert tally(100.0, samples=samples(100, 0.5)).broken() == []
+    assert tally().growth() == {"rss_mb": None, "threads": None, "files": None}
+
+
+def test_the_figures_of_a_siege_are_drawn_and_counted(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    some = tally(outcomes=[outcome(CALM), outcome(), outcome(moving_s=3.0), outcome(routed_s=None)])
+    some.samples += samples(100, 0.1)
+    kill = some.rows()[1]
+    assert (kill["kind"], kill["blows"], kill["slower_than_2_s"], kill["never"]) == ("kill", 3, 1, 1)
+    assert kill["moving_max_s"] == 3.0
+    draw(some, tmp_path / "chaos.png")
+    assert (tmp_path / "chaos.png").read_bytes().startswith(b"\x89PNG")
