@@ -223,13 +223,14 @@ def seats_a_file_that_is_not_the_first(patch: pytest.MonkeyPatch) -> None:
 
 
 def acts_on_a_table_that_is_not_the_newest(patch: pytest.MonkeyPatch) -> None:
-    leave = Holdings._forget_left
+    standings = Holdings.standings
 
-    def absent_minded(self: Holdings, by_plot) -> None:  # type: ignore[no-untyped-def]
-        leave(self, by_plot)
+    def absent_minded(self: Holdings, wishes, now_ns):  # type: ignore[no-untyped-def]
+        said = standings(self, wishes, now_ns)
         self._views = {plot: view for plot, view in self._views.items() if plot in self.plots}
+        return said
 
-    patch.setattr(Holdings, "_forget_left", absent_minded)
+    patch.setattr(Holdings, "standings", absent_minded)
 
 
 RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
