@@ -108,6 +108,8 @@ class Agent:
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
+        self._unassigned = False
+        """Whether vehicles have been placed that nobody has asked a target for yet."""
         self._driven_ns: int | None = None
         self._left_s: dict[str, float] = {}
         self._look_from: dict[int, None] = {}
@@ -120,6 +122,7 @@ class Agent:
             cell = self.holdings.path(id)[0]
             self.vehicles[id] = Vehicle(id, self._map.grid, cell)
             self._look_from[cell] = None
+            self._unassigned = True
 
     def stand_down(self) -> None:
         """Another process drives the vehicles now."""
@@ -236,6 +239,10 @@ class Agent:
             )
             self._route_requests[request.request] = request
             actions.append(request)
+        if self._unassigned:
+            # A new life learns its vehicles' places one after the other, from several plots.
+            self._unassigned = False
+            self._assignment.ask_soon(now_ns)
         if self.vehicles and self._assignment.due(now_ns):
             self._requests += 1
             actions.append(self._assignment.ask(self._requests, self.vehicles, now_ns))

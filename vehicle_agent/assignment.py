@@ -103,7 +103,7 @@ class Assignment:
         return self._open
 
     def ask_soon(self, now_ns: int) -> None:
-        """A target has jumped or has a planner again: costs are not what they were."""
+        """A target has jumped or has a planner again, so that costs are not what they were, or vehicles are new."""
         self._due_ns = min(self._due_ns, now_ns + _RETRY_NS)
 
     def costs_given(self, request: int, target: str, costs_s: NDArray[np.float32]) -> None:

@@ -23,7 +23,7 @@ def running(runs: Path) -> dict[str, int]:
 
 def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
-    options = ("--seconds", 14, "--every", 4, "--within", 30, "--seed", 12, "--runs", runs, "--json")
+    options = ("--seconds", 16, "--every", 4, "--within", 30, "--seed", 57, "--runs", runs, "--json")
     ended = swarm("chaos", write_scenario(tmp_path), *options, timeout_s=240)
     report = json.loads(ended.stdout)
     assert report["broken"] == [], ended.stderr
@@ -31,7 +31,7 @@ def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(
     kinds = [outcome["kind"] for outcome in report["outcomes"]]
     assert kinds[:2] == ["calm", "kill"]
     assert report["outcomes"][1]["back_s"] > 0
-    assert "messages" not in kinds or sum(report["messages"].values()) > 0
+    assert "messages" not in kinds[2:] or sum(report["messages"].values()) > 0
     [run_dir] = runs.iterdir()
     assert (run_dir / "chaos.png").stat().st_size > 1000
     whole = json.loads((run_dir / "chaos.json").read_text())

@@ -97,6 +97,23 @@ def test_one_request_per_target_and_tick_for_all_who_need_a_route(agent: Agent) 
     assert routes == AskRoutes(2, "t0", ("a0-00", "a0-01"), cells, force=False, reroutes=0)
 
 
+def test_a_vehicle_that_finds_its_place_after_the_others_is_assigned_soon() -> None:
+    agent = agent_of(parse_scenario(TEXT))
+    agent.set_planners({"t0": 1, "t1": 1}, 0)
+    asks = []
+    for tenth in range(30):
+        if tenth in (0, 10):
+            grant(agent, 1 + tenth, v0=[GRID.cell(5, 5)], **({"v1": [GRID.cell(5, 7)]} if tenth else {}))
+        now_ns = tenth * S // 10
+        for asked in agent.decide(now_ns):
+            if isinstance(asked, AskCosts):
+                asks.append((tenth, asked.vehicles))
+                many = len(asked.vehicles)
+                answer_costs(agent, asked, now_ns, t0=[5.0] * many, t1=[9.0] * many)
+    assert asks[0] == (0, ("a0-00",))
+    assert min(tenth for tenth, vehicles in asks if "a0-01" in vehicles) <= 20
+
+
 def test_nobody_answering_is_asked_again_soon(agent: Agent) -> None:
     (asked,) = agent.decide(0)
     assert isinstance(asked, AskCosts)
