@@ -48,7 +48,7 @@ def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: 
     out = tmp_path / "out.txt"
     command = [*SWARM, "up", str(write_scenario(tmp_path)), "--runs", str(disk / "runs"), "--plain"]
     with out.open("w") as file:
-        swarm = subprocess.Popen([*command, "--seconds", "70"], stdout=file, stderr=subprocess.STDOUT)
+        swarm = subprocess.Popen([*command, "--seconds", "45"], stdout=file, stderr=subprocess.STDOUT)
     try:
         until(out, "routes are served", 240)
         (run_dir,) = (disk / "runs").iterdir()
@@ -75,6 +75,7 @@ def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: 
     said = lines_of(out)
     assert "vehicles that had a route 12" in said
     assert "collisions 0" in said
+    assert "restarts 2" in said
     assert "Traceback" not in out.read_text()
     assert all("Traceback" not in path.read_text() for path in run_dir.glob("*.log*"))
     assert (run_dir / "report.json").is_file()
