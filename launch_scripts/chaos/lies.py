@@ -1,4 +1,4 @@
-"""Well-formed lies: any message that passes the door, made of the bounds in its type."""
+"""Well-formed lies: any message that decodes, made of the bounds in its type."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ class Lies:
     # --- making ---------------------------------------------------------------------------------------------
 
     def lie(self, kind: type[M]) -> M:
-        """A message of this type which passes the door."""
+        """A message of this type which decodes."""
         for _ in range(_TRIES):
             try:
                 made = self._made(kind)
                 return decode(encode(made), kind)  # type: ignore[type-var]
             except (ProtocolError, ValueError):
                 continue  # fields that contradict each other
-        raise AssertionError(f"no {kind.__name__} of {_TRIES} passes the door: its types say less than its checks")
+        raise AssertionError(f"no {kind.__name__} of {_TRIES} decodes: its types say less than its checks")
 
     def _made(self, kind: type[Any]) -> Any:
         if kind is Routes:

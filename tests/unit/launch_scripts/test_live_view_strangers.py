@@ -1,4 +1,4 @@
-"""The law of the live view's door: pages of this machine come in, those of other sites neither read nor connect;
+"""Who may see the live view: pages of this machine come in, those of other sites neither read nor connect;
 and nobody can keep it busy."""
 
 from __future__ import annotations
