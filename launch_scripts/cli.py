@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import sys
@@ -14,7 +15,8 @@ import typer
 
 from launch_scripts.commands import query, roles
 from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Runs, Tls, spread
-from swarm.errors import SwarmError
+from swarm.errors import StoreError, SwarmError
+from swarm.ranks import HIGHEST_RANK
 
 
 def _began_s() -> float:
@@ -99,6 +101,14 @@ def up(
     only: Annotated[
         list[str] | None, typer.Option(help="Start only this role; may be given several times.")
     ] = None,
+    rank: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=HIGHEST_RANK,
+            help="Of planners and the targets process, start those of this rank: 0 lead, 1 stand by, and so on.",
+        ),
+    ] = None,
     run_id: Annotated[
         str | None, typer.Option(help="Take part in this run; by default a new one, or the one in the namespace.")
     ] = None,
@@ -110,9 +120,13 @@ def up(
 
     swarm up my.toml --only router --only keeper
 
+    swarm up my.toml --connect tls/10.0.0.5:7447 --only planner --rank 1 --tls-ca ca.pem --tls-cert . --tls-key .
+
     swarm up my.toml --connect tls/10.0.0.5:7447 --only agent --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
-    _up(scenario, run, tls, connect=connect, listen=listen, namespace=namespace, only=only, run_id=run_id)
+    _up(
+        scenario, run, tls, connect=connect, listen=listen, namespace=namespace, only=only, rank=rank, run_id=run_id
+    )
 
 
 def _up(
@@ -124,6 +138,7 @@ def _up(
     listen: str | None = None,
     namespace: str | None = None,
     only: list[str] | None = None,
+    rank: int | None = None,
     run_id: str | None = None,
 ) -> None:
     import msgspec
@@ -161,6 +176,7 @@ def _up(
         run.runs,
         roles=roles,
         joins="router" not in roles,
+        rank=rank,
         run_id=run_id,
         as_json=run.as_json,
         plain=run.plain,
@@ -320,10 +336,27 @@ _mount(
 def main() -> int:
     """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
     try:
-        app(prog_name="swarm")
+        try:
+            app(prog_name="swarm")
+        finally:
+            sys.stdout.flush()
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
+        _leave_output()
         return 0
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or error.filename is not None:
+            raise
+        _leave_output()
+        print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
+        return StoreError.exit_code
     return 0
+
+
+def _leave_output() -> None:
+    """Send what still waits to be printed nowhere: the interpreter would complain about it at its end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)

@@ -9,6 +9,7 @@ import msgspec
 
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario, ids_of
+from swarm.ranks import ranked_id
 
 Restart = Literal["always", "never"]
 
@@ -50,9 +51,12 @@ class ProcessSpec:
         return f"{self.role}-{self.id}"
 
 
-def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES) -> list[ProcessSpec]:
-    """Processes of a scenario, restricted to `roles`, in order of start."""
-    ids: dict[str, list[str]] = {
+def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES, rank: int | None = None) -> list[ProcessSpec]:
+    """Processes of a scenario, restricted to `roles`, in order of start.
+
+    rank  of planners and the targets process: only those of this rank; if None all, with those of rank 0 first
+    """
+    jobs: dict[str, list[str]] = {
         "router": ["0"],
         "keeper": ["0"],
         "monitor": ["0"],
@@ -60,7 +64,15 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES) -> list[Pro
         "targets": ["0"] if any(target.is_simulated for target in scenario.targets) else [],
         "agent": [plan.id for plan in plan_agents(scenario)],
     }
-    return [ProcessSpec(role, id, ENTRIES[role]) for role in ROLES if role in roles for id in ids[role]]
+    standbys = {"planner": scenario.standbys.planner, "targets": scenario.standbys.targets}
+    return [
+        ProcessSpec(role, ranked_id(job, each), ENTRIES[role])
+        for role in ROLES
+        if role in roles
+        for each in (range(standbys[role] + 1) if role in standbys else (0,))
+        if rank in (None, each) or role not in standbys
+        for job in jobs[role]
+    ]
 
 
 LAUNCHER = "launcher"

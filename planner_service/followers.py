@@ -112,6 +112,12 @@ class Followers:
             row0, col0, row1, col1 = int(rows.min()), int(cols.min()), int(rows.max()), int(cols.max())
             follower.bounds = Window(row0 - 1, col0 - 1, row1 + 2, col1 + 2)
 
+    def forget_routes(self) -> None:
+        """Another planner has given routes meanwhile: whatever is given next is news to every follower."""
+        for follower in self._by_id.values():
+            follower.route, follower.stale, follower.push_ns = None, True, 0
+            follower.rows, follower.cols, follower.bounds = _NOWHERE, _NOWHERE, _EMPTY
+
     def _register(self, vehicle: str, follower: Follower) -> Follower:
         if len(self._by_id) >= CAPACITY:
             del self._by_id[next(iter(self._by_id))]

@@ -11,23 +11,27 @@ from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
+from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, end_with
 from swarm.runtime.role import RoleSetup
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
-    """Plan for the target `setup.id` until SIGTERM, SIGINT or the end of the launcher."""
+    """Plan for one target, as its planner or a standby, until SIGTERM, SIGINT or the end of the launcher."""
     scenario = setup.scenario
-    if setup.id not in scenario.target_ids:
-        raise ConfigError(
-            f"scenario {scenario.name} has no target {setup.id}; it has {', '.join(scenario.target_ids)}"
-        )
+    target = job_of(setup.id)
+    if target not in scenario.target_ids:
+        ids = ", ".join(scenario.target_ids)
+        raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = load_terrain(setup)
     warm_up()
     clock = MonotonicClock()
     inbox = Inbox()
-    with open_bus(scenario.network) as bus, closing(ThreadWorker("grow-tree", inbox, clock)) as worker:
+    with (
+        open_bus(scenario.network, patient=True) as bus,
+        closing(ThreadWorker("grow-tree", inbox, clock)) as worker,
+    ):
         service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
         process = Process(service, inbox, clock, scenario.planner.tick_hz)
         process.stop_on_signals()

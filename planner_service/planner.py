@@ -70,6 +70,7 @@ class Planner:
 
     stopwatch       times growths on this thread; without one they take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
+    leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     """
 
     def __init__(
@@ -84,8 +85,10 @@ class Planner:
         route_cells: int = 0,
         stopwatch: Callable[[], int] | None = None,
         newest_mark_ns: Callable[[], int | None] = lambda: None,
+        leads: bool = True,
     ) -> None:
         self.target = target
+        self.leads = leads
         self.tree = tree
         self.counters = counters
         self._incarnation = incarnation
@@ -122,6 +125,13 @@ class Planner:
         for name in COUNTS:
             counters.count(name, 0)
 
+    def lead(self, leads: bool) -> None:
+        """Take over, or leave it to another. A planner that takes over does not know which routes followers have:
+        it pushes one to each."""
+        self.leads = leads
+        if leads:
+            self.followers.forget_routes()
+
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where the target's tracker says it is, if that is news. The next tick takes it in."""
         if pose.target == self.target and self._poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
@@ -147,8 +157,9 @@ class Planner:
         """Bring the tree up to date, push newer routes, tell how we are doing."""
         actions = self._keep_up(now_ns)
         self.followers.drop_silent(now_ns)
-        actions.extend(self._pushes(now_ns))
-        if now_ns >= self._status_due_ns:
+        if self.leads:
+            actions.extend(self._pushes(now_ns))
+        if self.leads and now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + STATUS_NS
             actions.append(self.status(now_ns))
         return actions

@@ -16,6 +16,8 @@ from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.config.agents import agent_of
+from swarm.ranks import job_of
+from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
@@ -44,20 +46,21 @@ class PlannerService:
         stopwatch: Callable[[], int] | None = None,
     ) -> None:
         scenario = setup.scenario
-        self._target = setup.id
+        self._target = job_of(setup.id)
         self._bus = bus
         self._post = post
         self._worker = worker
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters
         self._cost_map = CostMap(terrain)
-        filter = MarkFilter(terrain.grid, readable_for_target(scenario, setup.id))
-        self._untracked = setup.id in scenario.untracked
+        filter = MarkFilter(terrain.grid, readable_for_target(scenario, self._target))
+        self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
         self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role)
         self._planner = Planner(
-            setup.id,
+            self._target,
             setup.incarnation,
             scenario.planner,
             TargetTree(terrain.grid, scenario.planner, terrain.climb),
@@ -66,6 +69,7 @@ class PlannerService:
             route_cells=scenario.vehicles.route_cells,
             stopwatch=stopwatch,
             newest_mark_ns=self._replica.take_newest_stamp_ns,
+            leads=False,
         )
         self._served = False
         self.counters.count("marks_merged", 0)
@@ -75,11 +79,13 @@ class PlannerService:
         self._sync.start(now_ns)
         self._bus.subscribe(SIGHTED if self._untracked else POSE, self._post, target=self._target)
         self._bus.subscribe(FLEET, self._post)
-        self._bus.serve(ROUTE, self._post, target=self._target)
-        self._bus.serve(COST, self._post, target=self._target)
+        self._candidacy.start()
+        self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
+            return
+        if self._candidacy.handle(event, now_ns):
             return
         match event:
             case Heard(message=TargetPose() as pose):
@@ -105,6 +111,7 @@ class PlannerService:
     def tick(self, now_ns: int) -> None:
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
+        self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)
         self._perform(self._planner.tick(now_ns))
         for name in ("marks_merged", "sets_foreign"):
             self.counters.counts[name] = self._replica.counts[name]
@@ -114,8 +121,22 @@ class PlannerService:
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        self._bus.publish(STATUS, self._planner.status(now_ns), target=self._target)
+        self._candidacy.stop()
+        if self._planner.leads:
+            self._bus.publish(STATUS, self._planner.status(now_ns), target=self._target)
         self._member.publish_stats(now_ns)
+
+    def _lead(self, leads: bool, now_ns: int) -> None:
+        """Serve the target, or leave that to another. A query which comes meanwhile is answered all the same."""
+        if leads == self._planner.leads:
+            return
+        self._planner.lead(leads)
+        for topic in (ROUTE, COST):
+            if leads:
+                self._bus.serve(topic, self._post, target=self._target)
+            else:
+                self._bus.unserve(topic, target=self._target)
+        self._candidacy.tell(self._member, now_ns)
 
     def _perform(self, actions: list[Action]) -> None:
         for action in actions:

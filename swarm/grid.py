@@ -16,6 +16,9 @@ TILE_CELLS = 32
 REGION_TILES = 8
 """Side of a region, in tiles. Processes subscribe to positions and marks by region."""
 
+MAX_CELLS = 16384 * 16384
+"""A larger grid is refused wherever one comes from outside."""
+
 STEP_ROW = (-1, -1, 0, 1, 1, 1, 0, -1)
 STEP_COL = (0, 1, 1, 1, 0, -1, -1, -1)
 """Direction codes 0..7, clockwise from north. Odd codes are diagonal."""
@@ -87,6 +90,8 @@ class GridSpec:
     def __post_init__(self) -> None:
         if self.rows < 1 or self.cols < 1:
             raise ValueError(f"a grid needs at least one cell, not {self.rows} x {self.cols}")
+        if self.rows * self.cols > MAX_CELLS:
+            raise ValueError(f"{self.rows} x {self.cols} cells are more than {MAX_CELLS}")
         if not self.resolution_m > 0:
             raise ValueError(f"resolution_m must be positive, not {self.resolution_m}")
 

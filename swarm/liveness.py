@@ -15,11 +15,16 @@ class Peer:
     incarnation: int
 
 
+_MOST_LIVES = 64
+"""Tokens of one process: whoever holds its certificate may raise any number."""
+
+
 class Roster:
     """The peers whose liveliness tokens are up.
 
     A token of a new incarnation may appear before that of the old one falls, so all incarnations of a process are
-    kept, and the order in which tokens come and go does not matter. Repeated and unknown ones change nothing.
+    kept, and the order in which tokens come and go does not matter. Repeated and unknown ones change nothing. Of a
+    process with more than 64 tokens only the newest are.
     """
 
     def __init__(self) -> None:
@@ -32,6 +37,7 @@ class Roster:
         if peer.incarnation not in incarnations:
             incarnations.append(peer.incarnation)
             incarnations.sort()
+            del incarnations[:-_MOST_LIVES]
 
     def gone(self, peer: Peer) -> None:
         """A token has fallen."""

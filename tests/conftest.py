@@ -1,8 +1,22 @@
-"""Order of the tests: those of the network last."""
+"""Order of the tests: those of the network last. `--seeds` lets tests that replay seeded histories run others."""
 
 from __future__ import annotations
 
 import pytest
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--seeds", metavar="A:B", help="these histories instead of the ones that tests name")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    marker = metafunc.definition.get_closest_marker("seeds")
+    if marker is not None:
+        named = metafunc.config.getoption("--seeds")
+        first, _, end = (named or f"0:{marker.args[0]}").partition(":")
+        if not (first.isdecimal() and end.isdecimal() and int(first) < int(end)):
+            raise pytest.UsageError(f"--seeds {named}: expected two numbers A:B with A < B, as in 0:2000")
+        metafunc.parametrize("seed", range(int(first), int(end)))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -7,6 +7,7 @@ import random
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,7 +166,7 @@ class Agent:
         while left_s > 0.0:
             if motion.at_rest:
                 path = self.holdings.path(vehicle.id)
-                if len(path) < 2 or self._steering.closed(path[1]):
+                if len(path) < 2 or not self._steering.passable(path[0], path[1]):
                     return 0.0
                 motion.set_out(path[1])
             before = vehicle.cell
@@ -182,25 +183,25 @@ class Agent:
         return 0.0
 
     def map_changed(self, now_ns: int, *, look: bool = False) -> None:
-        """End routes and paths before cells that are lethal now.
+        """End routes before cells that are lethal now, and paths also before corners that are.
 
         look  another agent changed the map: compare what is in sight with it again
         """
         pace = self._map.pace.reshape(-1)
         for vehicle in self.vehicles.values():
             ahead = vehicle.route.ahead()
-            if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.closed):
+            if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable):
                 vehicle.cut_route(now_ns)
             self._end_path(vehicle)
             if look:
                 self._look_from[vehicle.cell] = None
 
     def _end_path(self, vehicle: Vehicle) -> None:
-        """Give back what lies behind a lethal cell, and that cell."""
+        """Give back what lies behind a step that the map does not allow any more."""
         path = self.holdings.path(vehicle.id)
-        for index, cell in enumerate(path):
-            if index and self._steering.closed(cell):
-                if cell == vehicle.motion.entering:
+        for index, (tail, head) in enumerate(pairwise(path), 1):
+            if not self._steering.passable(tail, head):
+                if head == vehicle.motion.entering:
                     vehicle.motion.turn_back()
                 self.holdings.give_back(vehicle.id, index)
                 return
@@ -351,7 +352,7 @@ class Agent:
         begun = vehicle.give_route(given, path, now_ns)
         if begun is None:
             return []
-        if vehicle.route.cut(self._steering.closed):
+        if vehicle.route.cut(self._steering.passable):
             vehicle.cut_route(now_ns)
         on_route = set(cells)
         if path[-1] not in on_route:  # it was granted cells along another route

@@ -29,7 +29,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         else FilePromiseStore(setup.run_dir / f"promises-{setup.id}")
     )
     network = setup.scenario.network
-    with open_bus(network, authenticator=authenticator_of(network, setup.run_id)) as bus:
+    with open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus:
         inbox = Inbox()
         service = AgentService(setup, terrain, truth, bus, inbox.post, store)
         process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import fcntl
 import os
 import secrets
@@ -10,11 +12,14 @@ from typing import Protocol
 
 import msgspec
 
+from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
 from swarm.wire.messages.traffic import Table
 from vehicle_agent.traffic.right_of_way import OwnRecord
 
-_LARGEST_BYTES = 16 << 20
+_SIZE_BYTES = 1 << 18
+"""Of each of the two files, and at least four times what still counts in them."""
+_HEAD_BYTES = 4
 
 
 class _Record(msgspec.Struct, array_like=True):
@@ -28,10 +33,18 @@ class _Record(msgspec.Struct, array_like=True):
 class PromiseStore(Protocol):
     """own    of the agent itself
     saved  plot -> (promised epoch, stored table)
+    ready  whether all that one event can bring will find space. While it will not, nothing may be promised
+
+    `reserve` tries to get the space that is missing, and returns why it cannot.
     """
 
     own: OwnRecord
     saved: dict[int, tuple[int, Table]]
+
+    @property
+    def ready(self) -> bool: ...
+
+    def reserve(self) -> str | None: ...
 
     def save_own(self, own: OwnRecord) -> None: ...
 
@@ -45,6 +58,13 @@ class MemoryPromiseStore:
         self.own = OwnRecord(disk=disk)
         self.saved: dict[int, tuple[int, Table]] = {}
 
+    @property
+    def ready(self) -> bool:
+        return True
+
+    def reserve(self) -> str | None:
+        return None
+
     def save_own(self, own: OwnRecord) -> None:
         self.own = own
 
@@ -53,8 +73,12 @@ class MemoryPromiseStore:
 
 
 class FilePromiseStore(MemoryPromiseStore):
-    """Appends to a file, and writes it anew when it has grown. What was written survives a kill -9 of the process,
-    not a loss of power: nothing is synced.
+    """Appends to a file, and goes over to a spare one with what still counts when it is full. What was written
+    survives a kill -9 of the process, not a loss of power: nothing is synced.
+
+    Both files have their space beforehand, so that a disk which is full keeps no member from its promises for long,
+    and a life that begins meanwhile from none. A record counts once its length stands before it, which is written
+    last; behind the last record stands a length of 0.
 
     The file is locked for as long as the process lives: so an earlier life that ran on it has ended.
 
@@ -64,6 +88,7 @@ class FilePromiseStore(MemoryPromiseStore):
     def __init__(self, path: Path) -> None:
         super().__init__(secrets.randbits(60))
         self._path = path
+        self._spare_path = path.with_name(f"{path.name}.spare")
         self._encoder = msgspec.msgpack.Encoder()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,8 +98,39 @@ class FilePromiseStore(MemoryPromiseStore):
             raise StoreError(f"{path} is in use: the same agent runs here already; end it first") from error
         except OSError as error:
             raise StoreError(f"cannot open {path}: {error.strerror}") from error
-        self._read()
-        self._rewrite()
+        self._file = self._spare = -1
+        """Open files; -1 is none."""
+        self._at = self._size = self._spare_size = 0
+        """Where the next record begins, and how long the two files are."""
+        if path.exists():
+            self._read()
+        else:
+            self._switch()
+        self.reserve()
+
+    @property
+    def ready(self) -> bool:
+        return self._spare >= 0 or self._size - self._at >= self._size // 2
+
+    def reserve(self) -> str | None:
+        """Make the spare file. Returns the reason if that fails, None if there is one."""
+        if self._spare >= 0:
+            return None
+        size = max(_SIZE_BYTES, 4 * len(self._all()))
+        try:
+            spare = os.open(self._spare_path, os.O_CREAT | os.O_RDWR, 0o600)
+            try:
+                if os.fstat(spare).st_size < size and os.pwrite(spare, bytes(size), 0) != size:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            except OSError:
+                os.close(spare)
+                with contextlib.suppress(OSError):
+                    self._spare_path.unlink()  # half of it is of no use, and somebody else needs the space
+                raise
+        except OSError as error:
+            return f"cannot write {self._spare_path}: {error.strerror}"
+        self._spare, self._spare_size = spare, size
+        return None
 
     def save_own(self, own: OwnRecord) -> None:
         super().save_own(own)
@@ -85,20 +141,21 @@ class FilePromiseStore(MemoryPromiseStore):
         self._append(_Record(promised=promised, table=table))
 
     def close(self) -> None:
-        os.close(self._file)
-        os.close(self._lock)
+        for file in (self._file, self._spare, self._lock):
+            if file >= 0:
+                os.close(file)
 
     def _read(self) -> None:
-        """Take in the records of the file up to the first that was cut short by a kill."""
-        data = self._path.read_bytes() if self._path.exists() else b""
+        """Take in the records of the file, and go on behind them."""
+        data = read_bytes(self._path, FileKind.PROMISES)
         decoder = msgspec.msgpack.Decoder(_Record)
         at = 0
-        while at + 4 <= len(data):
-            end = at + 4 + int.from_bytes(data[at : at + 4], "little")
-            if end > len(data):
-                break
+        while length := int.from_bytes(data[at : at + _HEAD_BYTES], "little"):
+            end = at + _HEAD_BYTES + length
             try:
-                record = decoder.decode(data[at + 4 : end])
+                if end > len(data):
+                    raise ValueError("it ends within a record")
+                record = decoder.decode(data[at + _HEAD_BYTES : end])
             except (msgspec.MsgspecError, ValueError) as error:
                 raise StoreError(f"{self._path} is damaged at byte {at}: {error}") from error
             if record.own is not None:
@@ -106,30 +163,47 @@ class FilePromiseStore(MemoryPromiseStore):
             elif record.table is not None:
                 self.saved[record.table.plot] = (record.promised, record.table)
             at = end
+        try:
+            self._file = os.open(self._path, os.O_RDWR)
+        except OSError as error:
+            raise StoreError(f"cannot write {self._path}: {error.strerror}") from error
+        self._at, self._size = at, len(data)
 
-    def _rewrite(self) -> None:
+    def _all(self) -> bytes:
+        """What still counts, as a file begins with it."""
         records = [_Record(own=self.own)]
         records += [_Record(promised=promised, table=table) for promised, table in self.saved.values()]
-        fresh = self._path.with_suffix(".new")
-        try:
-            fresh.write_bytes(b"".join(map(self._packed, records)))
-            fresh.replace(self._path)
-            self._file = os.open(self._path, os.O_WRONLY | os.O_APPEND)
-        except OSError as error:
-            raise StoreError(f"cannot write {self._path}: {error.strerror}") from error
+        packed = map(self._encoder.encode, records)
+        return b"".join(len(each).to_bytes(_HEAD_BYTES, "little") + each for each in packed)
 
-    def _packed(self, record: _Record) -> bytes:
-        packed = self._encoder.encode(record)
-        return len(packed).to_bytes(4, "little") + packed
+    def _switch(self) -> None:
+        """Go over to the spare file."""
+        why = self.reserve()
+        content = self._all()
+        try:
+            if why is None:
+                os.pwrite(self._spare, content + bytes(_HEAD_BYTES), 0)
+                self._spare_path.replace(self._path)
+        except OSError as error:
+            why = f"cannot write {self._path}: {error.strerror}"
+        if why is not None:
+            raise StoreError(why)
+        if self._file >= 0:
+            os.close(self._file)
+        self._file, self._size, self._at = self._spare, max(self._spare_size, len(content)), len(content)
+        self._spare = -1
 
     def _append(self, record: _Record) -> None:
-        packed = self._packed(record)
+        packed = self._encoder.encode(record)
+        if self._at + len(packed) + 2 * _HEAD_BYTES > self._size:
+            self._switch()  # the record is among what still counts
+            self.reserve()
+            return
         try:
-            # A record in part would hide all that come after it; the process ends, and the next life cuts it off.
-            if os.write(self._file, packed) != len(packed):
-                raise StoreError(f"{self._path}: the disk is full")
-            if os.fstat(self._file).st_size > _LARGEST_BYTES:
-                os.close(self._file)
-                self._rewrite()
+            body = packed + bytes(_HEAD_BYTES)
+            if os.pwrite(self._file, body, self._at + _HEAD_BYTES) != len(body):
+                raise StoreError(f"cannot write {self._path}: {os.strerror(errno.ENOSPC)}")
+            os.pwrite(self._file, len(packed).to_bytes(_HEAD_BYTES, "little"), self._at)
         except OSError as error:
             raise StoreError(f"cannot write {self._path}: {error.strerror}") from error
+        self._at += _HEAD_BYTES + len(packed)

@@ -19,7 +19,7 @@ from swarm.wire.topics import KNOWN, STANDING, STORED, TABLE
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.holdings import Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
-from vehicle_agent.traffic.plots import PLOT_CELLS, Plots
+from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
@@ -32,13 +32,17 @@ _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
 _PROMISE_TIMEOUT_S = 0.5
 _MOST_REFUSALS_TOLD = 100
+_RESERVE_NS = NS_PER_S
+_SILENT_AGAIN_NS = 60 * NS_PER_S
+_WAITING_AGAIN_NS = 10 * NS_PER_S
 
 
 class RightOfWaySync:
     """Carries an agent's right of way.
 
     placed  called with the vehicles that have found their places
-    warn    called with a sentence about what was refused
+    warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait;
+            "promises", for the file of promises
     """
 
     def __init__(
@@ -50,7 +54,7 @@ class RightOfWaySync:
         bus: Bus,
         post: Post,
         placed: Callable[[Sequence[str]], None],
-        warn: Callable[[str], None],
+        warn: Callable[[str, str], None],
     ) -> None:
         plots = Plots(grid, list(spawns))
         self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
@@ -62,12 +66,18 @@ class RightOfWaySync:
         self._warn = warn
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
-        self._near = Interest(grid, _LEAD_CELLS, square_cells=PLOT_CELLS)
+        self._near = Interest(grid, _LEAD_CELLS)
         self._seats = frozenset(plot for plot in range(plots.count) if setup.id in plots.members(plot))
         self._listens_to: frozenset[int] = frozenset()
-        self._ask_due_ns: int | None = None
+        self._asking = False
+        self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
         self._refused: set[str] = set()
+        self._unled_due_ns: dict[int, int] = {}
+        """Plot without a warden -> when that is said again."""
+        self._reserve_due_ns = 0
+        self._told_silent_ns: int | None = None
+        """When it was last said that our seats are silent; None while they are not."""
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role="agent")
@@ -81,6 +91,7 @@ class RightOfWaySync:
     def handle(self, event: Event, now_ns: int) -> bool:
         """True if the event was about right of way."""
         core = self.core
+        core.silent = not self._store.ready
         match event:
             case Heard(message=Standing() as standing):
                 core.hear_standing(standing, now_ns)
@@ -114,26 +125,53 @@ class RightOfWaySync:
         return True
 
     def tick(self, wishes: Mapping[str, Wish], places: Sequence[int], now_ns: int) -> None:
-        if self._ask_due_ns is not None and now_ns >= self._ask_due_ns:
-            self._ask_due_ns = None
+        if not self._asking and not self.core.settled and now_ns >= self._ask_due_ns:
             self._ask_known()
+        self._look_after_store(now_ns)
         holdings = self.core.holdings
         if places:
             holdings.watch(sorted(self._near.update(places)))
         self._listen(self._seats.union(holdings.plots))
         self._perform(self.core.tick(wishes, now_ns))
+        self._tell_unled(now_ns)
+
+    def _tell_unled(self, now_ns: int) -> None:
+        unled = self.core.unled(now_ns)
+        self._unled_due_ns = {plot: self._unled_due_ns.get(plot, now_ns) for plot in unled}
+        for plot, text in unled.items():
+            if now_ns >= self._unled_due_ns[plot]:
+                self._unled_due_ns[plot] = now_ns + _WAITING_AGAIN_NS
+                self._warn("waiting", text)
+
+    def _look_after_store(self, now_ns: int) -> None:
+        """A seat whose promises would not be on file must not act. Say so, and go on when there is space."""
+        if now_ns >= self._reserve_due_ns:
+            self._reserve_due_ns = now_ns + _RESERVE_NS
+            why = self._store.reserve()
+            told = self._told_silent_ns
+            if self._store.ready:
+                if told is not None:
+                    self._told_silent_ns = None
+                    self._warn("promises", "promises can be written again: this agent votes on right of way again")
+            elif told is None or now_ns - told >= _SILENT_AGAIN_NS:
+                self._told_silent_ns = now_ns
+                self._warn("promises", f"{why}; this agent does not vote on right of way until there is space")
+        self.core.silent = not self._store.ready
 
     def _ask_known(self) -> None:
         request = KnownRequest(agent=self._id, disk=self._store.own.disk)
+        self._asking = True
         self._bus.ask(KNOWN, request, self._post, tag="known", timeout_s=_FIRST_ANSWERS_S)
 
     def _known_ended(self, now_ns: int) -> None:
-        """Begin, once all who could be asked have answered; ask on until everybody has noted our file."""
-        if not self.core.holdings.life:
+        """Begin, once all who could be asked have answered and promises can be kept; ask on, ever more rarely, as
+        long as it is needed."""
+        self._asking = False
+        self.core.silent = not self._store.ready
+        if not self.core.holdings.life and not self.core.silent:
             self._perform(self.core.begin(self._chance))
-        if not self.core.settled:
-            self._ask_due_ns = now_ns + self._ask_wait_ns
-            self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
+        self._ask_due_ns = now_ns + self._ask_wait_ns
+        self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
 
     def _listen(self, plots: frozenset[int]) -> None:
         for plot in sorted(plots - self._listens_to):
@@ -180,4 +218,4 @@ class RightOfWaySync:
                 case Refused(text):
                     if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:
                         self._refused.add(text)
-                        self._warn(text)
+                        self._warn("refused", text)

@@ -18,6 +18,7 @@ from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Po
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
+from swarm.ranks import job_of
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
@@ -155,10 +156,10 @@ class AgentService:
                 agent.costs_ended(_number(tag), now_ns)
             case Appeared(peer):
                 self._roster.appeared(peer)
-                agent.set_planners(self._roster.alive("planner"), now_ns)
+                agent.set_planners(self._planners(), now_ns)
             case Disappeared(peer):
                 self._roster.gone(peer)
-                agent.set_planners(self._roster.alive("planner"), now_ns)
+                agent.set_planners(self._planners(), now_ns)
             case _:
                 pass
 
@@ -198,10 +199,10 @@ class AgentService:
             self._agent.place(vehicles)
             log.info("%d vehicles have their places", len(self._agent.vehicles))
 
-    def _warn(self, text: str) -> None:
-        log.warning("refused: %s", text)
-        self.counters.count("refused")
-        self._member.note(self._now_ns, "refused", text)
+    def _warn(self, kind: str, text: str) -> None:
+        log.warning("%s: %s", kind, text)
+        self.counters.count(kind)
+        self._member.note(self._now_ns, kind, text)
 
     def _stand_down(self, now_ns: int) -> None:
         """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""
@@ -223,6 +224,11 @@ class AgentService:
         pose = self._untracked.hear(sighted, now_ns)
         if pose is not None:
             self._agent.set_pose(pose, now_ns)
+
+    def _planners(self) -> dict[str, int]:
+        """Target -> incarnation of its living planner, or of the first of its standbys that lives."""
+        alive = self._roster.alive("planner")
+        return {job_of(id): alive[id] for id in sorted(alive, reverse=True)}
 
     # --- doing what was decided -----------------------------------------------------------------------------
 

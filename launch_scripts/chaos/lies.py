@@ -27,7 +27,10 @@ from swarm.wire.routes import Route, RouteBatch, Routes
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 from swarm.wire.topics import Topic
 
-NAMES = ("t0", "t1", "a0", "a1", "a0-00", "a0-01", "all.a0.1", "a0.1", "all", "0", "agent", "keeper", "x" * 64)
+NAMES = (
+    "t0", "t0.r1", "t1", "a0", "a1", "a0-00", "a0-01", "all.a0.1", "a0.1", "all", "0", "agent", "keeper", "planner",
+    "x" * 64,
+)  # fmt: skip
 ROLES = ("agent", "planner", "keeper", "targets", "monitor", "router")
 _TRIES = 1000
 

@@ -22,10 +22,11 @@ from launch_scripts.chaos.processes import Usage, has_ended, processes, usage
 from launch_scripts.chaos.recovery import Recovery
 from launch_scripts.chaos.stranger import Stranger
 from launch_scripts.chaos.tally import Ended, Outcome, Sample, Tally, name_of
-from launch_scripts.launcher.options import find_scenario, listening, make_run_dir, with_port
+from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
 from launch_scripts.process_table import processes_of
 from launch_scripts.world.referee import Collision, Referee
 from shared_map.terrain.terrain import build_terrain, build_truth
+from swarm.bus.endpoints import listening
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ProtocolError, SwarmError

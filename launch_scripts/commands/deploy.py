@@ -48,6 +48,7 @@ def certs(
     Copy ca.pem and the two files of a name to where it runs. ca.key stays here: who has it can let anybody in.
     """
     from launch_scripts.deploy.certificates import issue
+    from launch_scripts.deploy.revocations import revoked_in
     from launch_scripts.launcher.options import find_scenario
     from launch_scripts.process_table import certificate_names
     from swarm.bus.access_control import ROUTER, bearer, common_name
@@ -58,16 +59,36 @@ def certs(
     wanted = [*given, *(() if scenario is None else certificate_names(chosen))]
     for name in wanted:
         bearer(name)
+    revoked = {*chosen.network.revoked, *revoked_in(folder)}
     for name in dict.fromkeys(wanted):
         if name not in given and (folder / f"{name}.pem").exists():
             continue
         hosts = [host for host in given.get(name, "").split(",") if host]
         if bearer(name).role == ROUTER:
             hosts += _THIS_MACHINE
-        called = common_name(name, chosen.network.revoked)
+        called = common_name(name, revoked)
         path = issue(folder, name, hosts, days, renew=renew and name in given, called=called)
         print(f"{path}, {path.with_suffix('.key')}: {called}, good for {days} days")
     print(f"authority: {folder / 'ca.pem'}; keep {folder / 'ca.key'} to yourself")
+
+
+@app.command()
+def revoke(
+    folder: Annotated[Path, typer.Argument(help="Folder with the certificate of a router.")],
+    names: Annotated[list[str], typer.Argument(help="Names as they stand in the certificates: agent.all.a0~2.")],
+) -> None:
+    """Deny everything to who has these names in a certificate. A running router notices within a second.
+
+    swarm deploy revoke certs agent.all.a0
+
+    adds them to the file `revoked` in the folder. Do so, or copy the file, on every machine with a router. All
+    links of the router end, and are back at once, those of the names with no rights. `swarm deploy certs --renew`
+    makes the next certificate of a name.
+    """
+    from launch_scripts.deploy.revocations import revoke as add
+
+    path = add(folder, names)
+    print(f"revoked, as {path} says: {', '.join(names)}")
 
 
 @app.command()
@@ -96,6 +117,7 @@ def zenohd(
     """
     import msgspec
 
+    from launch_scripts.deploy.revocations import with_revocations
     from launch_scripts.deploy.zenohd import zenohd_config
     from launch_scripts.launcher.options import find_scenario, own_certificate, with_network
     from launch_scripts.process_table import admitting_all
@@ -115,6 +137,7 @@ def zenohd(
         peers=tuple(peer or network.peers),
         tls=own_certificate(network.tls, "router.0"),
     )
+    network = with_revocations(network)
     if network.tls is not None:  # zenohd may run elsewhere than here
         files = (network.tls.ca, network.tls.certificate, network.tls.key)
         ca, certificate, key = (str(Path(file).resolve()) for file in files)

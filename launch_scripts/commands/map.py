@@ -12,6 +12,7 @@ import typer
 from launch_scripts.commands.shared_options import AsJson
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
+from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.wire.messages.marks import MarkSet
@@ -106,11 +107,7 @@ def import_(
     store: Annotated[Path, typer.Argument(help="The store; made if missing.")],
 ) -> None:
     """Import exported marks into a store, where they merge with those it holds. No keeper may use it meanwhile."""
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise StoreError(f"cannot read {file}: {error}") from error
-    terrain, grid, sets = stored_marks.from_json(text)
+    terrain, grid, sets = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
     with KeeperStore(store) as into:
         into.bind(terrain, grid)
         into.save(sets)
@@ -120,7 +117,8 @@ def import_(
 def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
     import numpy as np
     import rasterio
-    from rasterio.errors import CRSError
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import CRSError, RasterioError
     from rasterio.transform import from_origin
 
     pace, kind = stored_marks.to_bands(grid, sets, time.time_ns())
@@ -128,22 +126,25 @@ def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) ->
         crs = rasterio.crs.CRS.from_user_input(grid.crs)
     except CRSError:
         crs = None  # a grid of its own, as synthetic terrain has
-    with rasterio.open(
-        out,
-        "w",
-        driver="GTiff",
-        height=grid.rows,
-        width=grid.cols,
-        count=2,
-        dtype="float32",
-        nodata=np.nan,
-        compress="deflate",
-        crs=crs,
-        transform=from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m),
-    ) as tiff:
-        tiff.write(pace, 1)
-        said = np.where(kind == stored_marks.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
-        tiff.write(said, 2)
-        tiff.set_band_description(1, "pace of marks, s/m; inf lethal; nan as the prior map says")
-        tiff.set_band_description(2, "kind: 0 pace, 1 lethal, 2 clear; nan nothing said")
-        tiff.update_tags(terrain=terrain)
+    try:
+        with rasterio.open(
+            out,
+            "w",
+            driver="GTiff",
+            height=grid.rows,
+            width=grid.cols,
+            count=2,
+            dtype="float32",
+            nodata=np.nan,
+            compress="deflate",
+            crs=crs,
+            transform=from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m),
+        ) as tiff:
+            tiff.write(pace, 1)
+            said = np.where(kind == stored_marks.NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
+            tiff.write(said, 2)
+            tiff.set_band_description(1, "pace of marks, s/m; inf lethal; nan as the prior map says")
+            tiff.set_band_description(2, "kind: 0 pace, 1 lethal, 2 clear; nan nothing said")
+            tiff.update_tags(terrain=terrain)
+    except (RasterioError, CPLE_BaseError) as error:
+        raise StoreError(f"cannot write {out}: {error.__cause__ or error}") from error

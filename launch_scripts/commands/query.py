@@ -164,15 +164,17 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     from swarm.errors import BusError
     from swarm.runtime.inbox import Inbox
     from swarm.wire.messages.planning import PlannerStatus
-    from swarm.wire.messages.processes import Stats
-    from swarm.wire.topics import STATS, STATUS
+    from swarm.wire.messages.processes import Beat, Stats
+    from swarm.wire.topics import LEAD, STATS, STATUS
 
     inbox = Inbox()
     stats: dict[tuple[str, str], Stats] = {}
     planners: dict[str, PlannerStatus] = {}
+    leads: dict[tuple[str, str], bool] = {}
     with open_bus(where.network(tls)) as bus:
         bus.subscribe(STATS, inbox.post)
         bus.subscribe(STATUS, inbox.post)
+        bus.subscribe(LEAD, inbox.post)
         until_s = time.monotonic() + _STATUS_LISTEN_S
         found = ask_run(bus, routers=True)
         while (left_s := until_s - time.monotonic()) > 0:
@@ -181,6 +183,8 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
                     stats[message.role, message.id] = message
                 case Heard(message=PlannerStatus() as message):
                     planners[message.target] = message
+                case Heard(message=Beat() as message):
+                    leads[message.role, message.id] = message.leads
     if not found:
         admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
         raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
@@ -191,11 +195,11 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
     members = [info for info in found if info not in strangers]
     if as_json:
-        fields = _status_fields(members, stats, planners)
+        fields = _status_fields(members, stats, planners, leads)
         fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
         typer.echo(json.dumps(fields, indent=2))
     else:
-        _print_status(members, stats, planners)
+        _print_status(members, stats, planners, leads)
         for info in strangers:
             typer.secho(
                 f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}",
@@ -204,7 +208,10 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
 
 
 def _status_fields(
-    members: list[RunInfo], stats: dict[tuple[str, str], Stats], planners: dict[str, PlannerStatus]
+    members: list[RunInfo],
+    stats: dict[tuple[str, str], Stats],
+    planners: dict[str, PlannerStatus],
+    leads: dict[tuple[str, str], bool],
 ) -> dict[str, Any]:
     import msgspec
 
@@ -217,6 +224,7 @@ def _status_fields(
                 "role": info.role,
                 "id": info.id,
                 "incarnation": info.incarnation,
+                "leads": leads.get((info.role, info.id)),
                 "counts": stats[info.role, info.id].counts if (info.role, info.id) in stats else None,
                 "gauges": stats[info.role, info.id].gauges if (info.role, info.id) in stats else None,
             }
@@ -235,7 +243,10 @@ def _throttled(stats: dict[tuple[str, str], Stats]) -> list[str]:
 
 
 def _print_status(
-    members: list[RunInfo], stats: dict[tuple[str, str], Stats], planners: dict[str, PlannerStatus]
+    members: list[RunInfo],
+    stats: dict[tuple[str, str], Stats],
+    planners: dict[str, PlannerStatus],
+    leads: dict[tuple[str, str], bool],
 ) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -253,7 +264,9 @@ def _print_status(
         counts = stats[info.role, info.id].counts if (info.role, info.id) in stats else {}
         numbers = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
         up_s = (now_ns - info.incarnation) / 1e9
-        crew.add_row(f"{info.role}-{info.id}", f"{up_s:.0f}", *("-" if n is None else str(n) for n in numbers))
+        leading = {True: ", leads", False: ", stands by", None: ""}[leads.get((info.role, info.id))]
+        told = ("-" if n is None else str(n) for n in numbers)
+        crew.add_row(f"{info.role}-{info.id}{leading}", f"{up_s:.0f}", *told)
     console.print(crew)
     for author in _throttled(stats):
         console.print(f"author {author} exceeds its quota; its marks are delayed", style="yellow")

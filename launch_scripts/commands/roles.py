@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.commands.shared_options import Namespace, Runs, Tls, spread
+from launch_scripts.commands.shared_options import Namespace, Rank, Runs, Tls, spread
+from swarm.ranks import ranked_id
 
 if TYPE_CHECKING:
-    from swarm.config.scenario import NetworkConfig
     from swarm.wire.messages.processes import RunInfo
 
 app = typer.Typer()
@@ -86,12 +86,13 @@ def planner(
     target: Annotated[str, typer.Option(help="The target whose tree this planner keeps, such as t0.")],
     part: Part,
     tls: Tls,
+    rank: Rank = 0,
 ) -> None:
-    """Plan for one target.
+    """Plan for one target, or stand by to do so.
 
     swarm planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
-    _run("planner", target, part, tls)
+    _run("planner", ranked_id(target, rank), part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -107,9 +108,9 @@ def agent(
 
 @app.command(rich_help_panel=_PANEL)
 @spread
-def targets(part: Part, tls: Tls) -> None:
-    """Move the simulated targets and referee the run."""
-    _run("targets", "0", part, tls)
+def targets(part: Part, tls: Tls, rank: Rank = 0) -> None:
+    """Move the simulated targets and referee the run, or stand by to do so."""
+    _run("targets", ranked_id("0", rank), part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -127,7 +128,7 @@ def _run(role: str, id: str, part: Place, tls: Tls, *, listen: str | None = None
     from launch_scripts.launcher.lives import next_life
     from launch_scripts.launcher.log_file import log_to
     from launch_scripts.launcher.progress import progress
-    from launch_scripts.launcher.run_terrain import fetch_if_missing
+    from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import ENTRIES, processes_of
     from swarm.errors import ConfigError
@@ -153,7 +154,13 @@ def _run(role: str, id: str, part: Place, tls: Tls, *, listen: str | None = None
     found: list[RunInfo] = []
     run_id = part.run_id if isinstance(part, Part) else None
     if role != "router":
-        found = _found(scenario.network)
+        found = find_members(scenario)
+        if not found and scenario.network.tls is not None:
+            # Denied messages are silent. A router of ours answers everybody that it admits, zenohd does not.
+            logging.getLogger(__name__).warning(
+                "nobody answers, not even a router: does it admit the name in %s?", scenario.network.tls.certificate
+            )
+        found = [info for info in found if info.run_id]
         check_vacant(found, role, id)
         run_id = run_id or (found[0].run_id if found else None)
     run_id = run_id or options.common_run_id(scenario)
@@ -175,18 +182,3 @@ def _check_id(id: str) -> None:
         check_id("--id", id)
     except ValueError as error:
         raise ConfigError(str(error)) from error
-
-
-def _found(network: NetworkConfig) -> list[RunInfo]:
-    """Members of the run in the namespace."""
-    from launch_scripts.launcher.watcher import ask_run
-    from swarm.bus.zenoh_bus import open_bus
-
-    with open_bus(network) as bus:
-        found = ask_run(bus, routers=True)
-    if not found and network.tls is not None:
-        # Denied messages are silent. A router of ours answers everybody that it admits, zenohd does not.
-        logging.getLogger(__name__).warning(
-            "nobody answers, not even a router: does it admit the name in %s?", network.tls.certificate
-        )
-    return [info for info in found if info.run_id]

@@ -10,12 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from swarm.ranks import HIGHEST_RANK
+
 if TYPE_CHECKING:
     from swarm.config.scenario import TlsConfig
 
 Namespace = Annotated[str | None, typer.Option(help="Prefix of all keys: runs in different ones do not meet.")]
 Runs = Annotated[Path, typer.Option(help="Folder in which each run gets a folder of its own.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
+Rank = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        max=HIGHEST_RANK,
+        help="0 leads; 1 stands by and takes over when it is dead; and so on (`standbys`).",
+    ),
+]
 
 
 def spread(command: Callable[..., None]) -> Callable[..., None]:

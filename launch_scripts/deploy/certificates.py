@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import ConfigError, StoreError
 from swarm.wire.fields import check_id
 
@@ -127,10 +128,8 @@ def _general_name(host: str) -> x509.GeneralName:
 
 def _read_authority(folder: Path) -> Authority:
     try:
-        certificate = x509.load_pem_x509_certificate((folder / f"{CA}.pem").read_bytes())
-        key = serialization.load_pem_private_key((folder / f"{CA}.key").read_bytes(), None)
-    except OSError as error:
-        raise StoreError(f"cannot read the authority in {folder}: {error.strerror or error}") from error
+        certificate = x509.load_pem_x509_certificate(read_bytes(folder / f"{CA}.pem", FileKind.CERTIFICATE))
+        key = serialization.load_pem_private_key(read_bytes(folder / f"{CA}.key", FileKind.CERTIFICATE), None)
     except (ValueError, TypeError) as error:
         raise StoreError(f"the authority in {folder} is no certificate and key in PEM: {error}") from error
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():

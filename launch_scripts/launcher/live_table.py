@@ -50,7 +50,7 @@ def plain_line(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], r
 
 def _row(line: TargetLine) -> tuple[str, ...]:
     return (
-        line.id if line.planner_up else f"{line.id} (planner down)",
+        line.title,
         str(line.following),
         "-" if line.nearest_m is None else f"{line.nearest_m:.0f}",
         _count(line.growths),

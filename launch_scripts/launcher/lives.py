@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 from swarm.errors import StoreError
 
 _HIGHEST = 1 << 61
+_DIGITS = 20
 
 
 def next_life(run_dir: Path, role: str, id: str) -> int:
@@ -22,17 +24,19 @@ def next_life(run_dir: Path, role: str, id: str) -> int:
     path = run_dir / "lives" / f"{role}-{id}"
     try:
         path.parent.mkdir(exist_ok=True)
-        with path.open("a+", encoding="ascii") as file:
+        file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+        try:
             fcntl.flock(file, fcntl.LOCK_EX)  # of two that start at once each gets a number of its own
-            file.seek(0)
             last = 0
             with contextlib.suppress(ValueError):  # cut short by a full disk
-                last = min(int(file.read(20) or 0), _HIGHEST)
+                last = min(int(os.pread(file, _DIGITS, 0) or b"0"), _HIGHEST)
             life = max(time.time_ns(), last + 1)
-            file.truncate(0)
-            file.write(str(life))
-            file.flush()
-            os.fsync(file.fileno())
+            # In place and always as long: so a full disk keeps nobody from a second life.
+            if os.pwrite(file, b"%0*d" % (_DIGITS, life), 0) != _DIGITS:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(file)
+        finally:
+            os.close(file)
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     return life

@@ -20,6 +20,7 @@ from pathlib import Path
 
 from launch_scripts.launcher.child import ExitReason, run_child
 from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
+from swarm.errors import StoreError, SwarmError
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -123,8 +124,15 @@ class LocalSwarm:
             if running.process is not None and running.process.exitcode is not None:
                 endings.append(self._ended(running, running.process))
             elif running.due_s is not None and time.monotonic() >= running.due_s:
-                running.restarts += 1
-                self._start(running)
+                try:
+                    self._start(running)
+                    running.restarts += 1
+                except SwarmError as error:  # its folder cannot be written
+                    wait_s = running.backoff.crashed(0.0)
+                    running.due_s = time.monotonic() + wait_s
+                    endings.append(
+                        Ending(running.spec, str(error), error.exit_code, True, wait_s, running.restarts + 1)
+                    )
         return endings
 
     def stop(
@@ -177,7 +185,7 @@ class LocalSwarm:
         now_s = time.monotonic()
         ran_s = now_s - running.began_s
         wait_s: float | None = running.backoff.crashed(ran_s)
-        if reason.refused and self._is_final(running, ran_s, now_s):
+        if reason.refused and self._is_final(running, reason.exit_code, ran_s, now_s):
             wait_s = FINALLY_REFUSED_WAIT_S if running.spec.role in EXPENDABLE else None
         if running.spec.restart != "always":
             wait_s = None
@@ -185,12 +193,13 @@ class LocalSwarm:
             running.due_s = now_s + wait_s
         return Ending(running.spec, reason.sentence, reason.exit_code, reason.refused, wait_s, running.restarts + 1)
 
-    def _is_final(self, running: Running, ran_s: float, now_s: float) -> bool:
+    def _is_final(self, running: Running, exit_code: int, ran_s: float, now_s: float) -> bool:
         """Whether a process that refused to run now would do so again. A refused first start is; a later one may be
-        the network's, so it takes several in a short time."""
+        the network's, so it takes several in a short time. A disk that was written to once is full and will have
+        space again."""
         running.refused_s = [each for each in running.refused_s if now_s - each < REFUSALS_WITHIN_S] + [now_s]
         first = running.restarts == 0 and ran_s < SETTLED_S
-        return first or len(running.refused_s) >= REFUSALS_ALLOWED
+        return first or (exit_code != StoreError.exit_code and len(running.refused_s) >= REFUSALS_ALLOWED)
 
     def _exit_reason(self, running: Running, process: ForkServerProcess) -> ExitReason:
         code = process.exitcode if process.exitcode is not None else 1

@@ -5,14 +5,22 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from datetime import datetime
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 
 MAX_BYTES = 16 << 20
 """A log that is longer is renamed to NAME.1, in the place of the one before, and begun anew."""
-_FORMAT = logging.Formatter(
-    "%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s", datefmt="%Y-%m-%d %H:%M:%S"
-)
+
+
+class _Format(logging.Formatter):
+    """Begins a line with date, time and zone: logs of several machines are read side by side."""
+
+    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802
+        return datetime.fromtimestamp(record.created).astimezone().isoformat(" ", "milliseconds")
+
+
+_FORMAT = _Format("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 
 
 class LogFile(RotatingFileHandler):

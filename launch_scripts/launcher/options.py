@@ -14,6 +14,8 @@ from pathlib import Path
 import msgspec
 
 from launch_scripts.process_table import certificate_name
+from swarm.bus.endpoints import host_port
+from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
@@ -100,6 +102,7 @@ def own_certificate(tls: TlsConfig | None, name: str) -> TlsConfig | None:
         own = file / f"{name}.{suffix}" if file.is_dir() else file
         if not own.is_file():
             raise ConfigError(f"no file {own}, which {name} needs: `swarm deploy certs` makes it")
+        check_bytes(own, FileKind.CERTIFICATE)
         files.append(str(own))
     return TlsConfig(ca=tls.ca, certificate=files[0], key=files[1])
 
@@ -140,21 +143,6 @@ def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
             )
 
 
-def host_port(endpoint: str) -> tuple[str, int]:
-    """Host and port of an endpoint such as tcp/[::1]:7447."""
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
-    return host.strip("[]"), int(port)
-
-
-def listening(endpoint: str) -> bool:
-    """Whether something accepts connections there."""
-    try:
-        with socket.create_connection(host_port(endpoint), timeout=0.5):
-            return True
-    except OSError:
-        return False
-
-
 def _taken(host: str, port: int) -> bool:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -173,7 +161,9 @@ def new_run_id() -> str:
 
 def common_run_id(scenario: Scenario) -> str:
     """Run id derived from the scenario, so that separately started parts agree on it."""
-    same = msgspec.structs.replace(scenario, network=NetworkConfig(), monitor=MonitorConfig())
+    same = msgspec.structs.replace(
+        scenario, network=NetworkConfig(), monitor=MonitorConfig(), seconds=Scenario().seconds
+    )
     digest = hashlib.blake2b(msgspec.json.encode(same, order="deterministic"), digest_size=4).hexdigest()
     return f"{scenario.name}-{digest}"
 

@@ -1,13 +1,22 @@
-"""The router: a Zenoh session in router mode that passes on all messages."""
+"""The router: a Zenoh session in router mode that passes on all messages.
+
+Zenoh reads access control when a session opens, and closes no single link. So when a name is revoked, the router
+opens its session anew: all links end, and whoever is admitted is back within half a second, as after a restart.
+"""
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Callable
 
+from launch_scripts.deploy.revocations import with_revocations
 from launch_scripts.process_table import admitting_all
 from swarm.bus.bus import Bus, Event, Post
-from swarm.bus.zenoh_bus import open_bus
+from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
+from swarm.config.scenario import NetworkConfig
+from swarm.errors import BusError, SwarmError
 from swarm.liveness import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN, Member
@@ -16,16 +25,24 @@ from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.processes import RunInfo
 
+log = logging.getLogger(__name__)
+
+_OPEN_WITHIN_S = 5.0
+
 
 class RouterService:
-    """Belongs to no run, so it may be stopped, started again and replaced while runs go on around it."""
+    """Belongs to no run, so it may be stopped, started again and replaced while runs go on around it.
 
-    def __init__(self, peer: Peer, bus: Bus, post: Post) -> None:
+    reopened  asked at each tick: the bus in place of the one before, which is closed; None: it stays
+    """
+
+    def __init__(self, peer: Peer, bus: Bus, post: Post, reopened: Callable[[], Bus | None] = lambda: None) -> None:
         info = RunInfo(
             run_id=NO_RUN, role=peer.role, id=peer.id, incarnation=peer.incarnation, scenario="", terrain="",
             rows=0, cols=0, resolution_m=0.0, started_ns=peer.incarnation,
         )  # fmt: skip
         self._member = Member(info, bus, post)
+        self._reopened = reopened
 
     @property
     def counters(self) -> Counters:
@@ -38,18 +55,63 @@ class RouterService:
         self._member.handle(event)
 
     def tick(self, now_ns: int) -> None:
+        if (bus := self._reopened()) is not None:
+            self._member.move_to(bus)
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
         self._member.publish_stats(now_ns)
 
 
+class Admission:
+    """The router's session, opened anew whenever the names that are revoked change."""
+
+    def __init__(self, network: NetworkConfig) -> None:
+        self._network = network
+        self._admitting = with_revocations(network)
+        self._failure = ""
+        """Why the file of revoked names could not be read at the last look."""
+        self.bus = open_bus(self._admitting, mode="router")
+
+    def reopened(self) -> ZenohBus | None:
+        """The new session, if one was opened. Where the names cannot be read, those before stay in force."""
+        try:
+            admitting = with_revocations(self._network)
+        except SwarmError as error:
+            if str(error) != self._failure:
+                log.error("%s; the names that were revoked before stay so", error)
+            self._failure = str(error)
+            return None
+        self._failure = ""
+        if admitting == self._admitting:
+            return None
+        log.warning("revoked are now: %s; opening the session anew", ", ".join(admitting.revoked) or "none")
+        self._admitting = admitting
+        self.bus.close()
+        self.bus = self._open()
+        return self.bus
+
+    def _open(self) -> ZenohBus:
+        until_s = time.monotonic() + _OPEN_WITHIN_S
+        while True:
+            try:
+                return open_bus(self._admitting, mode="router")
+            except BusError:  # the port is free only once the last link has ended
+                if time.monotonic() > until_s:
+                    raise
+                time.sleep(0.05)
+
+
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
     clock, inbox = MonotonicClock(), Inbox()
-    with open_bus(admitting_all(setup.scenario).network, mode="router") as bus:
-        service = RouterService(Peer(setup.role, setup.id, setup.incarnation), bus, inbox.post)
+    admission = Admission(admitting_all(setup.scenario).network)
+    try:
+        peer = Peer(setup.role, setup.id, setup.incarnation)
+        service = RouterService(peer, admission.bus, inbox.post, admission.reopened)
         process = Process(service, inbox, clock, tick_hz=2.0)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)
         process.run()
+    finally:
+        admission.bus.close()

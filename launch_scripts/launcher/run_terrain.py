@@ -8,6 +8,7 @@ import logging
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
+from launch_scripts.launcher.watcher import ask_run
 from shared_map.keeper.base_map import NEEDED
 from shared_map.keeper.base_map_transfer import Fetching, fetch_base_map
 from shared_map.terrain.row_bands import Progress, no_progress
@@ -31,6 +32,23 @@ def missing_files(scenario: Scenario) -> list[str]:
     masks = [zone.mask for zone in scenario.cost.zones]
     named = [source, terrain.photo, terrain.labels, *masks]
     return [name for name in named if name is not None and not Path(name).is_file()]
+
+
+def find_members(scenario: Scenario) -> list[RunInfo]:
+    """Members of the run in the namespace, with routers; empty if nobody answers.
+
+    Waits for a router, and for a keeper if files of the terrain are missing here. Says once what it waits for.
+    """
+    missing = missing_files(scenario)
+    said = False
+    with open_bus(scenario.network, patient=True) as bus:
+        while True:
+            found = ask_run(bus, routers=True)
+            if not missing or any(info.role == "keeper" for info in found):
+                return found
+            if not said:
+                said = True
+                log.warning("there is no file %s here: waiting for a keeper, which hands it out", missing[0])
 
 
 def fetch_if_missing(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
-import sys
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -56,9 +56,22 @@ class Terminal:
     def say(self, text: str, style: str | None = None) -> None:
         """Prints one line, above the table if there is one, and logs it."""
         log.info("%s", text)
-        self._console.print(Text(text, style=style or ""))
-        if not self._console.is_terminal:
-            sys.stdout.flush()
+        self.print(Text(text, style=style or ""))
+
+    def print(self, what: Any) -> None:
+        """Prints, if that is possible: a full disk or a reader who has left ends no run."""
+        try:
+            self._console.print(what)
+            self._console.file.flush()
+        except OSError as error:
+            log.warning("cannot write the output: %s", error.strerror or error)
+
+    def print_json(self, text: str) -> None:
+        """Prints the report on standard output."""
+        try:
+            print(text, flush=True)
+        except OSError as error:
+            self.say(f"cannot write the output: {error.strerror or error}", "red")
 
     def due(self) -> bool:
         """Whether it is time to show the next summary."""
@@ -72,10 +85,11 @@ class Terminal:
             self.say(plain_line(summary, processes, restarts))
             return
         table = live_table(summary, processes, restarts, title)
-        if self._live is None:
-            self._live = Live(table, console=self._console, auto_refresh=False, transient=False)
-            self._live.start()
-        self._live.update(table, refresh=True)
+        with contextlib.suppress(OSError):  # of a terminal that is gone
+            if self._live is None:
+                self._live = Live(table, console=self._console, auto_refresh=False, transient=False)
+                self._live.start()
+            self._live.update(table, refresh=True)
 
     def report(self, numbers: Mapping[str, Any]) -> None:
         """Prints the numbers of a finished run."""
@@ -83,12 +97,13 @@ class Terminal:
         for name, value in numbers.items():
             if name in REPORTED:
                 table.add_row(REPORTED[name], _plain(value))
-        self._console.print(table)
+        self.print(table)
 
     def close(self) -> None:
         """Ends the live table and leaves its last state on the terminal."""
         if self._live is not None:
-            self._live.stop()
+            with contextlib.suppress(OSError):
+                self._live.stop()
             self._live = None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import math
 import os
 import signal
 import time
@@ -19,12 +20,11 @@ from launch_scripts.launcher.options import (
     as_process,
     check_ports,
     common_run_id,
-    listening,
     make_run_dir,
     new_run_id,
 )
 from launch_scripts.launcher.progress import progress
-from launch_scripts.launcher.run_terrain import fetch_if_missing, missing_files
+from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
@@ -34,16 +34,19 @@ from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
 from swarm.bus.bus import Bus
+from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import Scenario
-from swarm.errors import BusError, StoreError, SwarmError
+from swarm.errors import BusError, ConfigError, StoreError, SwarmError
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
 
-PRELOAD = ("launch_scripts.launcher.warm_kernels",)
+_WARM_ROLES = "launch_scripts.launcher.warm_roles"
+_WARM_KERNELS = "launch_scripts.launcher.warm_kernels"
 
 _TURN_S = 0.05
 _LISTEN_WITHIN_S = 20.0
@@ -57,6 +60,7 @@ class UpOptions:
     """Options of a run.
 
     joins      there is a router elsewhere: none is started here
+    rank       of planners and the targets process, start only those of this rank; if None all
     run_id     the run to take part in; if None it is made or found
     began_s    time.monotonic() at which the command was given
     table      other processes than the scenario's
@@ -66,11 +70,11 @@ class UpOptions:
     runs: Path
     roles: tuple[str, ...] = ROLES
     joins: bool = False
+    rank: int | None = None
     run_id: str | None = None
     as_json: bool = False
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
-    preload: tuple[str, ...] = PRELOAD
     table: tuple[ProcessSpec, ...] | None = None
 
 
@@ -116,7 +120,7 @@ class _StopAsked:
 
 def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
-    for spec in options.table or processes_of(options.scenario, options.roles):
+    for spec in _table(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     if not options.joins:
         check_ports(options.scenario, options.roles)
@@ -127,18 +131,28 @@ def run_swarm(options: UpOptions) -> int:
     return _Run(options, run_id, run_dir).run()
 
 
+def _table(options: UpOptions) -> list[ProcessSpec]:
+    """The processes to start here. Raises ConfigError if there are none."""
+    table = list(options.table or processes_of(options.scenario, options.roles, options.rank))
+    if not table:
+        of_rank = "" if options.rank is None else f" of rank {options.rank}"
+        raise ConfigError(
+            f"scenario {options.scenario.name} has no {' or '.join(options.roles)}{of_rank}; see standbys"
+        )
+    return table
+
+
 def _run_id(options: UpOptions) -> str:
     """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario."""
+    found: list[RunInfo] = []
+    if options.joins:
+        log_to(None)  # it may have to wait, and says so
+        found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
     if options.run_id is not None:
         return options.run_id
-    if set(ROLES[1:]) <= set(options.roles):
+    if set(ROLES[1:]) <= set(options.roles) and options.rank is None:
         return new_run_id()
-    if options.joins:
-        with open_bus(as_process(options.scenario, LAUNCHER, "0").network) as bus:
-            found = ask_run(bus)
-        if found:
-            return found[0].run_id
-    return common_run_id(options.scenario)
+    return found[0].run_id if found else common_run_id(options.scenario)
 
 
 class _Run:
@@ -152,15 +166,14 @@ class _Run:
         self._started_ns = time.time_ns()
         self._terminal = Terminal(options.as_json, options.plain)
         self._stop_asked = _StopAsked()
-        specs = list(options.table or processes_of(self._scenario, options.roles))
-        self._swarm = LocalSwarm(specs, self._setup_of, run_dir)
+        self._swarm = LocalSwarm(_table(options), self._setup_of, run_dir)
         self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
 
     def run(self) -> int:
         # One thread each: the processes share the cores already, and idle threads make a fork unsafe.
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
-        warm_up = WarmUp(list(self._options.preload))
+        warm_up = WarmUp([_WARM_KERNELS if "planner" in self._options.roles else _WARM_ROLES])
         warm_up.begin()
         with self._stop_asked.interrupting():
             self._terrain, self._truth = self._prepared()
@@ -175,8 +188,9 @@ class _Run:
         try:
             if not self._options.joins and "router" in self._options.roles:
                 self._swarm.start("router")
-                self._wait("waiting for the router to listen", self._router_listens, _LISTEN_WITHIN_S)
-                log.info("the router listens")
+            within_s = math.inf if self._options.joins else _LISTEN_WITHIN_S
+            self._wait("waiting for the router to listen", self._router_listens, within_s)
+            log.info("the router listens")
             if self._stop_asked:
                 return 0 if not self._swarm.stop() else 1
             with open_bus(self._scenario.network) as bus:
@@ -208,8 +222,7 @@ class _Run:
     def _prepared(self) -> tuple[Terrain, Floats]:
         """Builds the terrain from its files, or fetches it from a keeper where one is missing and a swarm runs."""
         if self._options.joins and missing_files(self._scenario):
-            with open_bus(self._scenario.network) as bus:
-                found = ask_run(bus)
+            found = [info for info in find_members(self._scenario) if info.run_id]
             with progress() as tell:
                 fetch_if_missing(self._scenario, self._run_dir, found, roles=self._options.roles, progress=tell)
             setup = self._setup_of(ProcessSpec(LAUNCHER, "0", ""))
@@ -242,7 +255,7 @@ class _Run:
 
     def _router_listens(self, timeout_s: float) -> bool:
         self._raise_refusals(self._swarm.poll())
-        if all(listening(endpoint) for endpoint in self._scenario.network.connect):
+        if any(map(listening, self._scenario.network.connect)):
             return True
         time.sleep(timeout_s)
         return False
@@ -338,7 +351,7 @@ class _Run:
         )
         numbers = {name: value for name, value in report.items() if name != "series"}
         if self._options.as_json:
-            print(json.dumps(numbers, indent=2))
+            self._terminal.print_json(json.dumps(numbers, indent=2))
         else:
             self._terminal.report(numbers)
         # The figures come first: a full disk keeps nobody from them.

@@ -32,8 +32,7 @@ def summary_markdown(setup: RoleSetup, summary: LiveSummary) -> str:
         nearest = "–" if line.nearest_m is None else f"{line.nearest_m / 1000:.1f} km"
         growth = "–" if line.growth_ms is None else f"{line.growth_ms:.1f} ms"
         gap = "–" if line.gap is None else f"{max(line.gap - 1, 0) * 100:.2f} %"
-        id = line.id if line.planner_up else f"{line.id} (planner gone)"
-        lines.append(f"| {id} | {line.following} | {nearest} | {growth} | {gap} | {line.captures} |")
+        lines.append(f"| {line.title} | {line.following} | {nearest} | {growth} | {gap} | {line.captures} |")
     if len(summary.targets) > _SHOWN_TARGETS:
         lines.append(f"\n{len(summary.targets) - _SHOWN_TARGETS} more targets")
     return "\n".join(lines)

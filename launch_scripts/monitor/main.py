@@ -29,7 +29,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
     inbox = Inbox()
     with contextlib.ExitStack() as stack:
-        bus = stack.enter_context(open_bus(setup.scenario.network))
+        bus = stack.enter_context(open_bus(setup.scenario.network, patient=True))
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
         sinks = Sinks(recording_id, path, config, make_blueprint(mesh))
         stack.callback(sinks.close)

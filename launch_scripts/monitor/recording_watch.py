@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -44,7 +46,7 @@ class RecordingWatch:
         if now_ns >= self._retry_ns:
             self._retry_ns = now_ns + int(RETRY_S * NS_PER_S)
             try:
-                can_write(self._path.parent, SPACE_BYTES)
+                check_space(self._path.parent)
                 self._path = new_recording_path(self._path.parent)
             except (OSError, StoreError):
                 pass
@@ -69,7 +71,16 @@ class RecordingWatch:
         self._ended_ns = now_ns
         why = "it does not grow"
         try:
-            can_write(self._path.parent, SPACE_BYTES)
+            check_space(self._path.parent)
         except OSError as error:
             why = error.strerror or str(error)
         return f"the recording {self._path} has ended: {why}; another begins when there is space"
+
+
+def check_space(folder: Path) -> None:
+    """Raises OSError if there is no space for a recording. It is tried by writing, as there are quotas and limits
+    that nothing else shows; but only where that does not fill the disk for everybody else meanwhile."""
+    left = os.statvfs(folder)
+    if left.f_bavail * left.f_frsize < 2 * SPACE_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    can_write(folder, SPACE_BYTES)

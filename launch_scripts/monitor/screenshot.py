@@ -15,7 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from launch_scripts.monitor.web import LOOPBACK, viewer_program
+from launch_scripts.monitor.loopback_guard import LOOPBACK
+from launch_scripts.monitor.web import viewer_program
 
 T = TypeVar("T")
 _START_WITHIN_S = 30.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import secrets
 import socket
 import threading
 import time
@@ -14,7 +15,9 @@ from typing import Any, TypeVar
 import rerun as rr
 import rerun.blueprint as rrb
 
-from launch_scripts.monitor.web import LOOPBACK, ViewerPage
+from launch_scripts.monitor.loopback_guard import LOOPBACK
+from launch_scripts.monitor.stream_gate import StreamGate
+from launch_scripts.monitor.web import ViewerPage
 from swarm.config.scenario import MonitorConfig
 from swarm.errors import BusError, StoreError
 
@@ -71,15 +74,18 @@ class Sinks:
         self.stream_url: str | None = None
         """Address for a native viewer."""
         self._page: ViewerPage | None = None
+        self._gate: StreamGate | None = None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         if path is not None:
             sinks.append(rr.FileSink(path, write_footer=True))
         if config.live:
-            grpc_port = _when_free(_free_port, config.grpc_port, "grpc_port")
-            self.stream_url = stream_url = f"rerun+http://{LOOPBACK}:{grpc_port}/proxy"
+            behind = _hidden_address()
+            self._gate = _when_free(lambda port: StreamGate(port, behind), config.grpc_port, "grpc_port")
+            threading.Thread(target=self._gate.serve_forever, name="stream-gate", daemon=True).start()
+            self.stream_url = stream_url = f"rerun+http://{LOOPBACK}:{self._gate.port}/proxy"
             page = _when_free(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
             self._page = page
-            sinks.append(rr.GrpcServerSink(bind_ip=LOOPBACK, port=grpc_port, server_memory_limit=_MEMORY))
+            sinks.append(rr.GrpcServerSink(bind_ip=behind[0], port=behind[1], server_memory_limit=_MEMORY))
         self.rec.set_sinks(*sinks, default_blueprint=blueprint)
 
     @property
@@ -110,6 +116,9 @@ class Sinks:
             log.warning("the recording was not written to the end within %.0f s", within_s)
         if self._page is not None:
             self._page.close()
+        if self._gate is not None:
+            self._gate.shutdown()
+            self._gate.server_close()
 
     def _flush(self, within_s: float) -> None:
         for stream in reversed(self.streams.streams):
@@ -133,8 +142,13 @@ def _when_free(listen: Callable[[int], T], port: int, name: str) -> T:
         time.sleep(0.1)
 
 
-def _free_port(wanted: int) -> int:
+def _hidden_address() -> tuple[str, int]:
+    """An address on loopback that nobody guesses, if the system has more than one there."""
+    host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(254) + 1}.{secrets.randbelow(254) + 1}"
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind((LOOPBACK, wanted))
-        return int(probe.getsockname()[1])
+        try:
+            probe.bind((host, 0))
+        except OSError:
+            probe.bind((LOOPBACK, 0))
+        address, port = probe.getsockname()
+        return str(address), int(port)

@@ -11,22 +11,21 @@ import importlib.util
 import logging
 import os
 import socket
-import socketserver
 import subprocess
 import sys
 import threading
 import time
 import urllib.parse
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from launch_scripts.monitor import die_with_parent
+from launch_scripts.monitor.loopback_guard import LOOPBACK, BoundedServer, refusal
 from swarm.errors import StoreError
 
 log = logging.getLogger(__name__)
 
-LOOPBACK = "127.0.0.1"
 _FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/sw.js")
 _READY_WITHIN_S = 20.0
 _HEADERS = {
@@ -36,6 +35,8 @@ _HEADERS = {
         f"style-src 'self' 'unsafe-inline'; worker-src 'self' blob:; connect-src 'self' http://{LOOPBACK}:*"
     ),
     "Cache-Control": "no-cache",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "X-Frame-Options": "DENY",
     "X-Content-Type-Options": "nosniff",
 }
 
@@ -54,13 +55,13 @@ class ViewerPage:
         self._fetching = threading.Lock()
         query = {"url": stream_url, "theme": "dark", "hide_welcome_screen": "1"}
         self._entrance = "/?" + urllib.parse.urlencode(query)
-        self._server = _Server((LOOPBACK, port), _Handler)
+        self._server = _Server(port, _Handler)
         self._server.page = self
         threading.Thread(target=self._server.serve_forever, name="viewer-page", daemon=True).start()
 
     @property
     def url(self) -> str:
-        return f"http://{LOOPBACK}:{self._server.server_address[1]}/"
+        return f"http://{LOOPBACK}:{self._server.port}/"
 
     def close(self) -> None:
         self._server.shutdown()
@@ -80,21 +81,20 @@ class ViewerPage:
         return self._files.get(path)
 
 
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
+class _Server(BoundedServer):
+    lasts_s = 120.0  # the page has 40 MB, and a tunnel may be slow
     page: ViewerPage
-
-    def server_bind(self) -> None:
-        socketserver.TCPServer.server_bind(self)  # HTTPServer's asks the name service who 127.0.0.1 is
-        self.server_name, self.server_port = LOOPBACK, int(self.server_address[1])
 
 
 class _Handler(BaseHTTPRequestHandler):
     server: _Server
-    timeout = 60.0
+    timeout = 60.0  # for the head of a request, and for all of an answer
 
     def do_GET(self) -> None:
+        headers = {name.lower(): value for name, value in self.headers.items()}
+        if len(self.headers.get_all("host", [])) > 1 or refusal(headers) is not None:
+            self.send_error(403, "only pages of this machine are served")
+            return
         path, _, query = self.path.partition("?")
         entrance = None if query else self.server.page.entrance(path)
         if entrance is not None:

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.liveness import Peer
+from swarm.ranks import HIGHEST_RANK, ranked_id, split_rank
 from swarm.runtime.stats import Histogram, merged
 from swarm.wire.fields import column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.processes import Beat, Stats
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 from swarm.wire.statements import MarkKind
@@ -55,6 +56,8 @@ class Observed:
         self._messages_before: dict[tuple[str, str, int], int] = {}
         self._fleets: dict[tuple[str, int], Fleet] = {}
         self._marks: dict[tuple[str, int], MarkSet] = {}
+        self._ranks: dict[tuple[str, str], int] = {}
+        """(role, job) -> rank of the process that leads, where there are standbys."""
         self._alive: dict[tuple[str, str], set[int]] = {}
         self._incarnations: dict[tuple[str, str], set[int]] = {}
 
@@ -68,12 +71,11 @@ class Observed:
                 self._messages_before.setdefault(key, message.counts.get("messages_out", 0))
                 self._seen(message.role, message.id, message.incarnation)
             case PlannerStatus():
-                status = self.status.get(message.target)
-                if status is None or (message.incarnation, message.stamp_ns) >= (
-                    status.incarnation,
-                    status.stamp_ns,
-                ):
-                    self.status[message.target] = message
+                # Only the planner that leads tells one, and a standby that takes over may be the older process.
+                self.status[message.target] = message
+            case Beat(leads=True):
+                job, rank = split_rank(message.id)
+                self._ranks[message.role, job] = rank
             case Fleet():
                 fleet = self._fleets.get((message.author, message.region))
                 if fleet is None or message.seq >= fleet.seq:
@@ -105,8 +107,13 @@ class Observed:
         """(role, id) of all processes which are alive now."""
         return sorted(key for key, incarnations in self._alive.items() if incarnations)
 
-    def is_up(self, role: str, id: str) -> bool:
-        return bool(self._alive.get((role, id)))
+    def is_up(self, role: str, job: str) -> bool:
+        """Whether the process with this job or one of its standbys is alive."""
+        return any(self._alive.get((role, ranked_id(job, rank))) for rank in range(HIGHEST_RANK + 1))
+
+    def rank(self, role: str, job: str) -> int:
+        """Rank of the process that leads."""
+        return self._ranks.get((role, job), 0)
 
     @property
     def processes(self) -> int:

@@ -21,15 +21,16 @@ from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
+from swarm.ranks import ranked_id
 from swarm.runtime.stats import Histogram
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
-from swarm.wire.topics import FLEET, FOLLOWED, MARKS, NOTE, POSE, STATS, STATUS, Topic
+from swarm.wire.topics import FLEET, FOLLOWED, LEAD, MARKS, NOTE, POSE, STATS, STATUS, Topic
 
-RECORDED_TOPICS: tuple[Topic, ...] = (STATS, STATUS, FLEET, POSE, NOTE, FOLLOWED, MARKS)
+RECORDED_TOPICS: tuple[Topic, ...] = (STATS, STATUS, LEAD, FLEET, POSE, NOTE, FOLLOWED, MARKS)
 
 _TRACK_NS = NS_PER_S // 2
 _SAMPLE_NS = NS_PER_S
@@ -65,16 +66,29 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class TargetLine:
-    """One row of the live table. `nearest_m` is the distance of the nearest vehicle."""
+    """One row of the live table.
+
+    planner_up  whether its planner or one of its standbys is alive
+    rank        of the planner that leads; 0 unless a standby does
+    nearest_m   distance of the nearest vehicle
+    """
 
     id: str
     planner_up: bool
+    rank: int
     following: int
     nearest_m: float | None
     growths: int | None
     growth_ms: float | None
     gap: float | None
     captures: int
+
+    @property
+    def title(self) -> str:
+        """The id, and what is unusual about its planner."""
+        if not self.planner_up:
+            return f"{self.id} (planner down)"
+        return f"{self.id} (standby {self.rank})" if self.rank else self.id
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +257,7 @@ class Recorder:
         return TargetLine(
             id=id,
             planner_up=observed.is_up("planner", id),
+            rank=observed.rank("planner", id),
             following=sum(1 for vehicle in vehicles.values() if vehicle.target == id),
             nearest_m=nearest_m,
             growths=None if status is None else status.growths + status.window_growths,
@@ -349,11 +364,12 @@ def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
 
 def _expected(scenario: Scenario) -> list[tuple[str, str]]:
     """(role, id) of the processes that a complete run has; "" stands for any id."""
+    targets = scenario.target_ids
     driven = any(target.is_simulated for target in scenario.targets)
     return [
         ("keeper", ""),
         *([("targets", "")] if driven else []),
-        *(("planner", id) for id in scenario.target_ids),
+        *(("planner", ranked_id(id, rank)) for rank in range(scenario.standbys.planner + 1) for id in targets),
         *(("agent", plan.id) for plan in plan_agents(scenario)),
     ]
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -62,19 +64,27 @@ def _draw(
 ) -> None:
     from launch_scripts.report.picture import save_picture  # matplotlib takes a moment
 
-    partial = path.with_name(path.name + ".part")
     try:
-        save_picture(partial, recorder, report, terrain, truth)
-        partial.replace(path)
+        with _replacing(path) as partial:
+            save_picture(partial, recorder, report, terrain, truth)
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Replaces a file atomically."""
-    partial = path.with_name(path.name + ".part")
-    with partial.open("wb") as file:
+    with _replacing(path) as partial, partial.open("wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-    partial.replace(path)
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """A file to write which then takes the place of another. Half a one is removed: a full disk needs the space."""
+    partial = path.with_name(path.name + ".part")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)

@@ -34,10 +34,11 @@ class Partition:
 
 @dataclass(frozen=True, slots=True)
 class Crash:
-    """Kills a process as kill -9 does. It starts again after a backoff."""
+    """Kills a process as kill -9 does. It starts again after a backoff, or never, as if its machine was lost."""
 
     at_s: float
     node: str
+    for_good: bool = False
 
 
 @dataclass(frozen=True, slots=True)

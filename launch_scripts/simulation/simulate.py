@@ -105,12 +105,14 @@ class Simulation:
     def run_until(self, seconds: float) -> None:
         self.scheduler.run_until(EPOCH_NS + int(seconds * NS_PER_S))
 
-    def crash(self, name: str) -> None:
+    def crash(self, name: str, *, for_good: bool = False) -> None:
         """Kills a node now, and starts it again after its backoff."""
         node = self.nodes[name]
         if node.bus is None:
             return
         node.crash()
+        if for_good:
+            return
         backoff_s = min(BACKOFF_S * 2 ** (node.crashes - 1), 10.0)
         self.scheduler.after(int(backoff_s * NS_PER_S), node.boot)
 
@@ -168,7 +170,7 @@ class Simulation:
     def _plan_faults(self) -> None:
         plan = self.faults
         for crash in plan.crashes:
-            self._at(crash.at_s, lambda name=crash.node: self.crash(name))  # type: ignore[misc]
+            self._at(crash.at_s, lambda each=crash: self.crash(each.node, for_good=each.for_good))  # type: ignore[misc]
         for hang in plan.hangs:
             self._at(hang.from_s, self.nodes[hang.node].hang)
             self._at(hang.until_s, self.nodes[hang.node].wake)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from launch_scripts.world.service import TargetsService
+from launch_scripts.world.service import TICK_HZ, TargetsService
 from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -12,15 +12,13 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
 
-TICK_HZ = 10.0
-
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Moves all targets of the scenario until SIGTERM, SIGINT or the end of the launcher."""
     terrain = load_terrain(setup)
     truth = load_truth(setup, terrain)
     inbox = Inbox()
-    with open_bus(setup.scenario.network) as bus:
+    with open_bus(setup.scenario.network, patient=True) as bus:
         service = TargetsService(setup, terrain, truth, bus, inbox.post)
         process = Process(service, inbox, MonotonicClock(), TICK_HZ)
         process.stop_on_signals()

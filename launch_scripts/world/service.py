@@ -11,13 +11,17 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import ids_of
+from swarm.liveness import Roster
+from swarm.ranks import job_of
+from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import COST, FLEET, POSE, STATUS, TRUE_POSE
+from swarm.wire.topics import COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
 
+TICK_HZ = 10.0
 _ASK_NS = NS_PER_S // 2
 _ASK = "where"
 
@@ -33,7 +37,9 @@ class TargetsService:
         self._bus = bus
         self._post = post
         self._ask_due_ns = 0
-        self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation)
+        self._candidacy = Candidacy(setup, setup.scenario.standbys.targets, TICK_HZ, bus, post)
+        self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation, leads=self._candidacy.leads)
+        self._planners = Roster()
         self.counters = self._member.counters
         for name in ("captures", "collisions", "lethal_entries", "poses"):
             self.counters.count(name, 0)
@@ -44,12 +50,13 @@ class TargetsService:
         self._bus.subscribe(STATUS, self._post)
         self._bus.watch_alive(self._post, role="planner")
         for target in self._scenario.targets:
-            if not target.is_simulated:
+            if not target.is_simulated or self._scenario.standbys.targets:
                 for id in ids_of(target):
-                    self._bus.subscribe(POSE, self._post, target=id)
+                    self._bus.subscribe(self._topic(id), self._post, target=id)
+        self._candidacy.start()
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if self._member.handle(event):
+        if self._member.handle(event) or self._candidacy.handle(event, now_ns):
             return
         match event:
             case Heard(message=Fleet() as fleet):
@@ -59,31 +66,41 @@ class TargetsService:
             case Replied(message=CostReply() as reply):
                 self._world.hear_planner(reply.target, reply.target_cell)
             case Appeared(peer):
-                self._world.planner_up(peer.id, True)
+                self._planners.appeared(peer)
+                self._world.planner_up(job_of(peer.id), True)
             case Disappeared(peer):
-                self._world.planner_up(peer.id, False)
+                self._planners.gone(peer)
+                left = {job_of(id) for id in self._planners.alive(peer.role)}
+                self._world.planner_up(job_of(peer.id), job_of(peer.id) in left)
             case Heard(message=TargetPose() as pose):
-                self._world.hear_pose(pose)
+                self._world.hear_pose(pose, now_ns)
             case _:
                 pass
 
     def tick(self, now_ns: int) -> None:
-        if self._world.listening and now_ns >= self._ask_due_ns:
+        leads = self._candidacy.tick(self._world.ready, now_ns)
+        if leads != self._world.leads:
+            self._world.lead(leads)
+            self._candidacy.tell(self._member, now_ns)
+        if leads and self._world.listening and now_ns >= self._ask_due_ns:
             self._ask_due_ns = now_ns + _ASK_NS
             self._bus.ask(COST, CostRequest(), self._post, tag=_ASK)
         self._perform(self._world.tick(now_ns), now_ns)
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
+        self._candidacy.stop()
         self._member.publish_stats(now_ns)
+
+    def _topic(self, target: str) -> Topic:
+        return TRUE_POSE if target in self._scenario.untracked else POSE
 
     def _perform(self, actions: list[Action], now_ns: int) -> None:
         for action in actions:
             match action:
                 case Publish(pose):
                     self.counters.count("poses")
-                    topic = TRUE_POSE if pose.target in self._scenario.untracked else POSE
-                    self._bus.publish(topic, pose, target=pose.target)
+                    self._bus.publish(self._topic(pose.target), pose, target=pose.target)
                 case Captured(target, vehicle, cell):
                     self.counters.count("captures")
                     self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell)

@@ -19,6 +19,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
+from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.wire.fields import column
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
@@ -31,6 +32,8 @@ PATIENCE_NS = 5 * NS_PER_S
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
+_MOST_COUNTED = 1 << 32
+"""Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,18 +71,30 @@ class TargetWorld:
 
     An incarnation that starts while planners run goes on where they last saw the targets. A capture counts once:
     a target that jumps is out of reach for a cool-down, one that stays must first have been alone for another.
+
+    leads  false for a standby, which follows the poses that another tells and does nothing itself
     """
 
     def __init__(
-        self, scenario: Scenario, terrain: Terrain, truth_s_per_m: NDArray[np.float32], incarnation: int
+        self,
+        scenario: Scenario,
+        terrain: Terrain,
+        truth_s_per_m: NDArray[np.float32],
+        incarnation: int,
+        *,
+        leads: bool = True,
     ) -> None:
+        self.leads = leads
         self._grid = terrain.grid
         # A target keeps to cells where a vehicle fits, by the truth and by the prior map: others are out of reach.
         halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
         pace = np.where(terrain.lethal, np.float32(np.inf), inflate(truth_s_per_m, halves))
         self._terrain = TrueTerrain(terrain.grid, pace.astype(np.float32))
         self._referee = Referee(np.isfinite(truth_s_per_m))
-        self._incarnation = incarnation
+        self._own_incarnation = self._incarnation = incarnation
+        # Of the poses of simulated targets that others tell: which are news, and the highest incarnation.
+        self._poses = Newest(silence_ns=POSE_SILENCE_NS)
+        self._others_incarnation = 0
         self._capture_range_m = scenario.vehicles.capture_range_m
         self._time_scale = scenario.time_scale
         self._started_ns: int | None = None
@@ -102,6 +117,22 @@ class TargetWorld:
         walker = Walker(id, config.walk, slowness_of(config, scenario.cost), chance, cell)
         return _Target(config, walker, *self._grid.centre_m(cell))
 
+    def lead(self, leads: bool) -> None:
+        """Take over where the poses of the one before ended, or leave it to another.
+
+        The poses told from now on supersede those: an incarnation above theirs. One that leaves no room above it is
+        no process's; what follows it is heard once it has been silent.
+        """
+        self.leads = leads
+        self._started_ns = None
+        above = self._others_incarnation + 1
+        self._incarnation = max(self._own_incarnation, above if above < 1 << 62 else 0)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it is known where all simulated targets are."""
+        return all(target.placed for target in self._targets.values() if target.config.is_simulated)
+
     def hear_planner(self, id: str, cell: int | None) -> None:
         """Places a target where its planner last saw it, once; None if the planner does not know."""
         target = self._targets.get(id)
@@ -123,16 +154,30 @@ class TargetWorld:
         """Whether a planner may still answer where an unplaced target was."""
         return any(not t.placed and not t.unheard_of and t.config.is_simulated for t in self._targets.values())
 
-    def hear_pose(self, pose: TargetPose) -> None:
-        """Takes the pose of an external target."""
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
+        """Takes the pose of an external target; as a standby also where whoever leads has moved one of ours."""
         target = self._targets.get(pose.target)
-        if target is not None and not target.config.is_simulated and 0 <= pose.cell < self._grid.cells:
+        if target is None or not 0 <= pose.cell < self._grid.cells:
+            return
+        if target.config.is_simulated:
+            number = (pose.incarnation, pose.seq)
+            lethal = self._terrain.lethal(pose.cell)
+            if self.leads or lethal or not self._poses.is_news(pose.target, number, now_ns):
+                return
+            self._others_incarnation = max(self._others_incarnation, pose.incarnation)
+            if pose.captures > target.captures:
+                target.calm_until_ns = now_ns + _cool_down_ns(target)
+            if max(pose.captures, pose.jumps) < _MOST_COUNTED:
+                target.captures, target.jumps = pose.captures, pose.jumps
+        if pose.cell != target.walker.cell or not target.config.is_simulated:
             target.walker.put(pose.cell)
-            target.x_m, target.y_m = pose.x_m, pose.y_m
-            target.placed = True
+        target.x_m, target.y_m = pose.x_m, pose.y_m
+        target.placed = True
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
         actions: list[Action] = list(self._referee.hear(fleet))
+        if not self.leads:
+            return []
         for index, vehicle in self._catchers(fleet):
             id = fleet.target_ids[index]
             actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
@@ -140,6 +185,8 @@ class TargetWorld:
 
     def tick(self, now_ns: int) -> list[Action]:
         """Moves all targets and returns their poses."""
+        if not self.leads:
+            return []
         if self._started_ns is None:
             self._started_ns = self._ticked_ns = now_ns
         elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * self._time_scale
@@ -201,9 +248,9 @@ class TargetWorld:
 
     def _reached(self, id: str, target: _Target, vehicle: str, now_ns: int) -> list[Action]:
         calm = now_ns >= target.calm_until_ns
-        jumps = target.config.caught == "jump" and target.config.is_simulated
+        jumps = _jumps(target)
         if calm or not jumps:
-            target.calm_until_ns = now_ns + (JUMP_COOL_DOWN_NS if jumps else STAY_COOL_DOWN_NS)
+            target.calm_until_ns = now_ns + _cool_down_ns(target)
         if not calm:
             return []
         target.captures += 1
@@ -215,3 +262,11 @@ class TargetWorld:
         walker = target.walker
         walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, walker.chance))
         return [captured, Publish(self._pose(id, target, now_ns))]
+
+
+def _jumps(target: _Target) -> bool:
+    return target.config.caught == "jump" and target.config.is_simulated
+
+
+def _cool_down_ns(target: _Target) -> int:
+    return JUMP_COOL_DOWN_NS if _jumps(target) else STAY_COOL_DOWN_NS

@@ -27,4 +27,13 @@ def read_routes(tree: CostToGoTree, bounds: LowerBounds, asked: NDArray[np.int64
     whole = price_routes(tree.cost, tree.offset, root, metres, walks[1:], statuses, bound, prices)
     if not whole:
         raise AssertionError("a route does not end at the target: the tree is broken")
+    if max_cells and grid.config.length_weight:
+        # The tree's cost of what is cut off holds a price of its length; only driving it tells the time it takes.
+        ends = grid.walk(tree.parent, root, starts, 0, grid.cell_cost)
+        of_whole = np.empty_like(prices)
+        price_routes(tree.cost, tree.offset, root, metres, ends[1:], statuses, bound, of_whole)
+        known = np.isfinite(prices[0])
+        given_s = prices[0, known] - prices[3, known]
+        prices[0, known] = of_whole[0, known]
+        prices[3, known] = np.maximum(of_whole[0, known] - given_s, 0.0)
     return RouteBatch(statuses, asked, walks.directions, walks.ends, *prices)

@@ -6,7 +6,12 @@ whose number says that it is compacted, and at which replicas forget that author
 
 A compacted set has a number between those of the author: it replaces the set which it was made of, and no newer
 one. So two keepers may compact with different knowledge: whichever compacted set stays, no winner was dropped. The
-store keeps what was dropped for a while, and puts it back if a newer set retracts what had overruled it.
+store keeps what was dropped for good.
+
+The law: the compacted sets of a tile are a function of its whole sets, dropped statements included, and of which
+authors are dead. Whenever either changes, or may have changed unseen, the tile is due. So a statement is missing
+from the map only as long as a newer lasting one of a dead author stands there: should that author turn out to live,
+what it had overruled is put back, before it can take anything back.
 """
 
 from __future__ import annotations
@@ -25,57 +30,56 @@ from swarm.wire.statements import FOREVER, TILE_AREA, MarkKind
 class CompactionPlan:
     """Which authors are dead, and which tiles may have something to compact. Core: time is an argument.
 
-    after_ns  an author of which nothing was heard for so long counts as dead. If it lives after all, it hears the
-              compacted sets, and states everything again under a higher epoch
+    after_ns   an author of which nothing was heard for so long counts as dead. If it lives after all, it hears the
+               compacted sets, and states everything again under a higher epoch
+    set_aside  tiles of which something was dropped before: whom an earlier life of the keeper took for dead is
+               forgotten, so they are due
     """
 
-    def __init__(self, after_ns: int, started_ns: int) -> None:
+    def __init__(self, after_ns: int, started_ns: int, set_aside: Iterable[int] = ()) -> None:
         self._after_ns = after_ns
         self._started_ns = started_ns
         self._heard_ns: dict[str, int] = {}  # author -> when it was heard last, of those that are not dead
-        self._gone: set[str] = set()  # dead authors whose tiles were due since they died
-        self._due: dict[int, bool] = {}  # tile to compact -> whether what was dropped there may count again
-        self._begun = False  # whether we have listened for `after_ns`
+        self._gone: set[str] = set()  # authors of sets that were dead at the last update
+        self._due: dict[int, None] = dict.fromkeys(set_aside)  # tiles to compact, in order
         self._expiries_ns: dict[int, int] = {}  # tile -> when the next statement of a dead author can be dropped
 
     def heard(self, author: str, now_ns: int) -> None:
         """An author lives."""
         self._heard_ns[author] = now_ns
 
-    def is_gone(self, author: str, now_ns: int) -> bool:
-        """Whether an author counts as dead."""
-        return now_ns - self._heard_ns.get(author, self._started_ns) > self._after_ns
+    def is_gone(self, author: str) -> bool:
+        """Whether an author counts as dead since the last update."""
+        return author not in self._heard_ns
 
     def accepted(self, mark_set: MarkSet) -> None:
         """A set was merged: a dead author's may need compaction, or retract what had overruled others."""
-        if mark_set.author not in self._heard_ns:
-            self._due[mark_set.tile] = True
+        if self.is_gone(mark_set.author) or mark_set.author in self._gone:
+            self._due[mark_set.tile] = None
 
     def update(self, ledger: Ledger, now_ns: int) -> None:
-        """Find the authors that died since the last call, and make their tiles due."""
+        """Find the authors that died, or turned out to live, since the last call, and make their tiles due."""
         self._heard_ns = {a: when for a, when in self._heard_ns.items() if now_ns - when <= self._after_ns}
-        gone = {author for author in ledger.authors if self.is_gone(author, now_ns)}
-        for rows in ledger.held(sorted(gone - self._gone)).values():
-            for tile in np.frombuffer(rows, DIGEST_ROW)["tile"].tolist():
-                # One more dead author overrules more, never less, so what was dropped stays dropped. Only of what
-                # was dropped before we began this is not known.
-                self._due[tile] = self._due.get(tile, not self._begun)
-        self._begun = self._begun or now_ns - self._started_ns > self._after_ns
+        gone = {author for author in ledger.authors if self.is_gone(author)}
+        for rows in ledger.held(sorted(gone ^ self._gone)).values():
+            self._due.update(dict.fromkeys(np.frombuffer(rows, DIGEST_ROW)["tile"].tolist()))
         self._gone = gone
         for tile in [tile for tile, expiry_ns in self._expiries_ns.items() if now_ns > expiry_ns]:
             del self._expiries_ns[tile]
-            self._due[tile] = True
+            self._due[tile] = None
 
-    def take_due(self, at_most: int, now_ns: int) -> dict[int, bool]:
-        """Tiles to compact now, and whether with what was dropped there before."""
+    def take_due(self, at_most: int, now_ns: int) -> list[int]:
+        """Tiles to compact now."""
         if now_ns - self._started_ns <= self._after_ns:
-            return {}  # not heard for long enough to know which authors are dead
-        return {tile: self._due.pop(tile) for tile in list(self._due)[:at_most]}
+            return []  # not heard for long enough to know which authors are dead
+        tiles = list(self._due)[:at_most]
+        for tile in tiles:
+            del self._due[tile]
+        return tiles
 
-    def put_off(self, tiles: Mapping[int, bool]) -> None:
+    def put_off(self, tiles: Iterable[int]) -> None:
         """These tiles could not be compacted: they are due again."""
-        for tile, dropped_too in tiles.items():
-            self._due[tile] = dropped_too or self._due.get(tile, False)
+        self._due.update(dict.fromkeys(tiles))
 
     def compacted(self, tile: int, left: Iterable[MarkSet], now_ns: int) -> None:
         """A tile was compacted.
@@ -172,11 +176,13 @@ def _replacing(held: MarkSet | None, complete: MarkSet, left: Statements) -> Mar
     """The set to publish instead of `held`; None if that is right already, or no number is left."""
     if held is None and not len(left.cells):
         return None
-    same = held is not None and held.kinds and np.array_equal(statements(held).cells, left.cells)
-    if same and held is not None and (held.epoch, base_seq(held.seq)) == (complete.epoch, base_seq(complete.seq)):
-        return None
     newest = complete if held is None else max(held, complete, key=lambda each: (each.epoch, each.seq))
     seq = newest.seq + 1
     if seq % SEQ_STEP == 0:
         return None
+    if seq % SEQ_STEP == SEQ_STEP - 1:
+        left = statements(complete)  # under the last number all is put back, as nothing could be after it
+    same = held is not None and held.kinds and np.array_equal(statements(held).cells, left.cells)
+    if same and held is not None and (held.epoch, held.seq) == (complete.epoch, complete.seq):
+        return None  # under a lower number than it had before, others would take it for superseded
     return mark_set(complete.author, complete.group, complete.tile, newest.epoch, seq, left)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +23,31 @@ FORMAT = "swarm-map/1"
 NOTHING_SAID_BAND = 255
 
 
+class _Mark(msgspec.Struct, array_like=True, gc=False):
+    row: int
+    col: int
+    kind: Literal["pace", "lethal", "clear"]
+    pace: float | None
+    stamp_ns: int
+    until_ns: int = FOREVER
+
+
+class _Set(msgspec.Struct):
+    author: str
+    group: str
+    tile: int
+    epoch: int
+    seq: int
+    marks: list[_Mark]
+
+
+class _Export(msgspec.Struct):
+    format: Literal["swarm-map/1"]
+    terrain: str
+    grid: GridSpec
+    sets: list[_Set]
+
+
 def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
     """Every set, readable: [row, col, kind, pace or null, stamp_ns] and, where it ends by itself, when."""
     listed = [
@@ -35,7 +61,9 @@ def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet]) -> str:
         }
         for each in sorted(sets, key=lambda each: (each.tile, each.author))
     ]
-    return json.dumps({"format": FORMAT, "terrain": terrain, "grid": asdict(grid), "sets": listed}, indent=1)
+    lines = ",\n ".join(json.dumps(each) for each in listed)  # a line a set; a line a mark takes thrice that
+    head = json.dumps({"format": FORMAT, "terrain": terrain, "grid": asdict(grid)})
+    return f'{head[:-1]},\n"sets": [\n {lines}\n]}}\n'
 
 
 def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
@@ -58,43 +86,38 @@ def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
     return marks
 
 
-def from_json(text: str) -> tuple[str, GridSpec, list[MarkSet]]:
+def from_json(text: str | bytes) -> tuple[str, GridSpec, list[MarkSet]]:
     """(terrain, grid, sets). Raises StoreError with the place of what is wrong."""
-    where = "file"
     try:
-        read = json.loads(text)
-        if read.get("format") != FORMAT:
-            raise ValueError(f"format is {read.get('format')!r}, expected {FORMAT!r}")
-        where = "grid"
-        grid = GridSpec(**read["grid"])
-        terrain = str(read["terrain"])
-        sets = []
-        for number, each in enumerate(read["sets"]):
-            where = f"sets[{number}]"
-            sets.append(_set(each, grid))
-    except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError) as error:
-        reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise StoreError(f"not an exported map: {where}: {reason}") from error
-    return terrain, grid, sets
+        read = msgspec.json.decode(text, type=_Export)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise StoreError(f"not an exported map: file: {error}") from error
+    sets = []
+    for number, each in enumerate(read.sets):
+        try:
+            sets.append(_set(each, read.grid))
+        except (ValueError, TypeError, OverflowError) as error:
+            raise StoreError(f"not an exported map: sets[{number}]: {error}") from error
+    return read.terrain, read.grid, sets
 
 
-def _set(each: dict[str, Any], grid: GridSpec) -> MarkSet:
-    marks = sorted(each["marks"], key=lambda mark: (mark[0], mark[1]))
+def _set(each: _Set, grid: GridSpec) -> MarkSet:
+    marks = sorted(each.marks, key=lambda mark: (mark.row, mark.col))
     for mark in marks:
-        if not grid.inside(mark[0], mark[1]):
-            raise ValueError(f"row {mark[0]}, col {mark[1]} is not in {grid.rows} x {grid.cols}")
-    cells = np.array([row * grid.cols + col for row, col, *_ in marks], np.int64)
+        if not grid.inside(mark.row, mark.col):
+            raise ValueError(f"row {mark.row}, col {mark.col} is not in {grid.rows} x {grid.cols}")
+    cells = np.array([mark.row * grid.cols + mark.col for mark in marks], np.int64)
     tiles, inner = tile_cells(grid, cells)
-    if (tiles != each["tile"]).any():
-        raise ValueError(f"a mark lies outside tile {each['tile']}")
+    if (tiles != each.tile).any():
+        raise ValueError(f"a mark lies outside tile {each.tile}")
     said = Statements(
         inner,
-        np.array([MarkKind[mark[2].upper()] for mark in marks], np.uint8),
-        np.array([mark[3] or 0.0 for mark in marks], np.float32),
-        np.array([mark[4] for mark in marks], np.int64),
-        np.array([mark[5] if len(mark) > 5 else FOREVER for mark in marks], np.int64),
+        np.array([MarkKind[mark.kind.upper()] for mark in marks], np.uint8),
+        np.array([mark.pace or 0.0 for mark in marks], np.float32),
+        np.array([mark.stamp_ns for mark in marks], np.int64),
+        np.array([mark.until_ns for mark in marks], np.int64),
     )
-    made = mark_set(each["author"], each["group"], each["tile"], each["epoch"], each["seq"], said)
+    made = mark_set(each.author, each.group, each.tile, each.epoch, each.seq, said)
     reason = fault(made, grid)
     if reason is not None:
         raise ValueError(reason)

@@ -34,7 +34,7 @@ def run(
         store_path = setup.run_dir / ("map.sqlite" if setup.id == "0" else f"map-{setup.id}.sqlite")
     with (
         KeeperStore(store_path or ":memory:", rebuild=rebuild) as store,
-        open_bus(setup.scenario.network) as bus,
+        open_bus(setup.scenario.network, patient=True) as bus,
     ):
         inbox = Inbox()
         service = KeeperService(setup, terrain, bus, inbox.post, store)

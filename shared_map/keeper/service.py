@@ -31,7 +31,6 @@ _NOTE_AGAIN_NS = 60 * NS_PER_S
 _NAME_AT_MOST = 16
 _COMPACT_EVERY_NS = NS_PER_S
 _COMPACT_TILES = 16
-_SWEEP_EVERY_NS = 600 * NS_PER_S
 
 
 class KeeperService:
@@ -64,10 +63,8 @@ class KeeperService:
         )
         config = setup.scenario.map
         self._compact_after_ns = int(config.compact_after_s * NS_PER_S)
-        self._compact_keep_ns = int(config.compact_keep_s * NS_PER_S)
         self._plan = CompactionPlan(self._compact_after_ns, 0)
         self._compact_due_ns = 0
-        self._sweep_due_ns = 0
         for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged"):
             self.counters.count(name, 0)
         self._save_due_ns = 0
@@ -83,7 +80,7 @@ class KeeperService:
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._base_map.start(self._bus)
-        self._plan = CompactionPlan(self._compact_after_ns, now_ns)
+        self._plan = CompactionPlan(self._compact_after_ns, now_ns, self._store.tiles_set_aside())
         self._sync.start(now_ns)
         self._bus.subscribe(SIGHTED, self._post)
         log.info("keeper started: %d tiles in store %s", len(self.replica.held.tiles), self._store.path)
@@ -110,7 +107,7 @@ class KeeperService:
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]
         self.counters.counts["sets_refused"] = counts["sets_refused"]
-        self.counters.gauge("sets_waiting", float(len(self._keeper.waiting)))
+        self.counters.gauge("sets_waiting", float(self._keeper.waiting))
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
@@ -154,20 +151,16 @@ class KeeperService:
         tiles = plan.take_due(_COMPACT_TILES, now_ns)
         compacted: list[MarkSet] = []
         try:
-            for tile, dropped_too in tiles.items():
+            for tile in tiles:
                 sets = self.replica.held.of_tile(tile)
-                dropped = self._store.set_aside(tile) if dropped_too else {}
-                names = {*dropped, *(each.author for each in sets)}
-                gone = {name for name in names if plan.is_gone(name, now_ns)}
+                dropped = self._store.set_aside(tile)
+                gone = {name for name in (*dropped, *(each.author for each in sets)) if plan.is_gone(name)}
                 new = compact(sets, dropped, gone, now_ns - self._compact_after_ns)
                 left = {each.author: each for each in sets if each.author in gone}
                 plan.compacted(tile, (left | {each.author: each for each in new}).values(), now_ns)
                 compacted.extend(new)
             if compacted:
                 self._store.save(compacted, now_ns)
-            if now_ns >= self._sweep_due_ns:
-                self._sweep_due_ns = now_ns + _SWEEP_EVERY_NS
-                self._store.forget_set_aside(now_ns - self._compact_keep_ns)
         except StoreError as error:
             plan.put_off(tiles)
             self._compact_due_ns = now_ns + 10 * _COMPACT_EVERY_NS
@@ -180,22 +173,21 @@ class KeeperService:
 
     def _save(self, now_ns: int) -> None:
         """Commit what waits. If the disk refuses, say so once, go on serving and try again."""
-        waiting = self._keeper.waiting
-        if not waiting:
-            return
         try:
-            self._store.save(waiting, now_ns)
+            for batch in self._keeper.batches():
+                self._store.save(batch, now_ns)
+                self._keeper.saved(batch)
+                self.counters.count("sets_saved", len(batch))
         except StoreError as error:
             self.counters.count("saves_failed")
             self._save_due_ns = now_ns + _RETRY_NS
             if self._noted_ns is None or now_ns - self._noted_ns >= _NOTE_AGAIN_NS:
                 self._noted_ns = now_ns
-                log.error("%s; %d sets wait, serving goes on", error, len(waiting))
-                self._member.note(now_ns, "store", f"{error}; {len(waiting)} sets wait, serving goes on")
+                text = f"{error}; {self._keeper.waiting} sets wait, serving goes on"
+                log.error("%s", text)
+                self._member.note(now_ns, "store", text)
             return
         if self._noted_ns is not None:
             self._noted_ns = None
             log.info("the store can be written again")
             self._member.note(now_ns, "store", f"the store {self._store.path} can be written again")
-        self._keeper.saved(waiting)
-        self.counters.count("sets_saved", len(waiting))

@@ -16,6 +16,7 @@ from urllib.parse import quote
 from shared_map.keeper.compaction import united, without
 from shared_map.replication.digest import Ledger
 from shared_map.replication.marks import base_seq, is_tombstone
+from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
@@ -26,6 +27,12 @@ log = logging.getLogger(__name__)
 
 STORE_VERSION = "2"
 _MEMORY = ":memory:"
+_LOG_BYTES = 1 << 20
+"""How far SQLite's write-ahead log grows beside the store, give or take one batch."""
+BATCH_BYTES = 1 << 19
+"""Marks of one commit, about."""
+_LONGEST_VALUE_BYTES = 16 << 20
+"""No message is larger, so no column of a row is."""
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS sets (
@@ -81,6 +88,8 @@ class KeeperStore:
         self.path = Path(path)
         self._lock: IO[bytes] | None = None
         in_memory = str(path) == _MEMORY
+        if not in_memory and self.path.is_file():
+            check_bytes(self.path, FileKind.STORE)
         if read_only:
             self._db = _open_to_read(self.path)
             return
@@ -140,13 +149,12 @@ class KeeperStore:
         """Author -> what was dropped from its set of this tile, under the number of its last compacted set."""
         return {each.author: each for each in self._sets("FROM folded WHERE tile = ?", tile)}
 
-    def forget_set_aside(self, before_ns: int) -> None:
-        """Delete what compaction set aside before this time."""
+    def tiles_set_aside(self) -> list[int]:
+        """Tiles of which compaction dropped something, in order."""
         try:
-            with self._db:
-                self._db.execute("DELETE FROM folded WHERE since_ns < ?", (before_ns,))
+            return [row[0] for row in self._db.execute("SELECT DISTINCT tile FROM folded ORDER BY tile")]
         except sqlite3.Error as error:
-            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+            raise StoreError(_damaged(self.path, str(error))) from error
 
     def _sets(self, where: str, *values: object) -> Iterator[MarkSet]:
         try:
@@ -234,6 +242,10 @@ class KeeperStore:
             self._lock = None
 
 
+def _bytes_of(of: MarkSet) -> int:
+    return 200 + sum(len(column) for column in (of.cells, of.kinds, of.paces, of.stamps_ns, of.untils_ns))
+
+
 def _row(of: MarkSet) -> tuple[object, ...]:
     return tuple(getattr(of, field) for field in _FIELDS)
 
@@ -246,6 +258,11 @@ def _open(path: str) -> sqlite3.Connection:
     try:
         db.execute("PRAGMA journal_mode = WAL")
         db.execute("PRAGMA synchronous = FULL")
+        # What is committed is taken over from the log as soon as it has so many pages, and the log's file is cut to
+        # that then: otherwise a small disk is full of its log for good.
+        db.execute(f"PRAGMA wal_autocheckpoint = {_LOG_BYTES // 4096}")
+        db.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE_BYTES)
         found = [row[0] for row in db.execute("PRAGMA quick_check(1)")]
         if found != ["ok"]:
             raise StoreError(_damaged(path, found[0] if found else "no answer from quick_check"))
@@ -328,9 +345,22 @@ class Keeper:
         self._waiting[mark_set.tile, mark_set.author] = mark_set
 
     @property
-    def waiting(self) -> list[MarkSet]:
-        """Sets to save."""
-        return list(self._waiting.values())
+    def waiting(self) -> int:
+        """How many sets are to be saved."""
+        return len(self._waiting)
+
+    def batches(self) -> Iterator[list[MarkSet]]:
+        """The sets to save, as many at a time as one commit should hold."""
+        batch: list[MarkSet] = []
+        held = 0
+        for each in list(self._waiting.values()):
+            batch.append(each)
+            held += _bytes_of(each)
+            if held >= BATCH_BYTES:
+                yield batch
+                batch, held = [], 0
+        if batch:
+            yield batch
 
     def saved(self, sets: Iterable[MarkSet]) -> None:
         """These sets are on the disk, or their tombstones deleted what was there."""

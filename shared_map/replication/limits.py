@@ -14,15 +14,24 @@ MAX_SETS = 1 << 18
 MAX_MARKS = 1 << 23
 """Statements in all; 15 bytes each, 23 where some of the set expire."""
 _PART = 4
-"""No author may fill more than one part in this many of either."""
+"""No process may fill more than one part in this many of any of these."""
+
+_MAX_WAITING = 1 << 14
+"""Sets of throttled processes that wait, in all. What finds no place is asked for again once a digest names it."""
 
 _BURST_S = 10
 _FORGET_NS = 60 * NS_PER_S
 _SPEAKS_NS = _BURST_S * NS_PER_S
 
 
+def owner_of(author: str) -> str:
+    """The process that an author is a life of. Its certificate lets it write under any number of lives, so what an
+    author may cost is what its process may cost."""
+    return author.rpartition(".")[0] or author
+
+
 class Capacity:
-    """Counts the sets and statements held, in all and by author; refuses a set which would exceed a bound.
+    """Counts the sets and statements held, in all and by process; refuses a set which would exceed a bound.
 
     Which sets are refused depends on what came first, so replicas are equal only within the bounds. The bounds
     limit what a hostile author can cost to some 330 MB.
@@ -34,7 +43,7 @@ class Capacity:
         self.sets = 0
         self.marks = 0
         self._max_sets, self._max_marks = max_sets, max_marks
-        self._authors: dict[str, list[int]] = {}  # author -> [sets, marks], of those that hold any
+        self._owners: dict[str, list[int]] = {}  # process -> [sets, marks], of those that hold any
 
     def take(self, new: MarkSet, old: MarkSet | None, *, own: bool = False) -> bool:
         """Count `new` instead of `old`; False, and nothing changes, if that exceeds a bound. A set which takes no
@@ -42,7 +51,8 @@ class Capacity:
 
         own  no bound applies
         """
-        held = self._authors.get(new.author) or [0, 0]
+        owner = owner_of(new.author)
+        held = self._owners.get(owner) or [0, 0]
         sets, marks = 1, len(new.kinds)
         if old is not None:
             sets, marks = 0, marks - len(old.kinds)
@@ -55,14 +65,15 @@ class Capacity:
                 return False
         held[0] += sets
         held[1] += marks
-        self._authors[new.author] = held
+        self._owners[owner] = held
         self.sets += sets
         self.marks += marks
         return True
 
     def take_all(self, author: str, sets: int, marks: int) -> bool:
         """As `take` of so many sets which replace none; False, and nothing changes, if all exceed a bound."""
-        held = self._authors.get(author) or [0, 0]
+        owner = owner_of(author)
+        held = self._owners.get(owner) or [0, 0]
         if (
             self.sets + sets > self._max_sets
             or held[0] + sets > self._max_sets // _PART
@@ -70,24 +81,25 @@ class Capacity:
             or held[1] + marks > self._max_marks // _PART
         ):
             return False
-        self._authors[author] = [held[0] + sets, held[1] + marks]
+        self._owners[owner] = [held[0] + sets, held[1] + marks]
         self.sets += sets
         self.marks += marks
         return True
 
     def free(self, old: MarkSet) -> None:
         """`old` is held no more."""
-        held = self._authors[old.author]
+        owner = owner_of(old.author)
+        held = self._owners[owner]
         held[0] -= 1
         held[1] -= len(old.kinds)
         self.sets -= 1
         self.marks -= len(old.kinds)
         if held == [0, 0]:
-            del self._authors[old.author]
+            del self._owners[owner]
 
     def full_for(self, author: str) -> bool:
         """Whether an author's set of one more tile could exceed a bound, were it to cover every cell."""
-        sets, marks = self._authors.get(author, (0, 0))
+        sets, marks = self._owners.get(owner_of(author), (0, 0))
         return (
             self.sets >= self._max_sets
             or self.marks + TILE_AREA > self._max_marks
@@ -97,11 +109,11 @@ class Capacity:
 
 
 class Quota:
-    """Token buckets of changed marks, for each author and for all of them together. Time is an argument.
+    """Token buckets of changed marks, for each process that writes and for all together. Time is an argument.
 
-    An author whose bucket is empty waits. While the shared bucket is empty, authors above their share wait too:
-    each author heard in the last ten seconds has an equal share of the total rate. An author below its share is
-    never delayed, whatever the others do. Of a waiting author the newest set of each tile is kept, and let in once
+    A process whose bucket is empty waits. While the shared bucket is empty, those above their share wait too: each
+    that was heard in the last ten seconds has an equal share of the total rate. One below its share is never
+    delayed, whatever the others do. Of who waits the newest set of each tile and author is kept, and let in once
     its buckets have filled: it is late, but not lost.
     """
 
@@ -109,26 +121,33 @@ class Quota:
         self._author_rate = author_marks_per_s
         self._total_rate = total_marks_per_s
         self._total = _Bucket(total_marks_per_s * _BURST_S, 0)
-        self._authors: dict[str, _Author] = {}
-        self._waiting: dict[str, dict[int, MarkSet]] = {}  # author -> tile -> newest set, next author first
+        self._owners: dict[str, _Budget] = {}
+        # Process -> (tile, author) -> newest set; the process whose turn is next comes first.
+        self._waiting: dict[str, dict[tuple[int, str], MarkSet]] = {}
+        self._waiting_sets = 0
         self._speaking = 1  # authors heard lately, counted at `_counted_ns`
         self._counted_ns = -NS_PER_S
 
     def admits(self, mark_set: MarkSet, now_ns: int) -> bool:
-        """Whether a set may be merged now; if not, it waits here."""
-        author = mark_set.author
-        if author not in self._waiting and self._may(author, now_ns):
+        """Whether a set may be merged now; if not, it waits here, while there is a place for it."""
+        owner = owner_of(mark_set.author)
+        if owner not in self._waiting and self._may(owner, now_ns):
             return True
-        waiting = self._waiting.setdefault(author, {})
-        held = waiting.get(mark_set.tile)
+        waiting = self._waiting.get(owner, {})
+        at = (mark_set.tile, mark_set.author)
+        held = waiting.get(at)
+        if held is None and (len(waiting) >= _MAX_WAITING // _PART or self._waiting_sets >= _MAX_WAITING):
+            return False
         if held is None or (mark_set.epoch, mark_set.seq) >= (held.epoch, held.seq):
-            waiting[mark_set.tile] = mark_set
+            self._waiting_sets += held is None
+            waiting[at] = mark_set
+            self._waiting[owner] = waiting
         return False
 
     def charge(self, author: str, marks: int, now_ns: int) -> None:
         """Merging a set of this author changed so many cells; a set that changes none costs as much as one."""
         cost = max(marks, 1)
-        each = self._filled(author, now_ns)
+        each = self._filled(owner_of(author), now_ns)
         each.heard_ns = now_ns
         each.own.left -= cost
         if self._total_rate < math.inf:
@@ -137,36 +156,37 @@ class Quota:
             self._total.left = max(self._total.left - cost, -self._total_rate * _BURST_S)
 
     def due(self, now_ns: int) -> MarkSet | None:
-        """A set which has waited long enough; None if there is none. Waiting authors take turns."""
-        for author, waiting in self._waiting.items():
-            if self._may(author, now_ns):
+        """A set which has waited long enough; None if there is none. Those that wait take turns."""
+        for owner, waiting in self._waiting.items():
+            if self._may(owner, now_ns):
                 mark_set = waiting.pop(next(iter(waiting)))
-                del self._waiting[author]
+                self._waiting_sets -= 1
+                del self._waiting[owner]
                 if waiting:
-                    self._waiting[author] = waiting  # to the end of the queue
+                    self._waiting[owner] = waiting  # to the end of the queue
                 return mark_set
         return None
 
     @property
     def throttled(self) -> list[str]:
-        """Authors whose sets wait now."""
+        """Processes whose sets wait now."""
         return sorted(self._waiting)
 
     def forget(self, now_ns: int) -> None:
-        """Drop the buckets of authors that were silent for a minute: they are full again."""
-        for author, each in list(self._authors.items()):
-            if now_ns - each.heard_ns > _FORGET_NS and author not in self._waiting:
-                del self._authors[author]
+        """Drop the buckets of those that were silent for a minute: they are full again."""
+        for owner, each in list(self._owners.items()):
+            if now_ns - each.heard_ns > _FORGET_NS and owner not in self._waiting:
+                del self._owners[owner]
 
-    def _may(self, author: str, now_ns: int) -> bool:
-        each = self._filled(author, now_ns)
+    def _may(self, owner: str, now_ns: int) -> bool:
+        each = self._filled(owner, now_ns)
         return each.own.left > 0 and (self._total.left > 0 or each.share.left > 0)
 
-    def _filled(self, author: str, now_ns: int) -> _Author:
-        each = self._authors.get(author)
+    def _filled(self, owner: str, now_ns: int) -> _Budget:
+        each = self._owners.get(owner)
         if each is None:
             own, share = self._author_rate * _BURST_S, self._share(now_ns) * _BURST_S
-            each = self._authors[author] = _Author(_Bucket(own, now_ns), _Bucket(share, now_ns), now_ns)
+            each = self._owners[owner] = _Budget(_Bucket(own, now_ns), _Bucket(share, now_ns), now_ns)
         each.own.fill(self._author_rate, now_ns)
         if self._total_rate < math.inf:
             each.share.fill(self._share(now_ns), now_ns)
@@ -174,10 +194,10 @@ class Quota:
         return each
 
     def _share(self, now_ns: int) -> float:
-        """Marks per second that each author is sure of. Authors are counted once a second."""
+        """Marks per second that each process is sure of. Processes are counted once a second."""
         if now_ns - self._counted_ns >= NS_PER_S:
             self._counted_ns = now_ns
-            speaking = sum(now_ns - each.heard_ns < _SPEAKS_NS for each in self._authors.values())
+            speaking = sum(now_ns - each.heard_ns < _SPEAKS_NS for each in self._owners.values())
             self._speaking = max(speaking, 1)
         return self._total_rate / self._speaking
 
@@ -196,10 +216,10 @@ class _Bucket:
 
 
 @dataclass(slots=True)
-class _Author:
+class _Budget:
     """
-    own       fills at the rate of an author
-    share     fills at this author's part of the total rate: no need of others takes from it
+    own       fills at the rate of one process
+    share     fills at this process's part of the total rate: no need of others takes from it
     heard_ns  when a set of it was merged last
     """
 

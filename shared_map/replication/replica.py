@@ -103,7 +103,8 @@ class MapReplica:
         self._published_ns: dict[int, int] = {}  # own tile -> when its set was published last
         self._newest_ns: int | None = None  # see `take_newest_stamp_ns`
         self._now_ns = 0  # the winners in the cost map are those at this time
-        self._expiries: list[tuple[int, int]] = []  # heap of (when a statement expires, tile)
+        self._expiry_ns: dict[int, int] = {}  # tile -> when to look for expired statements, of those with any
+        self._expiries: list[tuple[int, int]] = []  # heap of the same as (when, tile), and of some outdated ones
 
     # --- merging --------------------------------------------------------------------------------------------
 
@@ -239,16 +240,23 @@ class MapReplica:
     def _await_expiry(self, tile: int, sets: Iterable[MarkSet]) -> None:
         """Look at a tile again when the next statement of these sets expires."""
         ends = [end_ns for each in sets if (end_ns := next_expiry_ns(each, self._now_ns)) is not None]
-        if ends:
-            heapq.heappush(self._expiries, (min(ends), tile))
+        if not ends or min(ends) >= self._expiry_ns.get(tile, FOREVER):
+            return
+        self._expiry_ns[tile] = min(ends)
+        heapq.heappush(self._expiries, (min(ends), tile))
+        if len(self._expiries) > 2 * len(self._expiry_ns) + _MANY:  # so that no stream of sets makes it grow
+            self._expiries = [(when_ns, of) for of, when_ns in self._expiry_ns.items()]
+            heapq.heapify(self._expiries)
 
     def _expire(self, now_ns: int) -> None:
         """Give cells whose winner expired their next one, and drop our own expired statements from our sets."""
         before_ns, self._now_ns = self._now_ns, max(now_ns, self._now_ns)
         expired: dict[int, list[MarkSet]] = {}
         while self._expiries and self._expiries[0][0] <= now_ns:
-            tile = heapq.heappop(self._expiries)[1]
-            expired[tile] = self.held.of_tile(tile)
+            when_ns, tile = heapq.heappop(self._expiries)
+            if self._expiry_ns.get(tile) == when_ns:
+                del self._expiry_ns[tile]
+                expired[tile] = self.held.of_tile(tile)
         if not expired:
             return
         self._settle(expired, before_ns, False)

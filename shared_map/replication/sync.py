@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 
 from shared_map.replication.digest import Held
-from shared_map.replication.limits import Quota
+from shared_map.replication.limits import Quota, owner_of
 from shared_map.replication.mark_sets import packed, unpacked
 from shared_map.replication.pending_digests import PendingDigest, PendingDigests
 from shared_map.replication.replica import MapReplica, Merged, PublishSet
@@ -171,7 +171,7 @@ class MapSync:
 
     @property
     def throttled(self) -> list[str]:
-        """Authors that exceed their quota, whose marks are delayed now."""
+        """Processes that exceed their quota, whose marks are delayed now."""
         return self._quota.throttled
 
     # --- sets -----------------------------------------------------------------------------------------------
@@ -216,7 +216,7 @@ class MapSync:
                 self._merge_charged(taken, marks, now_ns)
                 taken, marks, stated = [], {}, None
             if stated is None and not self._quota.admits(each, now_ns):
-                self._warn_once(author, "exceeds its quota; its marks are delayed", now_ns)
+                self._warn_once(owner_of(author), "exceeds its quota; its marks are delayed", now_ns)
                 continue
             taken.append(each)
             marks[author] = (stated or 0) + len(each.kinds)
@@ -320,7 +320,7 @@ class MapSync:
         missing = self.replica.missing(digest.held)
         throttled = self.throttled
         for author, tiles in missing:
-            if author in throttled:
+            if owner_of(author) in throttled:
                 continue  # its sets wait here already
             # Not only when an ask has ended: if its end is lost, it ends by timeout, seconds later.
             asked_ns = self._asked_ns.get(author)

@@ -31,6 +31,7 @@ from shared_map.terrain.layers import (
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.zones import paint_zones
+from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import CostConfig, Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -320,10 +321,10 @@ def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
 
 def _read_meta(folder: Path) -> dict[str, Any] | None:
     try:
-        meta = json.loads((folder / _META).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
+        if not (folder / _META).exists():
+            return None
+        meta = json.loads(read_text(folder / _META, FileKind.PREPARED))
+    except (TerrainError, ValueError, RecursionError) as error:
         raise TerrainError(
             f"prepared terrain {folder / _META} is unreadable ({error}); delete the folder"
         ) from error
@@ -336,7 +337,7 @@ def _read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any])
     path = folder / f"{name}.npy"
     try:
         array: NDArray[Any] = np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
         raise TerrainError(f"prepared terrain {path} is unreadable ({error}); delete the folder") from error
     if array.shape != tuple(shape) or array.dtype != dtype:
         raise TerrainError(f"prepared terrain {path} is {array.shape} {array.dtype}, not as described; delete it")

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from swarm.errors import ConfigError
+from swarm.ranks import job_of
 from swarm.wire.access import MEMBERS, ROLES, Grant
 from swarm.wire.fields import check_id
 from swarm.wire.topics import ALIVE_KEY, TOPICS
@@ -38,8 +39,9 @@ class Bearer:
     author: str
 
     def own(self, field: str) -> str:
-        """What a field of a key must be where it must be the bearer's own."""
-        return {"role": self.role, "author": f"{self.author}.$*"}.get(field, self.id)
+        """What a field of a key must be where it must be the bearer's own. A standby serves its job's."""
+        own = {"role": self.role, "author": f"{self.author}.$*", "target": job_of(self.id)}
+        return own.get(field, self.id)
 
 
 def bearer(name: str) -> Bearer:

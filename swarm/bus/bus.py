@@ -208,6 +208,11 @@ class Bus(Protocol):
         """Post `Asked` for every query on the key. Raises TypeError on a topic without requests."""
         ...
 
+    def unserve(self, topic: Topic, **fields: str | int) -> None:
+        """End what was served with exactly these fields. Queries under way may be posted after it; others whom a
+        query reaches answer it."""
+        ...
+
     def ask(
         self,
         topic: Topic,

@@ -178,6 +178,11 @@ class MemoryBus:
             raise TypeError(f"topic {topic.name} is not a queryable")
         self.queryables.setdefault(topic.name, []).append(declare(self, topic, fields, post))
 
+    def unserve(self, topic: Topic, **fields: str | int) -> None:
+        narrow = narrowed(topic, fields)
+        served = self.queryables.get(topic.name, [])
+        self.queryables[topic.name] = [each for each in served if each.narrow != narrow]
+
     def ask(
         self,
         topic: Topic,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import zenoh
@@ -28,6 +28,7 @@ from swarm.bus.bus import (
     Post,
     Replied,
 )
+from swarm.bus.endpoints import listening, wait_for_router
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_threads import attached, guarded, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
@@ -59,18 +60,27 @@ _CLOSE_S = 3.0
 
 
 def open_bus(
-    network: NetworkConfig, *, mode: str = "client", authenticator: Authenticator | None = None
+    network: NetworkConfig,
+    *,
+    mode: str = "client",
+    patient: bool = False,
+    authenticator: Authenticator | None = None,
 ) -> ZenohBus:
     """Open a session. Raises BusError when it cannot listen or no router answers.
 
     mode           "client" connects to `network.connect`; "router" listens on `network.listen` and passes
                    messages on
+    patient        wait for as long as nobody listens there: a process may be started before its router
     authenticator  for who speaks on trusted topics
     """
     endpoints = network.listen if mode == "router" else network.connect
+    if patient:
+        wait_for_router(endpoints)
     try:
         return ZenohBus(zenoh.open(session_config(network, mode)), network.namespace, authenticator)
     except zenoh.ZError as error:
+        if patient and not any(map(listening, endpoints)):
+            return open_bus(network, patient=True, authenticator=authenticator)
         reason = str(error).split(" at /")[0]
         what = "listen on" if mode == "router" else "reach a router at"
         hint = "is the port taken?" if mode == "router" else "is `swarm router` running there?"
@@ -98,8 +108,10 @@ class ZenohBus:
         """All that was declared and not yet undeclared, in order; `close` undeclares it backwards."""
         self._subscribers: dict[str, list[Any]] = {}
         """Key expression -> its subscribers, for `unsubscribe`."""
+        self._queryables: dict[str, list[Any]] = {}
+        """Key expression -> its queryables, for `unserve`."""
         self._threads: list[threading.Thread] = []
-        """One per channel; those that have ended are removed at the next `unsubscribe`."""
+        """One per channel; those that have ended are removed when the next is ended."""
         self._logged_s: dict[str, float] = {}
         """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
         self._closed = False
@@ -177,10 +189,7 @@ class ZenohBus:
             self._read(subscriber, arrive, f"sub-{topic.name}")
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        for subscriber in self._subscribers.pop(topic.expression(self._namespace, **fields), ()):
-            self._entities.remove(subscriber)
-            subscriber.undeclare()  # which ends the thread that reads its channel
-        self._threads = [thread for thread in self._threads if thread.is_alive()]  # those of earlier ones
+        self._undeclare_all(self._subscribers.pop(topic.expression(self._namespace, **fields), ()))
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         request_type = topic.request
@@ -210,10 +219,13 @@ class ZenohBus:
             asked = topic.parse(self._namespace, key) or dict.fromkeys(topic.fields, "*") | concrete
             post(Asked(topic, asked, request, answerer))
 
-        queryable = self._session.declare_queryable(
-            topic.expression(self._namespace, **fields), zenoh.handlers.FifoChannel(_QUERY_BUFFER)
-        )
+        expression = topic.expression(self._namespace, **fields)
+        queryable = self._session.declare_queryable(expression, zenoh.handlers.FifoChannel(_QUERY_BUFFER))
+        self._queryables.setdefault(expression, []).append(queryable)
         self._read(queryable, arrive, f"serve-{topic.name}")
+
+    def unserve(self, topic: Topic, **fields: str | int) -> None:
+        self._undeclare_all(self._queryables.pop(topic.expression(self._namespace, **fields), ()))
 
     def ask(
         self,
@@ -307,6 +319,12 @@ class ZenohBus:
         closer.join(_CLOSE_S)
         if closer.is_alive():
             log.warning("the router does not answer: left without closing the session")
+
+    def _undeclare_all(self, entities: Iterable[Any]) -> None:
+        for entity in entities:
+            self._entities.remove(entity)
+            entity.undeclare()  # which ends the thread that reads its channel
+        self._threads = [thread for thread in self._threads if thread.is_alive()]  # those of earlier ones
 
     def _undeclare(self) -> None:
         for entity in reversed(self._entities):

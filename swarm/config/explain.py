@@ -8,6 +8,8 @@ import types
 import typing
 from typing import Annotated, Any, Literal
 
+from swarm.config.input_files import shown
+
 
 def explain(reason: str, raw: dict[str, Any], root: type) -> str:
     """One sentence from msgspec's error message.
@@ -37,10 +39,12 @@ def explain(reason: str, raw: dict[str, Any], root: type) -> str:
     if unknown:
         key = unknown[1]
         allowed = list(section.__struct_fields__) if hasattr(section, "__struct_fields__") else []
+        if len(key) > 60:
+            return f"unknown key {f'{name}.' if name else ''}{key[:57]}...; allowed here: {', '.join(allowed)}"
         where = f"{name}.{key}" if name else key
         return f"unknown key {where}{nearest(key, allowed)}; allowed here: {', '.join(allowed)}"
     reason = reason[:1].lower() + reason[1:]
-    found = "" if value is None or isinstance(value, (dict, list)) else f", found {value!r}"
+    found = "" if value is None or isinstance(value, (dict, list)) else f", found {shown(value)}"
     return f"{name or 'scenario'}: {reason}{found}{_choices(section)}"
 
 

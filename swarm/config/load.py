@@ -4,33 +4,33 @@ from __future__ import annotations
 
 import ipaddress
 import re
-import tomllib
+from collections import Counter
 from pathlib import Path
 
 import msgspec
 
 from swarm.config.explain import explain, nearest
-from swarm.config.scenario import WHOLE_TREE_STRATEGIES, PlannerConfig, Scenario, TlsConfig, ZoneConfig
+from swarm.config.input_files import FileKind, parse_toml, read_text
+from swarm.config.scenario import (
+    MOST_TARGETS,
+    WHOLE_TREE_STRATEGIES,
+    PlannerConfig,
+    Scenario,
+    TlsConfig,
+    ZoneConfig,
+)
 from swarm.errors import ConfigError
+from swarm.ranks import split_rank
 
 
 def load_scenario(path: Path) -> Scenario:
     """Read and check a scenario. Raises ConfigError that names the file and the key."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"cannot read scenario {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"scenario {path} is not text: {error.reason} at byte {error.start}") from error
-    return parse_scenario(text, str(path), base=path.parent)
+    return parse_scenario(read_text(path, FileKind.SCENARIO), str(path), base=path.parent)
 
 
 def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
     """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given."""
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{source}: not TOML: {error}") from error
+    raw = parse_toml(text, source, ConfigError)
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
@@ -41,10 +41,16 @@ def parse_scenario(text: str, source: str = "scenario", base: Path | None = None
 
 def _check(scenario: Scenario, source: str) -> None:
     """Raise ConfigError where settings that are valid each do not fit together."""
+    count = sum(target.count for target in scenario.targets)
+    if count > MOST_TARGETS:
+        raise ConfigError(f"{source}: targets: expected at most {MOST_TARGETS} in all, found {count}")
     ids = scenario.target_ids
-    doubled = sorted({id for id in ids if ids.count(id) > 1})
+    doubled = sorted(id for id, times in Counter(ids).items() if times > 1)
     if doubled:
         raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    for id in ids:
+        if split_rank(id)[1]:  # planner and standby of two targets would share an id
+            raise ConfigError(f"{source}: targets: {id!r} is what a standby of another target is called; rename it")
     for key, zones in (
         ("cost.zones", scenario.cost.zones),
         ("terrain.hidden.zones", scenario.terrain.hidden.zones),

@@ -12,15 +12,22 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from swarm.ranks import HIGHEST_RANK
+
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
 Count = Annotated[int, Meta(ge=1, le=100_000)]
+Standbys = Annotated[int, Meta(ge=0, le=HIGHEST_RANK)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
 GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
 ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}$")]
 CommonName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}(~[0-9]{1,4})?$")]
 Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Point = tuple[Metres, Metres]
+Polygon = Annotated[tuple[Point, ...], Meta(min_length=3, max_length=10_000)]
+
+MOST_TARGETS = 1000
+"""Of all entries together."""
 
 Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
@@ -49,7 +56,7 @@ class ZoneConfig(Section, frozen=True, kw_only=True):
     """
 
     kind: Literal["forbidden", "preferred", "road", "rough"]
-    polygon_m: Annotated[tuple[Point, ...], Meta(min_length=3)] | None = None
+    polygon_m: Polygon | None = None
     mask: str | None = None
     name: str = ""
 
@@ -66,7 +73,7 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
     closed_roads: Annotated[int, Meta(ge=0, le=1000)] = 0
     rubble_fields: Annotated[int, Meta(ge=0, le=10_000)] = 0
     flooded_share: Annotated[float, Meta(ge=0, le=0.3)] = 0.0
-    zones: tuple[ZoneConfig, ...] = ()
+    zones: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
 
 
 class TerrainConfig(Section, frozen=True, kw_only=True):
@@ -131,7 +138,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     classes: bool = True
     class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0
-    zones: tuple[ZoneConfig, ...] = ()
+    zones: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
 
 
 class TargetConfig(Section, frozen=True, kw_only=True):
@@ -149,7 +156,7 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     """
 
     name: Name = "t"
-    count: Annotated[int, Meta(ge=1, le=1000)] = 1
+    count: Annotated[int, Meta(ge=1, le=MOST_TARGETS)] = 1
     walk: Walk = "waypoints"
     speed_m_per_s: NotNegative = 4.0
     tracker: Literal["always", "sighted"] = "always"
@@ -232,6 +239,17 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     push_s: Positive = 1.0
 
 
+class StandbyConfig(Section, frozen=True, kw_only=True):
+    """Processes that stand by: as many as said keep up with each one that leads, and take over when it is dead.
+
+    planner  standbys of each target's planner; each costs as much as that planner
+    targets  standbys of the process that moves the targets
+    """
+
+    planner: Standbys = 0
+    targets: Standbys = 0
+
+
 class MapConfig(Section, frozen=True, kw_only=True):
     """How the shared map is replicated.
 
@@ -239,11 +257,10 @@ class MapConfig(Section, frozen=True, kw_only=True):
                         only. Planners, keepers and the monitor hold all
     interest_m          near: distance up to which an agent holds marks around its vehicles
     digest_s            every replica publishes this often which sets it holds
-    author_marks_per_s  an author which changes more cells than this for ten seconds is named, its sets delayed
-    total_marks_per_s   the same of all authors together: the sets of those above an equal share of it are delayed
+    author_marks_per_s  a process which changes more cells than this for ten seconds is named, its sets delayed
+    total_marks_per_s   the same of all processes together: the sets of those above an equal share of it are delayed
     compact_after_s     an author of which a keeper has heard nothing for so long counts as dead: its sets are
                         compacted with those of other dead authors. Longer than a partition is likely to last
-    compact_keep_s      what compaction dropped can be put back for so long
     """
 
     interest: Literal["all", "near"] = "all"
@@ -252,7 +269,6 @@ class MapConfig(Section, frozen=True, kw_only=True):
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0
     compact_after_s: Positive = 60.0
-    compact_keep_s: Positive = 86_400.0
 
 
 class TlsConfig(Section, frozen=True, kw_only=True):
@@ -276,7 +292,8 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
     connect            endpoints of the routers that the other processes connect to
     peers              endpoints of other routers that a router connects to
     lease_s            a peer that is silent for this long counts as gone
-    connect_timeout_s  a process that reaches no router for this long ends
+    connect_timeout_s  a tool that reaches no router for this long ends, and a process whose router listens but does
+                       not answer; while no router listens, processes wait
     tls                certificates, for endpoints beyond loopback
     admit              names in certificates that a router lets take part, beside those of the scenario's processes:
                        router.north, keeper.east, operator.anna
@@ -320,6 +337,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     groups      which vehicles there are
     vehicles    how vehicles behave
     planner     how a planner keeps its tree
+    standbys    which processes stand by
     map         how the shared map is replicated
     network     where processes meet
     monitor     the live view
@@ -331,10 +349,11 @@ class Scenario(Section, frozen=True, kw_only=True):
     time_scale: Annotated[float, Meta(gt=0, le=1000)] = 1.0
     terrain: TerrainConfig = TerrainConfig()
     cost: CostConfig = CostConfig()
-    targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1)] = (TargetConfig(),)
-    groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1)] = (GroupConfig(),)
+    targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1, max_length=MOST_TARGETS)] = (TargetConfig(),)
+    groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1, max_length=256)] = (GroupConfig(),)
     vehicles: VehicleConfig = VehicleConfig()
     planner: PlannerConfig = PlannerConfig()
+    standbys: StandbyConfig = StandbyConfig()
     map: MapConfig = MapConfig()
     network: NetworkConfig = NetworkConfig()
     monitor: MonitorConfig = MonitorConfig()

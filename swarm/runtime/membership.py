@@ -55,12 +55,17 @@ class Member:
 
     def join(self) -> None:
         """Serve our run, then ask for those of others, in this order: of two processes that start at once at least
-        one hears the other. Called once."""
+        one hears the other. Called once for each bus."""
         self._bus.serve(RUN, self._post, role=self.info.role, id=self.info.id)
         self._bus.watch_links(self._post)
         self._bus.watch_alive(self._post, role=ROUTER)
         self._bus.declare_alive(self.peer)
         self._ask()
+
+    def move_to(self, bus: Bus) -> None:
+        """Go on, and join, on another bus; the one before is closed."""
+        self._bus = bus
+        self.join()
 
     def handle(self, event: Event) -> bool:
         """Whether the event was about membership only and is done with. Raises RunMismatchError."""

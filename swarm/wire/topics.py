@@ -23,7 +23,7 @@ from swarm.wire.messages.planning import (
     RouteReply,
     RouteRequest,
 )
-from swarm.wire.messages.processes import Note, RunInfo, Stats
+from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.traffic import Claim, Known, KnownRequest, Standing, Stored, Table
 from swarm.wire.messages.vehicles import Fleet, Followed
@@ -179,7 +179,8 @@ FLEET = Topic(
 )  # fmt: skip
 STANDING = Topic(
     "standing", "standing/{plot}/{agent}", Standing,
-    "where a host's vehicles are in a plot and where they would go; for its members", "every tick",
+    "where a host's vehicles are in a plot and where they would go; for its members",
+    "on change, else 5 Hz",
     access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
@@ -190,7 +191,8 @@ TABLE = Topic(
     request=Claim, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
-    "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file", "per table",
+    "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file",
+    "per table by one member, 5 Hz by the other",
     access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(
@@ -216,7 +218,7 @@ POSE = Topic(
 TRUE_POSE = Topic(
     "true-pose", "world/target/{target}/pose", TargetPose,
     "where a target is that nobody tracks: for simulated sensors, not for planners", "every tick",
-    access(put="targets", hear="agent"),
+    access(put="targets", hear="agent targets"),
 )  # fmt: skip
 SIGHTED = Topic(
     "sighted", "sighted/{target}/{author}", Sighted, "where a vehicle of this author saw a target",
@@ -238,6 +240,12 @@ STATUS = Topic(
     access(put="planner:target", hear="targets monitor"),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
+LEAD = Topic(
+    "lead", "lead/{role}/{id}", Beat, "which of the processes with one job are ready, and which leads",
+    "10 Hz, where there are standbys",
+    access(put="planner:role,id targets:role,id", hear="planner targets monitor"),
+    priority=Priority.INTERACTIVE,
+)  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz",
     access(put=MEMBERS_OWN, hear="monitor"),
@@ -251,7 +259,8 @@ NOTE = Topic(
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, STANDING, TABLE, STORED, KNOWN, FOLLOWED, PUSHED_ROUTE, POSE,
-    SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, STATS, NOTE,
+    SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, LEAD, STATS,
+    NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

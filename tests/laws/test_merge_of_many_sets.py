@@ -233,5 +233,5 @@ def test_an_author_of_whom_nothing_is_taken_in_has_no_place_in_the_books() -> No
     listener = MapReplica(GRID, Composite())
     [message] = packed([set_of("b", 9999, 1, {3: (LETHAL, 0, 1)})])
     assert listener.merge(unpacked(message)).sets == []
-    assert listener.held.capacity._authors == {}
+    assert listener.held.capacity._owners == {}
     assert listener.held.ledger.held() == {}

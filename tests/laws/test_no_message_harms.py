@@ -44,6 +44,9 @@ vehicles = 4
 per_agent = 2
 sense_range_m = 60
 capture_range_m = 20
+[standbys]
+planner = 1
+targets = 1
 [monitor]
 live = false
 """)

@@ -1,5 +1,8 @@
 """Right of way: never two vehicles on one cell, and everybody moves again once all is quiet, whatever the network,
-the processes and the clocks do. Each rule that decision 25 needs is taken out in turn, and the law must notice."""
+the processes and the clocks do. Each rule that decision 25 needs is taken out in turn, and the law must notice.
+
+More histories: `pytest tests/laws/test_right_of_way.py -m seeds --seeds 0:2000`.
+"""
 
 from __future__ import annotations
 
@@ -64,19 +67,19 @@ def check(world: TrafficWorld, settle_s: float = 8.0, move_s: float = 10.0) -> N
     assert [vehicle for vehicle in vehicles if world.moves.get(vehicle, 0) == before.get(vehicle, 0)] == []
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.seeds(24)
 def test_no_two_meet_and_all_move_again_when_it_is_quiet(seed: int) -> None:
     check(world_of(seed))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.seeds(6)
 def test_no_two_meet_when_wardens_replace_each_other_all_the_time(seed: int) -> None:
     world = duel_of(seed)
     check(world, move_s=20.0)
     assert world.takeovers > 3
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.seeds(4)
 def test_no_two_meet_where_borders_are_crossed_all_the_time(seed: int) -> None:
     check(borders_of(seed), move_s=20.0)
 
@@ -220,13 +223,14 @@ def seats_a_file_that_is_not_the_first(patch: pytest.MonkeyPatch) -> None:
 
 
 def acts_on_a_table_that_is_not_the_newest(patch: pytest.MonkeyPatch) -> None:
-    leave = Holdings._forget_left
+    standings = Holdings.standings
 
-    def absent_minded(self: Holdings, by_plot) -> None:  # type: ignore[no-untyped-def]
-        leave(self, by_plot)
+    def absent_minded(self: Holdings, wishes, now_ns):  # type: ignore[no-untyped-def]
+        said = standings(self, wishes, now_ns)
         self._views = {plot: view for plot, view in self._views.items() if plot in self.plots}
+        return said
 
-    patch.setattr(Holdings, "_forget_left", absent_minded)
+    patch.setattr(Holdings, "standings", absent_minded)
 
 
 RULES: list[Callable[[pytest.MonkeyPatch], None]] = [

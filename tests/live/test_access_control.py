@@ -31,6 +31,7 @@ pytestmark = pytest.mark.network
 NAMES = {
     "keeper": "keeper.east",
     "planner": "planner.t0",
+    "standby": "planner.t0.r1",
     "agent": "agent.blue.a0",
     "targets": "targets.0",
     "tracker": "tracker.t0",
@@ -45,7 +46,7 @@ LATEST_S = 5.0
 NAMESPACE = "swarm"
 ALL = f"{NAMESPACE}/**"
 OPERATIONS = ("put", "delete", "serve", "ask", "hear", "raise", "watch", "look")
-EVERYBODY = (*ROLES, "outsider", "revoked")
+EVERYBODY = (*ROLES, "standby", "outsider", "revoked")
 
 FORBIDDEN = [
     ("agent", "put", "marks/0/0/red.a1.1"),
@@ -67,6 +68,12 @@ FORBIDDEN = [
     ("planner", "put", "target/t0/pose"),
     ("planner", "hear", "world/target/t0/pose"),
     ("planner", "raise", "alive/planner/t1/1"),
+    ("standby", "serve", "target/t1/route"),
+    ("standby", "serve", "target/t0.r1/route"),
+    ("standby", "serve", "run/planner/t0"),
+    ("standby", "put", "lead/planner/t0"),
+    ("standby", "put", "stats/planner/t0"),
+    ("standby", "raise", "alive/planner/t0/1"),
     ("monitor", "put", "marks/0/0/blue.a0.1"),
     ("operator", "put", "note/operator/anna"),
     ("operator", "raise", "alive/operator/anna/1"),
@@ -128,7 +135,7 @@ def allows(who: Bearer | None, topic: Topic, operation: str, key: str) -> bool:
     assert fields is not None
     for grant in getattr(topic.access, operation):
         if grant.role == who.role:
-            own = {"role": who.role, "author": f"{who.author}.1"}
+            own = {"role": who.role, "author": f"{who.author}.1", "target": who.id.removesuffix(".r1")}
             return all(fields[field] == own.get(field, who.id) for field in grant.own)
     return False
 

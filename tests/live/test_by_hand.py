@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 
 import pytest
 from support.live_swarm import Hands, ask, client, swarm
@@ -47,10 +48,25 @@ def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) ->
         assert process.wait(30) == 0, hands.logs()
 
 
-def test_a_role_without_a_router_says_so(hands: Hands) -> None:
-    path = hands.folder / "impatient.toml"
-    path.write_text(hands.path.read_text().replace("[network]", "[network]\nconnect_timeout_s = 1"))
-    told = swarm("keeper", path, "--runs", hands.folder / "runs")
-    assert told.returncode == 4
-    assert "cannot reach a router at" in told.stderr
-    assert "Traceback" not in told.stderr
+def test_who_is_started_before_the_router_waits_says_so_once_and_goes_on(hands: Hands) -> None:
+    text = hands.path.read_text().replace("[network]", "[network]\nconnect_timeout_s = 1")
+    hands.path.write_text(text)
+    scenario, connect = str(hands.path), hands.network.connect[0]
+    keeper = hands.start("keeper", scenario)
+    part = hands.start("up", scenario, "--connect", connect, "--only", "planner", "--plain")
+    impatient = hands.start("agent", scenario, "--id", "a0")
+    sentence = f"no router at {connect} yet: waiting for one"
+    eventually(lambda: hands.logs().count(sentence) == 3, 150, "three who wait")
+    impatient.send_signal(signal.SIGINT)
+    impatient.wait(10)
+    time.sleep(3)  # longer than the timeout of a connection
+    assert keeper.poll() is part.poll() is None
+    assert hands.logs().count(sentence) == 3
+    hands.start("router", scenario)
+    eventually(lambda: swarm("status", "--connect", connect).returncode == 0, 60, "the router")
+    eventually(lambda: len(hands.members()) == 4, 150, "router, keeper and planners")
+    assert len({run_id for role, _, run_id in hands.members() if role != "router"}) == 1
+    for process in (part, keeper):
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0, hands.logs()
+    assert "Traceback" not in hands.logs()

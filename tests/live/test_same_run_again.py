@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 from support.live_swarm import LiveSwarm, swarm
 from support.processes import eventually, session_of
@@ -22,15 +24,16 @@ def sets_in(store: Path) -> int:
     return int(json.loads(done.stdout)["sets"])
 
 
+@pytest.mark.parametrize("kill", [os.kill, os.killpg], ids=["launcher", "all"])
 def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_with_the_keepers_store(
-    tmp_path: Path,
+    tmp_path: Path, kill: Callable[[int, int], None]
 ) -> None:
     first = LiveSwarm(tmp_path, "--run-id", "again", "--no-live")
     try:
         first.wait_until_up()
         store = tmp_path / "runs" / "again" / "map.sqlite"
         eventually(lambda: store.exists() and sets_in(store) > 0, 60, "marks in the store")
-        os.killpg(first.process.pid, signal.SIGKILL)
+        kill(first.process.pid, signal.SIGKILL)  # with it or after it all that it started ends
         first.process.wait(10)
         eventually(lambda: not session_of(first.process.pid), 10, "the end of all")
         before = sets_in(store)
@@ -48,5 +51,6 @@ def test_parts_of_a_swarm_that_are_started_on_several_machines_belong_to_one_run
     from launch_scripts.launcher.options import common_run_id, with_port
 
     scenario = find_scenario("synthetic")
-    assert common_run_id(with_port(scenario, 4711)) == common_run_id(scenario)
+    longer = msgspec.structs.replace(scenario, seconds=scenario.seconds + 60)
+    assert common_run_id(with_port(scenario, 4711)) == common_run_id(longer) == common_run_id(scenario)
     assert common_run_id(find_scenario("jacksboro")) != common_run_id(scenario)

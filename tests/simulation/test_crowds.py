@@ -75,3 +75,20 @@ def test_an_agent_that_starts_again_with_another_clock_is_like_any_other(skew_s)
     simulation.run_until(12)
     assert all(vehicle.cell != before[id] for id, vehicle in service.agent.vehicles.items())
     assert laws.collisions == []
+
+
+def test_vehicles_that_wait_because_two_of_three_members_are_gone_say_why_and_drive_on_when_one_is_back():
+    simulation = Simulation(seeded(1))
+    simulation.run_until(5)
+    for name in ("agent-a0", "agent-a1"):
+        simulation.nodes[name].crash()
+    simulation.run_until(9)
+    notes = [note for _, note in simulation.recorder.notes if note.kind == "waiting"]
+    assert [note.id for note in notes] == ["a2"]
+    assert "plot 0 has no warden" in notes[0].text
+    service = simulation.nodes["agent-a2"].service
+    assert isinstance(service, AgentService)
+    before = {id: vehicle.cell for id, vehicle in service.agent.vehicles.items()}
+    simulation.nodes["agent-a0"].boot()
+    simulation.run_until(14)
+    assert any(vehicle.cell != before[id] for id, vehicle in service.agent.vehicles.items())

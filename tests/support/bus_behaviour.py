@@ -96,6 +96,22 @@ def test_a_subscription_with_a_field_hears_only_that_key(world: World):
     assert [event.fields["target"] for event in one] == ["t1"]
 
 
+def test_what_is_served_no_more_is_not_asked_and_may_be_served_again(world: World):
+    a, b, c = world.bus("a"), world.bus("b"), world.bus("c")
+    for bus, id in ((a, "a0"), (b, "a1")):
+        bus.serve(RUN, answering((run_info(id), {})), role="agent", id=id)
+    world.settle()
+    assert len(asked(world, c, RUN, Nothing()).of(Replied)) == 2
+    a.unserve(RUN, role="agent", id="a0")
+    a.unserve(RUN, role="agent", id="a7")  # of what never was there is nothing to end
+    world.settle()
+    assert [reply.message.id for reply in asked(world, c, RUN, Nothing()).of(Replied)] == ["a1"]
+    assert asked(world, c, RUN, Nothing(), id="a0").of(AskEnded) == [AskEnded("q", RUN, 0, None)]
+    a.serve(RUN, answering((run_info("a0"), {})), role="agent", id="a0")
+    world.settle()
+    assert len(asked(world, c, RUN, Nothing()).of(Replied)) == 2
+
+
 def test_samples_of_one_sender_come_in_order(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
     b.subscribe(POSE, box)

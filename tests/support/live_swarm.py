@@ -61,10 +61,10 @@ web_port = 0
 """
 
 
-def write_scenario(folder: Path) -> Path:
-    """A small scenario on a free port."""
+def write_scenario(folder: Path, also: str = "") -> Path:
+    """A small scenario on a free port; `also` are further sections of it."""
     path = folder / "small.toml"
-    path.write_text(_SCENARIO.format(port=free_ports(1)[0]))
+    path.write_text(_SCENARIO.format(port=free_ports(1)[0]) + also)
     return path
 
 
@@ -77,8 +77,8 @@ def swarm(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedPr
 class LiveSwarm:
     """`swarm up` under way, in a session of its own."""
 
-    def __init__(self, folder: Path, *options: object) -> None:
-        self.path = write_scenario(folder)
+    def __init__(self, folder: Path, *options: object, also: str = "") -> None:
+        self.path = write_scenario(folder, also)
         self.scenario: Scenario = load_scenario(self.path)
         self.output = folder / "output.txt"
         self.runs = folder / "runs"
@@ -134,11 +134,15 @@ class Hands:
         self.network = load_scenario(self.path).network
         self.started: list[subprocess.Popen[str]] = []
 
-    def start(self, *arguments: str, runs: Path | None = None) -> subprocess.Popen[str]:
+    def start(self, *arguments: str, runs: Path | None = None, own_session: bool = False) -> subprocess.Popen[str]:
         name = "-".join(arguments[:3]).replace("/", "_")
         with (self.folder / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
-                [*SWARM, *arguments, "--runs", str(runs or self.folder / "runs")], stdout=log, stderr=log, text=True
+                [*SWARM, *arguments, "--runs", str(runs or self.folder / "runs")],
+                stdout=log,
+                stderr=log,
+                text=True,
+                start_new_session=own_session,
             )
         self.started.append(process)
         return process

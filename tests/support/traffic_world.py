@@ -110,7 +110,7 @@ class Process:
             self.disk.bodies[vehicle] = self.rights.holdings.path(vehicle)[0]
             self.world.unmoved.pop(vehicle, None)
             self.world.placed += 1
-        self.world.look()
+            self.world.look()
 
     def tick(self) -> None:
         holdings = self.rights.holdings
@@ -302,7 +302,7 @@ class TrafficWorld:
         self.send(source, member, ask)
 
     def ask_known(self, source: Process, first: bool = False) -> None:
-        """Ask everybody what they know of us, again and again until all have noted our file."""
+        """Ask everybody what they know of us, again and again as long as it is needed."""
 
         def answer(to: Process) -> None:
             for action in to.rights.answer_known(KnownRequest(agent=source.agent, disk=source.disk.own.disk)):
@@ -311,8 +311,8 @@ class TrafficWorld:
                 else:
                     to.perform([action])
 
-        if source.alive and (first or not source.rights.settled):
-            for process in self.processes:
+        if source.alive:
+            for process in self.processes if first or not source.rights.settled else ():
                 if process.agent != source.agent:
                     self.carry(source, process, lambda to=process: answer(to))
             self.at(NS_PER_S, lambda: self.ask_known(source))
@@ -357,8 +357,11 @@ class TrafficWorld:
 
     def twin(self, process: Process) -> None:
         """Cut a process off, alone or one way, and start another life of its agent on another machine."""
+        replaced = {name for name, disks in self.disks.items() if len(disks) > 1} | {process.agent}
         if len(self.spawns) < 3 or len(self.disks[process.agent]) > 2:
             return
+        if any(replaced.issuperset(self.plots.members(plot)) for plot in range(self.plots.count)):
+            return  # decision 25: of the three files of a plot's members one at least is the first
         self.twins += 1
         cut = (f"{id(process.disk)}", "")
         self.cut.add(cut)

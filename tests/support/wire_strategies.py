@@ -21,7 +21,7 @@ from swarm.wire.messages.planning import (
     RouteReply,
     RouteRequest,
 )
-from swarm.wire.messages.processes import Note, RunInfo, Stats
+from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.traffic import Claim, Grant, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
 from swarm.wire.messages.vehicles import (
@@ -227,6 +227,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
             texts, st.dictionaries(st.integers(ZERO_BUCKET, TOP_BUCKET), counts, max_size=3), max_size=2
         ),
     ),
+    Beat: st.builds(Beat, role=ids, id=ids, incarnation=naturals, ready=st.booleans(), leads=st.booleans()),
     Note: st.builds(Note, role=ids, id=ids, stamp_ns=naturals, kind=texts, text=texts, cell=optional_cells),
 }  # fmt: skip
 
@@ -304,5 +305,6 @@ EXAMPLES: tuple[Message, ...] = (
         role="agent", id="a0", incarnation=7, stamp_ns=10, counts={"marks": 3}, gauges={"lost": 0.0},
         histograms={"tick_ms": {-3: 4}},
     ),
+    Beat(role="planner", id="t0.r1", incarnation=7, ready=True, leads=False),
     Note(role="agent", id="a0", stamp_ns=10, kind="closure", text="road closed", cell=9),
 )  # fmt: skip

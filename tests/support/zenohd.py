@@ -12,7 +12,7 @@ import pytest
 from support.processes import eventually
 
 from launch_scripts.deploy.zenohd import zenohd_config
-from launch_scripts.launcher.options import listening
+from swarm.bus.endpoints import listening
 from swarm.config.scenario import NetworkConfig
 
 PLUGIN = "libzenoh_plugin_storage_manager.so"

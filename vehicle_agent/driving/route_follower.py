@@ -67,10 +67,10 @@ class Follower:
         """How many cells are ahead."""
         return max(len(self._cells) - self._at - 1, 0)
 
-    def cut(self, closed: Callable[[int], bool]) -> bool:
-        """End the route before the first closed cell ahead; True if there is one."""
+    def cut(self, passable: Callable[[int, int], bool]) -> bool:
+        """End the route before the first step ahead that is not passable; True if there is one."""
         for index in range(self._at + 1, len(self._cells)):
-            if closed(self._cells[index]):
+            if not passable(self._cells[index - 1], self._cells[index]):
                 del self._cells[index:]
                 self.partial = False
                 return True

@@ -8,6 +8,7 @@ from itertools import takewhile
 
 from swarm.wire.messages.traffic import Stamp, Stand, Standing, Stored, Table
 from vehicle_agent.traffic.plots import Plots
+from vehicle_agent.traffic.warden import BEAT_NS
 
 _TABLES_KEPT = 16
 _BEFORE_ALL: Stamp = (0, 0)
@@ -39,6 +40,7 @@ class _View:
     pushed   vehicle -> the age with which it is to make way into another plot
     others   the cells that are granted to vehicles of other hosts, or to nobody
     quiet    the first standing from which on we want nothing here; None while we do
+    told     what was last told of our vehicles, and when
     """
 
     tables: dict[Stamp, Table] = field(default_factory=dict)
@@ -49,6 +51,8 @@ class _View:
     pushed: dict[str, int] = field(default_factory=dict)
     others: frozenset[int] = frozenset()
     quiet: int | None = None
+    told: object = None
+    told_ns: int = 0
 
 
 class Holdings:
@@ -109,6 +113,10 @@ class Holdings:
         """Keep only the first cells of the path. The rest must not be entered any more."""
         self._paths[vehicle] = self._paths[vehicle][: max(keep, 1)]
         self._cells = None
+
+    def waiting(self, plot: int) -> list[str]:
+        """The vehicles that hold cells of a plot, as far as its table in use tells."""
+        return list(self._views[plot].seen) if plot in self._views else []
 
     # --- what members say -----------------------------------------------------------------------------------
 
@@ -197,8 +205,9 @@ class Holdings:
 
     # --- what to say ----------------------------------------------------------------------------------------
 
-    def standings(self, wishes: Mapping[str, Wish]) -> list[Standing]:
-        """What to tell the members of each plot that concerns us. Cells left out are given back."""
+    def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Standing]:
+        """What to tell the members of each plot that concerns us, where it is new or the last word is a beat old.
+        Cells left out are given back."""
         self._seq += 1
         by_plot: dict[int, list[Stand]] = {plot: [] for plot in self.plots}
         for vehicle, path in self._paths.items():
@@ -213,13 +222,28 @@ class Holdings:
                 agent=self._agent,
                 life=self.life,
                 seq=self._seq,
-                knows=self._views[plot].knows if plot in self._views else _BEFORE_ALL,
+                knows=self._views[plot].knows,
                 vehicles=stands,
                 dead=self._dead,
                 ended=self.replaced,
             )
             for plot, stands in by_plot.items()
+            if self._is_news(plot, stands, now_ns)
         ]
+
+    def _is_news(self, plot: int, stands: Sequence[Stand], now_ns: int) -> bool:
+        view = self._views[plot]
+        # What a table grants and we do not hold is freed only if we say so, knowing that table.
+        in_step = view.seen == {stand.vehicle: stand.holds for stand in stands if stand.holds}
+        told = (
+            self.replaced,
+            view.knows[0] if in_step else view.knows,
+            [(stand.vehicle, stand.cell, stand.holds, stand.ahead, stand.better) for stand in stands],
+        )
+        if told == view.told and 0 <= now_ns - view.told_ns < BEAT_NS:
+            return False
+        view.told, view.told_ns = told, now_ns
+        return True
 
     def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
         """Without cells that were left or given back while a table still grants them: granted anew, such a cell

@@ -79,6 +79,11 @@ class Member:
         self._due_ns = now_ns
         self._wanted_ns: int | None = None
         self._acked_ns = now_ns
+        self._said = self._other_said = (
+            0,
+            0,
+        )  # the newest table that we, and the third member, said to have stored
+        self._said_ns = now_ns
 
     # --- what hosts say -------------------------------------------------------------------------------------
 
@@ -93,8 +98,12 @@ class Member:
 
     # --- what members say -----------------------------------------------------------------------------------
 
+    @property
+    def on_file(self) -> Stored:
+        return Stored(plot=self.plot, agent=self._me, epoch=self.stored.epoch, seq=self.stored.seq)
+
     def hear_table(self, table: Table, now_ns: int) -> list[MemberAction]:
-        if table.agent != self._plots.warden(self.plot, table.epoch):
+        if table.agent == self._me or table.agent != self._plots.warden(self.plot, table.epoch):
             return []
         if table.epoch < self.promised:
             # A claim of ours or of another came to nothing: let the warden claim again, so that we can follow it.
@@ -109,8 +118,25 @@ class Member:
             self.promised, self.stored = table.epoch, table
             actions.append(Save(self.promised, self.stored))
         if table.stamp == self.stored.stamp:
-            actions.append(Stored(plot=self.plot, agent=self._me, epoch=table.epoch, seq=table.seq))
+            self._said = min(self._said, (table.epoch, table.seq - 1))  # a table told again is answered again
+            if self._plots.warden(self.plot, table.epoch + 1) == self._me:
+                actions.append(self._say(now_ns))
         return actions
+
+    def _say(self, now_ns: int) -> Stored:
+        self._said, self._said_ns = self.stored.stamp, now_ns
+        return self.on_file
+
+    def _say_late(self, now_ns: int) -> list[MemberAction]:
+        """What the member that is second after the warden says of its file. With the warden the first one makes a
+        majority, so the second says only what the first does not, and, as others may not hear the first, speaks at
+        least once in a beat."""
+        stamp = self.stored.stamp
+        if self.warden is not None or self._said >= stamp:
+            return []
+        if self._other_said >= stamp and now_ns - self._said_ns < BEAT_NS:
+            return []
+        return [self._say(now_ns)]
 
     def hear_claim(self, epoch: int, now_ns: int) -> list[MemberAction]:
         """Promise, or say nothing. The last action is the table to answer with."""
@@ -130,7 +156,10 @@ class Member:
             self._take_charge(now_ns)
 
     def hear_stored(self, stored: Stored, now_ns: int) -> None:
-        if self.warden is None or stored.agent not in self._others:
+        if stored.agent not in self._others:
+            return
+        self._other_said = max(self._other_said, (stored.epoch, stored.seq))
+        if self.warden is None:
             return
         if stored.epoch == self.warden.epoch:
             self._acked_ns = now_ns
@@ -140,12 +169,14 @@ class Member:
     # --- being warden ---------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> list[MemberAction]:
-        if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
-            return []
-        if self.warden is not None and self._claim_above <= self.warden.epoch:
+        wanted = self._wanted_ns is not None and now_ns - self._wanted_ns <= _WANTED_NS
+        if wanted and self.warden is not None and self._claim_above <= self.warden.epoch:
             return self._lead(self.warden, now_ns)
-        if self.warden is None and now_ns < self._due_ns:
-            return []
+        if not wanted or (self.warden is None and now_ns < self._due_ns):
+            return self._say_late(now_ns)
+        return self._claim(now_ns)
+
+    def _claim(self, now_ns: int) -> list[MemberAction]:
         members = len(self._members)
         self._promise((max(self.promised, self._claim_above) // members + 1) * members + self._rank)
         self._claimed = self.promised
@@ -166,8 +197,10 @@ class Member:
         warden.refused.clear()
         table = warden.tick(now_ns)
         if table is not None:
-            self.stored = table
-            actions += [Save(self.promised, table), table]
+            if table is not self.stored:
+                self.stored = table
+                actions.append(Save(self.promised, table))
+            actions.append(table)
         return actions
 
     def _take_charge(self, now_ns: int) -> None:

@@ -26,6 +26,8 @@ Place = Callable[[str, Sequence[int]], int]
 _LIVES_KEPT = 32
 _ALONE_NS = NS_PER_S // 2
 """A life that has been replaced begins again once no other process of its agent has been alive for so long."""
+_UNLED_NS = 2 * NS_PER_S
+"""A plot that is silent for so long has no warden; another one takes over within a second where it can."""
 
 
 def _first(vehicle: str, cells: Sequence[int]) -> int:
@@ -64,6 +66,8 @@ class RightOfWay:
     place   tells on which of the cells that it was granted a vehicle of a new life stands
 
     holdings  which cells our vehicles hold: none before `begin`
+    silent    whether our file takes nothing now: then we are no member of any plot, and note nobody's file. What
+              our vehicles hold and are granted does not depend on it
     """
 
     def __init__(
@@ -87,13 +91,18 @@ class RightOfWay:
         self._known_life = 0
         self._twins = Roster()
         self._alone_since_ns: int | None = None
+        self._table_ns: dict[int, int] = {}
+        """Plot that concerns us -> when a table of it was heard last."""
+        self.silent = False
 
     # --- beginning a life -----------------------------------------------------------------------------------
 
     @property
     def settled(self) -> bool:
-        """Whether all other agents have noted our file, so that nobody needs to be asked again."""
-        return len(self.own.noted_by) >= len(self._spawns) - 1
+        """Whether nobody needs to be asked what is known of us: we live, all other agents have noted our file, and
+        no later life leaves it to us to say, wherever cells of ours are shut, that we have stopped."""
+        noted = len(self.own.noted_by) >= len(self._spawns) - 1
+        return self.holdings.life > 0 and noted and not self.holdings.replaced
 
     def answer_known(self, request: KnownRequest) -> list[Action]:
         """Another agent has begun a life. The last action is what to answer.
@@ -101,7 +110,7 @@ class RightOfWay:
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
         first.
         """
-        if request.agent not in self._spawns or request.agent == self.agent:
+        if request.agent not in self._spawns or request.agent == self.agent or self.silent:
             return []
         actions: list[Action] = []
         if request.agent not in self.own.noted:
@@ -118,7 +127,7 @@ class RightOfWay:
         if not is_far_ahead(known.life, self._known_life):
             self._known_life = max(self._known_life, known.life)
         self.holdings.watch([plot for plot in known.plots if plot < self.plots.count])
-        if known.disk != self.own.disk or known.agent in self.own.noted_by:
+        if self.silent or known.disk != self.own.disk or known.agent in self.own.noted_by:
             return []
         self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
         return [self.own]
@@ -154,12 +163,16 @@ class RightOfWay:
         return [AskKnown()]
 
     def _known(self, agent: str) -> tuple[int, list[int]]:
-        """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles."""
+        """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles or keep
+        some of an earlier life shut."""
         stored = {plot: table for plot, (_, table) in self._saved.items()}
         stored.update((plot, member.stored) for plot, member in self._members.items())
         life = max((table.hosts.get(agent, (0, 0))[0] for table in stored.values()), default=0)
         return life, sorted(
-            plot for plot, table in stored.items() if any(agent_of(v) == agent for v in table.grants)
+            plot
+            for plot, table in stored.items()
+            if any(agent_of(vehicle) == agent for vehicle in table.grants)
+            or any(shut.agent == agent for shut in table.shut)
         )
 
     def leads(self, plot: int) -> bool:
@@ -180,10 +193,10 @@ class RightOfWay:
         actions: list[Action] = [] if member is None else [*member.hear_table(table, now_ns)]
         placed = []
         if self.holdings.life and table.plot in self.holdings.plots:
+            self._table_ns[table.plot] = now_ns
             placed = self.holdings.hear_table(table, self._place)
-            for action in actions:
-                if isinstance(action, Stored):
-                    placed += self.holdings.hear_stored(action, self._place)
+            if member is not None:
+                placed += self.holdings.hear_stored(member.on_file, self._place)
         return actions, placed
 
     def hear_stored(self, stored: Stored, now_ns: int) -> list[str]:
@@ -209,19 +222,35 @@ class RightOfWay:
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
         """What our members and our vehicles have to say now."""
         actions: list[Action] = []
-        for member in self._members.values():
+        for member in () if self.silent else self._members.values():
             actions += member.tick(now_ns)
+        if self.holdings.replaced:
+            self.holdings.watch(self._known(self.agent)[1])
         if self.holdings.life:
-            actions += self.holdings.standings(wishes)
+            actions += self.holdings.standings(wishes, now_ns)
         if self.holdings.replaced:
             actions += self._again(now_ns)
         return actions
 
+    def unled(self, now_ns: int) -> dict[int, str]:
+        """Why vehicles of ours wait: plot -> that no warden of it is heard."""
+        plots = self.holdings.plots
+        self._table_ns = {plot: self._table_ns.get(plot, now_ns) for plot in plots}
+        found = {}
+        for plot, heard_ns in self._table_ns.items():
+            if now_ns - heard_ns > _UNLED_NS and (vehicles := self.holdings.waiting(plot)):
+                members = self.plots.members(plot)
+                found[plot] = (
+                    f"plot {plot} has no warden: {len(vehicles)} of our vehicles there wait until "
+                    f"{self.plots.majority} of its members {', '.join(members)} run and reach each other and us"
+                )
+        return found
+
     def _member(self, plot: int, now_ns: int) -> Member | None:
         """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is
         not known to be the first, and what was promised in the first is not in it."""
-        known = self._members.get(plot)
-        if known is not None or not 0 <= plot < self.plots.count:
+        known = None if self.silent else self._members.get(plot)
+        if self.silent or known is not None or not 0 <= plot < self.plots.count:
             return known
         members = self.plots.members(plot)
         if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,16 @@ class Steering:
         """Whether a cell is lethal."""
         return not math.isfinite(self._pace[cell])
 
+    def passable(self, tail: int, head: int) -> bool:
+        """Whether the map allows the step between two neighbours; a diagonal also needs the cells beside it."""
+        if self.closed(head):
+            return False
+        cols = self._grid.cols
+        rows, col = head // cols - tail // cols, head % cols - tail % cols
+        if self._corner_cutting or not rows or not col:
+            return True
+        return not (self.closed(tail + col) or self.closed(tail + rows * cols))
+
     def wish(
         self, vehicle: Vehicle, path: Sequence[int], pushed_ms: int, in_reach: Callable[[int], bool], now_ns: int
     ) -> Wish:
@@ -106,8 +117,8 @@ class Steering:
     def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:
         """The next cells of the route after what it holds; none if that ends beside the route."""
         ahead = vehicle.route.after(path[-1], self._reserve - len(path) + 1)
-        for index, cell in enumerate(ahead):
-            if self.closed(cell):
+        for index, (tail, head) in enumerate(pairwise((path[-1], *ahead))):
+            if not self.passable(tail, head):
                 return ahead[:index]
         return ahead
 

@@ -63,7 +63,9 @@ class Warden:
         self._shut = {(each.agent, each.life): list(each.cells) for each in table.shut}
         self._hosts: dict[str, _Host] = {}
         self._pushed: dict[str, int] = {}
-        self._changed = True
+        self._granted = True  # since the last table: something that a host waits for
+        self._changed = False  # or anything else
+        self._told: Table | None = None
         self._told_ns = 0
 
     @property
@@ -76,7 +78,7 @@ class Warden:
         host = standing.agent
         for dead in standing.dead:
             if self._shut.pop((host, dead), None) is not None:
-                self._changed = True
+                self._granted = True
         life, seq = self._lives.get(host, (0, 0))
         if standing.ended:
             self._ended(host, standing.life, life)
@@ -89,6 +91,8 @@ class Warden:
         if standing.life != life:
             self._succeed(host, life)
         self._lives[host] = (standing.life, standing.seq)
+        if not standing.vehicles and (host not in self._hosts or self._hosts[host].standing.vehicles):
+            self._changed = True  # it leaves the plot as soon as a table counts this
         holds = {stand.vehicle: stand.holds for stand in standing.vehicles}
         for vehicle in [vehicle for vehicle in self._grants if agent_of(vehicle) == host]:
             self._free(vehicle, holds.get(vehicle, []), standing.knows)
@@ -97,13 +101,13 @@ class Warden:
     def _ended(self, host: str, ended: int, life: int) -> None:
         """A life's own word that it drives no more."""
         if (host, ended) in self._shut:
-            self._changed = self._changed or bool(self._shut[host, ended])
+            self._granted = self._granted or bool(self._shut[host, ended])
             if ended == life:
                 return
             del self._shut[host, ended]
         elif ended == life:
             self._shut[host, ended] = []  # its successor need not wait for it
-            self._changed = True
+            self._granted = True
 
     def _succeed(self, host: str, before: int) -> None:
         """A new life of a host speaks. What the one before it was granted stays shut until that is known to have
@@ -116,7 +120,7 @@ class Warden:
         for vehicle in mine:
             self._grants[vehicle] = (self._grants[vehicle][0], self._next_stamp)
         self._hosts.pop(host, None)
-        self._changed = True
+        self._granted = True
 
     def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
         """Drop what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
@@ -137,13 +141,19 @@ class Warden:
     # --- what is granted ------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> Table | None:
-        """Grant what can be granted. Returns the table if it changed, or if it is time to tell it again."""
+        """Grant what can be granted. Returns the table if somebody waits for what is new in it, or once in a beat:
+        the same as before if nothing has changed."""
         self._plan(now_ns)
-        if not self._changed and now_ns - self._told_ns < BEAT_NS:
+        if not self._granted and now_ns - self._told_ns < BEAT_NS:
             return None
-        self._changed = False
+        if self._told is None or self._granted or self._changed:
+            self.seq += 1
+            self._told = self._table()
+        self._changed = self._granted = False
         self._told_ns = now_ns
-        self.seq += 1
+        return self._told
+
+    def _table(self) -> Table:
         return Table(
             plot=self._plot,
             agent=self._me,
@@ -187,7 +197,7 @@ class Warden:
                 self._grant(stand, ahead, held, round.taken)
         if round.pushed != self._pushed:
             self._pushed = round.pushed
-            self._changed = True
+            self._granted = True
 
     def _stands(self, now_ns: int) -> list[Stand]:
         """The vehicles of all who have spoken lately, whoever has been on its way for longest first."""
@@ -217,4 +227,4 @@ class Warden:
             held.add(cell)
             cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
             self._grants[stand.vehicle] = ([*cells, cell], self._next_stamp)
-            self._changed = True
+            self._granted = True

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
 from launch_scripts.world.walks import TrueTerrain
+from shared_map.terrain.importers.array_files import read_npy
+from swarm.config.input_files import FileKind
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 
@@ -109,10 +111,7 @@ def from_file(path: Path) -> Pace:
 
 
 def _read_npy(path: Path) -> NDArray[np.floating[Any]]:
-    try:
-        pace = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise TerrainError(f"field {path} is no .npy array: {error}") from error
+    pace = read_npy(path, FileKind.FIELD)
     if pace.ndim != 2 or not pace.size or pace.dtype.kind not in "fiu":
         raise TerrainError(
             f"field {path} has shape {pace.shape} of {pace.dtype}; expected rows x cols of paces in s/m"
@@ -123,7 +122,7 @@ def _read_npy(path: Path) -> NDArray[np.floating[Any]]:
         raise TerrainError(
             f"field {path}, row {row}, column {col}: a pace of {pace[row, col]}; expected more than 0, or inf"
         )
-    return pace  # type: ignore[no-any-return]
+    return pace
 
 
 class Field:

@@ -46,7 +46,7 @@ def after_lives(lives: int, compacts: bool, seed: int = 1) -> dict[str, float]:
                 new = [each for t in tiles for each in compact(keeper.held.of_tile(t), {}, gone, -(1 << 62))]
                 store.save(new)
                 keeper.merge(new)
-        store.forget_set_aside(1)  # as when the time to keep it is over
+        aside = [each for tile in store.tiles_set_aside() for each in store.set_aside(tile).values()]
         marked = sum(len(keeper.winners(tile).cells) for tile in keeper.held.tiles)
         sets = list(store.load())
     digest_bytes = sum(len(rows) for rows in keeper.held.ledger.held().values())
@@ -56,6 +56,7 @@ def after_lives(lives: int, compacts: bool, seed: int = 1) -> dict[str, float]:
         "authors": len(keeper.held.ledger.authors),
         "sets": len(sets),
         "marks": sum(len(each.kinds) for each in sets),
+        "marks_set_aside": sum(len(each.kinds) for each in aside),
         "payload_kib": round(sum(15 * len(each.kinds) + 40 for each in sets) / 1024),
         "digest_kib": math.ceil(digest_bytes / 1024),
     }

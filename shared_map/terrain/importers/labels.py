@@ -11,7 +11,7 @@ points_m = [[4700, 4200], [5300, 2900]]                   # each stands for 3 x 
 
 from __future__ import annotations
 
-import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass, polygon_mask
-from swarm.config.scenario import ClassName, Point, Section
+from swarm.config.input_files import FileKind, parse_toml, read_text
+from swarm.config.scenario import ClassName, Point, Polygon, Section
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -32,12 +33,12 @@ class Label(Section, frozen=True, kw_only=True, rename={"kind": "class"}):
     """A polygon, or points, of one class."""
 
     kind: ClassName
-    polygon_m: Annotated[tuple[Point, ...], Meta(min_length=3)] | None = None
-    points_m: tuple[Point, ...] = ()
+    polygon_m: Polygon | None = None
+    points_m: Annotated[tuple[Point, ...], Meta(max_length=10_000)] = ()
 
 
 class _File(Section, frozen=True, kw_only=True):
-    labels: Annotated[tuple[Label, ...], Meta(min_length=1)]
+    labels: Annotated[tuple[Label, ...], Meta(min_length=1, max_length=10_000)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +71,9 @@ def read_labels(path: Path, grid: GridSpec) -> Labels:
         If the file cannot be read or is not as it must be, if a label covers no cell, or if all labels left are of
         one class.
     """
+    raw = parse_toml(read_text(path, FileKind.LABELS), f"labels {path}", TerrainError)
     try:
-        found = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _File)
-    except OSError as error:
-        raise TerrainError(f"labels {path} cannot be read: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise TerrainError(f"labels {path} is not TOML: {error}") from error
+        found = msgspec.convert(raw, _File)
     except msgspec.ValidationError as error:
         raise TerrainError(f"labels {path}: {error}") from error
     classes = np.zeros((grid.rows, grid.cols), np.uint8)
@@ -83,23 +81,25 @@ def read_labels(path: Path, grid: GridSpec) -> Labels:
     count = 0
     for n, label in enumerate(found.labels):
         kind = TerrainClass[label.kind.upper()]
-        places = [_around(point, grid) for point in label.points_m]
-        if label.polygon_m is not None:
-            places.append(polygon_mask(label.polygon_m, grid))
-        if not any(place.any() for place in places):
-            raise TerrainError(f"labels {path}: label {n} ({label.kind}) covers no cell of the terrain")
-        for place in places:
+        covered = False
+        for place in _places(label, grid):
+            covered = covered or bool(classes[place].size)
             classes[place], groups[place] = kind, count
             count += 1
+        if not covered:
+            raise TerrainError(f"labels {path}: label {n} ({label.kind}) covers no cell of the terrain")
     if len(np.unique(classes[groups >= 0])) < 2:
         raise TerrainError(f"labels {path}: all labels are of one class; two are needed to tell them apart")
     return Labels(classes, groups, count)
 
 
-def _around(point: Point, grid: GridSpec) -> NDArray[np.bool_]:
-    """The cell of a point and its eight neighbours."""
-    col, row = int(point[0] // grid.resolution_m), int(point[1] // grid.resolution_m)
-    place = np.zeros((grid.rows, grid.cols), np.bool_)
-    if grid.inside(row, col):
-        place[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2] = True
-    return place
+def _places(label: Label, grid: GridSpec) -> Iterator[tuple[slice, slice] | NDArray[np.bool_]]:
+    """Indices of the cells of each point, its eight neighbours included, and of the polygon."""
+    for east_m, south_m in label.points_m:
+        col, row = int(east_m // grid.resolution_m), int(south_m // grid.resolution_m)
+        if grid.inside(row, col):
+            yield slice(max(row - 1, 0), row + 2), slice(max(col - 1, 0), col + 2)
+        else:
+            yield slice(0), slice(0)
+    if label.polygon_m is not None:
+        yield polygon_mask(label.polygon_m, grid)

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import io
+import itertools
 import math
 import re
-import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats
+from shared_map.terrain.importers.array_files import read_members
+from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text
 from swarm.errors import TerrainError
+from swarm.grid import MAX_CELLS
 
-MAX_CELLS = 16384 * 16384
+_NPZ_ARRAYS = ("elevation", "photo", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
+_PGM_HEADER_BYTES = 1 << 16
 SCALE_FACTOR = 9.0
 """ROS `scale` mode: pace grows by up to this many times between free and occupied."""
 
@@ -43,15 +47,6 @@ class PlainGrid:
     notes: tuple[str, ...] = ()
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="ascii")
-    except OSError as error:
-        raise TerrainError(f"terrain {path} cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise TerrainError(f"terrain {path} is no text: byte {error.start} is not ASCII") from error
-
-
 def check_cells(rows: int, cols: int, path: Path) -> None:
     """Raises TerrainError unless there are 1 to `MAX_CELLS` cells."""
     if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
@@ -69,17 +64,18 @@ def read_asc(path: Path) -> PlainGrid:
     TerrainError
         If the file cannot be read, or its rows are not what its header says.
     """
-    lines = _text(path).splitlines()
+    lines = enumerate(read_lines(path, FileKind.TEXT_GRID), 1)
     header: dict[str, float] = {}
-    first = 0
-    for first, line in enumerate(lines):
-        words = line.split()
-        if len(words) != 2 or not words[0][:1].isalpha() or words[0].lower() == "nan":
+    number, line = 0, ""
+    for number, line in lines:
+        words = line.split(maxsplit=2)
+        if len(words) != 2 or not words[0][:1].isalpha() or words[0].lower() == "nan" or number > 32:
             break
         try:
             header[words[0].lower()] = float(words[1])
         except ValueError as error:
-            raise TerrainError(f"terrain {path}, line {first + 1}: {words[1]!r} is no number") from error
+            raise TerrainError(f"terrain {path}, line {number}: {words[1][:40]!r} is no number") from error
+        line = ""
     missing = [key for key in ("ncols", "nrows", "cellsize") if key not in header]
     if missing:
         raise TerrainError(f"terrain {path} is no ESRI ASCII grid: its header lacks {', '.join(missing)}")
@@ -92,20 +88,27 @@ def read_asc(path: Path) -> PlainGrid:
     check_cells(rows, cols, path)
     if not step > 0:
         raise TerrainError(f"terrain {path}: cellsize is {step:g}; it must be positive")
-    body = [line for line in lines[first:] if line.strip()]
-    if len(body) != rows:
-        raise TerrainError(f"terrain {path} has {len(body)} rows of heights; its header says {rows}")
     heights = np.empty((rows, cols), np.float32)
-    for row, line in enumerate(body):
-        words = line.split()
-        if len(words) != cols:
-            raise TerrainError(
-                f"terrain {path} is ragged: line {first + row + 1} has {len(words)} heights, its header says {cols}"
-            )
-        try:
-            heights[row] = np.array(words, np.float32)
-        except ValueError as error:
-            raise TerrainError(f"terrain {path}, line {first + row + 1}: {error}") from error
+    row = 0
+    while True:
+        if line.strip():
+            if row == rows:
+                raise TerrainError(f"terrain {path} has more rows of heights than its header says, {rows}")
+            words = line.split()
+            if len(words) != cols:
+                raise TerrainError(
+                    f"terrain {path} is ragged: line {number} has {len(words)} heights, its header says {cols}"
+                )
+            try:
+                heights[row] = np.array(words, np.float32)
+            except ValueError as error:
+                raise TerrainError(f"terrain {path}, line {number}: {str(error)[:100]}") from error
+            row += 1
+        number, line = next(lines, (0, ""))
+        if not number:
+            break
+    if row < rows:
+        raise TerrainError(f"terrain {path} has {row} rows of heights; its header says {rows}")
     heights[heights == np.float32(header.get("nodata_value", -9999.0))] = np.nan
     half = step / 2
     west = header["xllcorner"] if "xllcorner" in header else header.get("xllcenter", half) - half
@@ -126,21 +129,14 @@ def read_npz(path: Path) -> PlainGrid:
     TerrainError
         If the file cannot be read, an array would unpack to more than 5 * `MAX_CELLS` bytes, or is not as above.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            _check_promises(archive, path)
-        with np.load(path, allow_pickle=False) as file:
-            arrays: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}
-    except OSError as error:
-        raise TerrainError(f"terrain {path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise TerrainError(f"terrain {path} is truncated or no .npz of numbers: {error}") from error
+    arrays, shapes = read_members(path, _NPZ_ARRAYS)
     heights = arrays.get("elevation")
     if heights is None or heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
-        held = ", ".join(f"{name} {value.shape}" for name, value in sorted(arrays.items()))
+        held = ", ".join(f"{name[:40]} {shape}" for name, shape in sorted(shapes.items()))
         raise TerrainError(
             f"terrain {path} has no two-dimensional `elevation` of numbers; it has {held or 'nothing'}"
         )
+    check_cells(heights.shape[0], heights.shape[1], path)
     photo = arrays.get("photo")
     if photo is not None and (photo.shape != (*heights.shape, 3) or photo.dtype != np.uint8):
         raise TerrainError(f"terrain {path}: photo is {photo.shape} {photo.dtype}, not {(*heights.shape, 3)} uint8")
@@ -165,13 +161,6 @@ def _positive(step: float, path: Path) -> float:
     return step
 
 
-def _check_promises(archive: zipfile.ZipFile, path: Path) -> None:
-    """A small archive may promise 20 GB: look at the headers before anything is unpacked."""
-    for member in archive.infolist():
-        if member.file_size > 5 * MAX_CELLS:
-            raise TerrainError(f"terrain {path}: {member.filename} would unpack to {member.file_size / 1e9:.1f} GB")
-
-
 # --- maps without heights -----------------------------------------------------------------------------------
 
 
@@ -183,8 +172,8 @@ def read_map(path: Path) -> PlainGrid:
     TerrainError
         If the file cannot be read, its rows are not what its header says, or a letter is unknown.
     """
-    lines = _text(path).splitlines()
-    words = [line.split() for line in lines[:4]]
+    lines = read_lines(path, FileKind.TEXT_GRID)
+    words = [line[:200].split() for line in itertools.islice(lines, 4)]
     try:
         ((_, kind), (_, rows_text), (_, cols_text), (marker,)) = words
         header = {line[0]: line[-1] for line in words}
@@ -196,15 +185,22 @@ def read_map(path: Path) -> PlainGrid:
     if marker != "map" or not rows_text or not cols_text:
         raise TerrainError(f"terrain {path} is no MovingAI map: line 4 is {marker!r}, not 'map'")
     check_cells(rows, cols, path)
-    body = lines[4:]
-    while body and not body[-1].strip():
-        body.pop()
-    if len(body) != rows:
-        raise TerrainError(f"terrain {path} has {len(body)} rows; its header says {rows}")
-    for row, line in enumerate(body):
-        if len(line) != cols:
+    cells = np.empty((rows, cols), np.uint8)
+    row = 0
+    for row, line in enumerate(lines):
+        if row >= rows:
+            if line.strip():
+                raise TerrainError(f"terrain {path} has more rows than its header says, {rows}")
+        elif len(line) == cols:
+            cells[row] = np.frombuffer(line.encode("ascii"), np.uint8)
+        elif line.strip():
             raise TerrainError(f"terrain {path}, line {row + 5}: {len(line)} cells; its header says {cols}")
-    cells = np.frombuffer("".join(body).encode("ascii"), np.uint8).reshape(rows, cols)
+        else:
+            break
+    else:
+        row += 1
+    if row < rows:
+        raise TerrainError(f"terrain {path} has {row} rows; its header says {rows}")
     factor = np.full((rows, cols), np.nan, np.float32)
     factor[np.isin(cells, list(b".GS"))] = 1.0
     factor[np.isin(cells, list(b"@OTW"))] = np.inf
@@ -276,7 +272,7 @@ def read_ros(path: Path) -> PlainGrid:
 def _flat_yaml(path: Path) -> dict[str, str]:
     """`key: value` lines; map_server needs no more of YAML."""
     values = {}
-    for number, line in enumerate(_text(path).splitlines(), 1):
+    for number, line in enumerate(read_text(path, FileKind.ROS_MAP).splitlines(), 1):
         line = re.sub(r"(^|\s)#.*", "", line).strip()
         if not line or line == "---":
             continue
@@ -302,33 +298,66 @@ def read_pgm(path: Path) -> tuple[NDArray[np.int32], int]:
     TerrainError
         If the file cannot be read, is no PGM, or is shorter than its header says.
     """
+    length = check_bytes(path, FileKind.IMAGE)
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            head = file.read(_PGM_HEADER_BYTES)
+            magic = head[:2]
+            if magic not in (b"P2", b"P5"):
+                raise TerrainError(
+                    f"image {path} is no PGM: it begins with {magic!r}, not P2 or P5;"
+                    " convert it (magick map.png map.pgm)"
+                )
+            header = re.match(rb"P[25]" + rb"(?:\s|#[^\n]*\n)+(\d{1,9})" * 3 + rb"(?:#[^\n]*\n|\s)", head)
+            if header is None:
+                raise TerrainError(f"image {path} is no PGM: width, height and brightest value are missing")
+            cols, rows, brightest = (int(group) for group in header.groups())
+            check_cells(rows, cols, path)
+            if not 0 < brightest < 65536:
+                raise TerrainError(f"image {path}: its brightest value is {brightest}; 1 to 65535 are allowed")
+            file.seek(header.end())
+            if magic == b"P5":
+                dtype = np.dtype(">u2" if brightest > 255 else "u1")
+                found = min((length - header.end()) // dtype.itemsize, rows * cols)
+                pixels = np.frombuffer(file.read(found * dtype.itemsize), dtype)
+            else:
+                pixels = _decimals(file, rows * cols, path)
     except OSError as error:
-        raise TerrainError(f"image {path} cannot be read: {error.strerror or error}") from error
-    magic = data[:2]
-    if magic not in (b"P2", b"P5"):
-        raise TerrainError(
-            f"image {path} is no PGM: it begins with {magic!r}, not P2 or P5; convert it (magick map.png map.pgm)"
-        )
-    header = re.match(rb"P[25]" + rb"(?:\s|#[^\n]*\n)+(\d{1,9})" * 3 + rb"(?:#[^\n]*\n|\s)", data)
-    if header is None:
-        raise TerrainError(f"image {path} is no PGM: width, height and brightest value are missing")
-    cols, rows, brightest = (int(group) for group in header.groups())
-    check_cells(rows, cols, path)
-    if not 0 < brightest < 65536:
-        raise TerrainError(f"image {path}: its brightest value is {brightest}; 1 to 65535 are allowed")
-    body = data[header.end() :]
-    if magic == b"P2":
-        try:
-            text = re.sub(rb"#[^\n]*", b"", body)
-            pixels = np.loadtxt(io.BytesIO(b" ".join(text.split())), np.int64, ndmin=1).reshape(-1)
-        except ValueError as error:
-            raise TerrainError(f"image {path} is no PGM: {error}") from error
-    else:
-        pixels = np.frombuffer(
-            body[: len(body) // 2 * 2] if brightest > 255 else body, ">u2" if brightest > 255 else "u1"
-        )
+        raise FileKind.IMAGE.unreadable(path, error) from error
     if pixels.size < rows * cols:
         raise TerrainError(f"image {path} is truncated: {pixels.size} pixels; its header says {rows} x {cols}")
-    return np.asarray(pixels[: rows * cols].reshape(rows, cols), np.int32), brightest
+    return np.asarray(pixels.reshape(rows, cols), np.int32), brightest
+
+
+def _decimals(file: BinaryIO, count: int, path: Path) -> NDArray[np.int32]:
+    """Up to so many whole numbers of a text, read piece by piece."""
+    pixels = np.empty(count, np.int32)
+    at = 0
+    for words in _words(file):
+        try:
+            taken = np.array(words[: count - at], np.int32)
+        except (ValueError, OverflowError) as error:
+            raise TerrainError(f"image {path} is no PGM: {str(error)[:100]}") from error
+        pixels[at : at + len(taken)] = taken
+        at += len(taken)
+        if at == count:
+            break
+    return pixels[:at]
+
+
+def _words(file: BinaryIO) -> Iterator[list[bytes]]:
+    """Words of a text without its comments, some at a time."""
+    rest, comment = b"", False
+    while piece := file.read(1 << 16):
+        lines = (rest + piece).split(b"\n")
+        rest = b""
+        words: list[bytes] = []
+        for number, line in enumerate(lines):
+            text, mark, _ = (b"", b"#", b"") if comment else line.partition(b"#")
+            comment = bool(mark) and number == len(lines) - 1
+            words += text.split()
+        if words and not comment and not lines[-1][-1:].isspace() and lines[-1]:
+            rest = words.pop()[:20]  # it may go on in the next piece
+        yield words
+    if rest:
+        yield [rest]

@@ -18,11 +18,30 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
 from shared_map.terrain.row_bands import Progress, bands, no_progress
+from swarm.config.input_files import FileKind, check_bytes, size
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
-from swarm.grid import GridSpec
+from swarm.grid import MAX_CELLS, GridSpec
 
-MAX_CELLS = 16384 * 16384
+_DRIVERS = {
+    b"II*\0": "GTiff",
+    b"MM\0*": "GTiff",
+    b"II+\0": "GTiff",
+    b"MM\0+": "GTiff",
+    b"<VRTDataset": "VRT",
+    b"\x89PNG": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+    b"\0\0\0\x0cjP  ": "JP2OpenJPEG",
+    b"RIFF": "WEBP",
+    b"BM": "BMP",
+}
+"""First bytes -> GDAL's driver. GDAL knows 150 formats, most of which nobody has tried to break for long."""
+_BY_ROWS = ("GTiff", "SRTMHGT", "VRT")
+_MAX_PIXELS = 16 * MAX_CELLS
+"""Of formats which are read a part at a time. Of others, `MAX_CELLS`."""
+_MAX_BLOCK_BYTES = 512 << 20
+"""A block is what has to be unpacked at once."""
+_MAX_BANDS = 256
 _FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937}
 _SHOWN = ("lat_0", "lat_ts", "lon_0", "zone")
 MAX_SPAN_DEG = 12.0
@@ -63,14 +82,55 @@ def opened(path: Path, what: str) -> Iterator[Any]:
     if not path.is_file():
         raise TerrainError(f"{what} {path} does not exist")
     try:
+        driver = _driver_of(path, what)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null"), rasterio.open(path) as dataset:
+            # A .vrt names other files: none of them may be somewhere on the network.
+            with (
+                rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null", CPL_VSIL_CURL_ALLOWED_EXTENSIONS=".none"),
+                rasterio.open(path, driver=driver) as dataset,
+            ):
+                _check_size(dataset, f"{what} {path}")
                 _check_length(path, dataset, what)
                 yield dataset
     except (RasterioError, CPLE_BaseError) as error:
         reason = str(error.__cause__ or error).strip().splitlines()[0]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
+    except OSError as error:
+        raise TerrainError(f"cannot read {what} {path}: {error.strerror or error}") from error
+
+
+def _driver_of(path: Path, what: str) -> str:
+    if path.suffix.lower() == ".hgt":
+        return "SRTMHGT"
+    with path.open("rb") as file:
+        head = file.read(16)
+    driver = next((driver for magic, driver in _DRIVERS.items() if head.startswith(magic)), None)
+    if driver is None:
+        known = ", ".join(dict.fromkeys(_DRIVERS.values()))
+        raise TerrainError(f"{what} {path} is no raster: it begins with {head[:8]!r}, as none of {known} does")
+    if driver == "VRT":
+        check_bytes(path, FileKind.VIRTUAL_RASTER)
+    return driver
+
+
+def _check_size(dataset: Any, what: str) -> None:
+    """Refuse what would not fit, before a pixel is read: a file of a megabyte can promise any number of them."""
+    rows, cols = dataset.height, dataset.width
+    most = _MAX_PIXELS if dataset.driver in _BY_ROWS else MAX_CELLS
+    if rows * cols > most:
+        raise TerrainError(f"{what} has {rows} x {cols} pixels; at most {most} are read: crop it")
+    if dataset.count > _MAX_BANDS:
+        raise TerrainError(f"{what} has {dataset.count} bands; at most {_MAX_BANDS} are read")
+    widths = [np.dtype(dtype).itemsize for dtype in dataset.dtypes]
+    interleaved = str(dataset.tags(ns="IMAGE_STRUCTURE").get("INTERLEAVE", "")).upper() == "PIXEL"
+    for (high, wide), width in zip(dataset.block_shapes, widths, strict=True):
+        block = high * wide * (sum(widths) if interleaved else width)
+        if block > _MAX_BLOCK_BYTES:
+            raise TerrainError(
+                f"{what} is stored in blocks of {high} x {wide} pixels, {size(block)}; at most"
+                f" {size(_MAX_BLOCK_BYTES)} are unpacked at once: gdal_translate -co TILED=YES makes smaller ones"
+            )
 
 
 def _check_length(path: Path, dataset: Any, what: str) -> None:
@@ -82,12 +142,8 @@ def _check_length(path: Path, dataset: Any, what: str) -> None:
     if path.stat().st_size < promised and not sparse:
         raise TerrainError(
             f"{what} {path} is truncated: its header promises {dataset.height} x {dataset.width} cells,"
-            f" {_size(promised)}, and it has {_size(path.stat().st_size)}; fetch it again"
+            f" {size(promised)}, and it has {size(path.stat().st_size)}; fetch it again"
         )
-
-
-def _size(length: int) -> str:
-    return f"{length / 1e6:.1f} MB" if length >= 100_000 else f"{length} bytes"
 
 
 def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_progress) -> Raster:

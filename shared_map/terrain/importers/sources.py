@@ -13,9 +13,10 @@ import numpy as np
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
+from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
-from swarm.grid import GridSpec
+from swarm.grid import MAX_CELLS, GridSpec
 
 JACKSBORO_RESOLUTION_M = 75.0
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
@@ -154,7 +155,7 @@ def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 def _check_hgt(path: Path) -> None:
     """.hgt has no header: its length is its only description."""
     sides = (1201, 3601)
-    length = path.stat().st_size
+    length = check_bytes(path, FileKind.VIRTUAL_RASTER if path.suffix.lower() == ".vrt" else FileKind.IMAGE)
     if path.suffix.lower() == ".hgt" and length not in [2 * side * side for side in sides]:
         raise TerrainError(
             f"terrain {path} is truncated or no .hgt: it has {length} bytes; an .hgt of 1201 cells a side has"
@@ -301,7 +302,7 @@ def _from_metres(
     rows, cols = int(heights.shape[0] / row_step + 1e-6), int(heights.shape[1] / col_step + 1e-6)
     if rows < 1 or cols < 1:
         raise TerrainError(f"terrain.resolution_m = {resolution_m:g} is coarser than the whole of {what}")
-    if rows * cols > 16384 * 16384:
+    if rows * cols > MAX_CELLS:
         raise TerrainError(f"{what} would be {rows} x {cols} cells; set a larger terrain.resolution_m")
     grid = GridSpec(rows, cols, resolution_m, west, north, crs or config.crs or "local")
     if abs(col_step - 1) < 1e-9 and abs(row_step - 1) < 1e-9:

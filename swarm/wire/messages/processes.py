@@ -51,6 +51,17 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
     histograms: Annotated[dict[Word, Annotated[dict[Bucket, Count], Meta(max_length=40_000)]], SMALL]
 
 
+class Beat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
+    """State of one of several processes with one job, such as a target's planner and its standbys. `ready`: it can
+    do the job. `leads`: it does."""
+
+    role: Id
+    id: Id
+    incarnation: Incarnation
+    ready: bool
+    leads: bool
+
+
 class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):
     """An event for people: a capture, a restart, a closed road found. `cell` is its place, if it has one."""
 

@@ -127,7 +127,7 @@ class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
     agent  who answers
     disk   the file that it takes to be the other's: the first that it was told of
     life   the greatest life in any table
-    plots  those whose tables grant cells to its vehicles
+    plots  those whose tables grant cells to its vehicles, or keep cells of an earlier life of it shut
     """
 
     agent: Id

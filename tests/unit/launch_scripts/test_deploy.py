@@ -15,7 +15,7 @@ from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import SMALL
 from swarm.bus.access_control import access_control, bearer, common_name
 from swarm.bus.memory_bus import MemoryBus
-from swarm.config.scenario import GroupConfig, NetworkConfig, Scenario, TargetConfig, TlsConfig
+from swarm.config.scenario import GroupConfig, NetworkConfig, Scenario, StandbyConfig, TargetConfig, TlsConfig
 from swarm.errors import ConfigError
 from swarm.wire.topics import Topic
 
@@ -44,7 +44,8 @@ def allowed(control: dict[str, Any], name: str, flow: str, message: str, key: st
 def test_processes_do_nothing_that_the_router_would_deny(monkeypatch: pytest.MonkeyPatch) -> None:
     targets = (msgspec.structs.replace(SMALL.targets[0], tracker="sighted"), TargetConfig(name="x"))
     vehicles = msgspec.structs.replace(SMALL.vehicles, sense_range_m=400.0)
-    scenario = msgspec.structs.replace(SMALL, targets=targets, vehicles=vehicles)
+    standbys = StandbyConfig(planner=1, targets=1)
+    scenario = msgspec.structs.replace(SMALL, targets=targets, vehicles=vehicles, standbys=standbys)
     done: set[tuple[str, str, str]] = set()
     for method, message in {
         "publish_bytes": "put", "subscribe": "declare_subscriber", "serve": "declare_queryable", "ask": "query",
@@ -89,6 +90,10 @@ def test_every_process_of_a_scenario_has_a_name_and_what_the_scenario_admits_bes
         "agent.a.b.a0", "agent.a.b.a1", "agent.red.a2", "tracker.real", "operator.0", "keeper.east",
         "operator.anna",
     ]  # fmt: skip
+    standing_by = msgspec.structs.replace(scenario, standbys=StandbyConfig(planner=1, targets=2))
+    assert set(certificate_names(standing_by)) - set(certificate_names(scenario)) == {
+        "planner.t0.r1", "planner.t1.r1", "planner.real.r1", "targets.0.r1", "targets.0.r2",
+    }  # fmt: skip
     agent = bearer("agent.a.b.a1")
     assert (agent.role, agent.id, agent.author) == ("agent", "a1", "a.b.a1")
 

@@ -16,9 +16,10 @@ from support.processes import eventually, session_of
 
 from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm, WarmUp
-from launch_scripts.launcher.up import _StopAsked
+from launch_scripts.launcher.up import UpOptions, _StopAsked, run_swarm
 from launch_scripts.process_table import ROLES, STOP_ORDER, ProcessSpec, processes_of
-from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
+from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
+from swarm.errors import ConfigError
 from swarm.runtime.role import RoleSetup
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -66,6 +67,30 @@ def test_the_table_has_a_process_for_each_target_and_each_25_vehicles() -> None:
         *("targets-0", "agent-a0", "agent-a1", "agent-a2"),
     ]
     assert [spec.name for spec in processes_of(scenario, ("router", "agent"))][:2] == ["router-0", "agent-a0"]
+
+
+def test_the_table_has_standbys_after_those_that_lead_and_may_be_limited_to_a_rank() -> None:
+    scenario = Scenario(targets=(TargetConfig(count=2),), standbys=StandbyConfig(planner=2, targets=1))
+    roles = ("planner", "targets", "agent")
+
+    def names(rank: int | None) -> list[str]:
+        return [spec.name for spec in processes_of(scenario, roles, rank) if spec.role != "agent"]
+
+    assert names(None) == [
+        *("planner-t0", "planner-t1", "planner-t0.r1", "planner-t1.r1", "planner-t0.r2", "planner-t1.r2"),
+        *("targets-0", "targets-0.r1"),
+    ]
+    assert names(0) == ["planner-t0", "planner-t1", "targets-0"]
+    assert names(1) == ["planner-t0.r1", "planner-t1.r1", "targets-0.r1"]
+    assert names(2) == ["planner-t0.r2", "planner-t1.r2"]
+    assert names(3) == []
+    assert len([spec for spec in processes_of(scenario, rank=1) if spec.role == "agent"]) == 4
+
+
+def test_a_part_of_a_swarm_that_has_no_process_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    options = UpOptions(Scenario(name="x"), tmp_path, roles=("planner",), rank=1)
+    with pytest.raises(ConfigError, match="scenario x has no planner of rank 1; see standbys"):
+        run_swarm(options)
 
 
 def test_targets_that_somebody_else_tracks_need_no_driver() -> None:

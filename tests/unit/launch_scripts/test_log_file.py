@@ -26,10 +26,10 @@ def write(
     return subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
 
 
-def test_a_line_begins_with_its_date(tmp_path: Path) -> None:
+def test_a_line_begins_with_its_date_time_and_zone(tmp_path: Path) -> None:
     write(tmp_path / "a.log", "log.info('hello')")
     line = (tmp_path / "a.log").read_text()
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} INFO    writer: hello\n", line)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}[+-]\d\d:\d\d INFO    writer: hello\n", line)
 
 
 def test_a_log_and_what_is_printed_into_it_stay_within_twice_the_bound(tmp_path: Path) -> None:

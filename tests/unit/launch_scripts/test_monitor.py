@@ -224,7 +224,8 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
             assert reply.read(4) == b"\0asm"
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(f"{sinks.live_url}etc/passwd", timeout=30)
-        assert eventually(lambda: listeners(os.getpid()) == {"0100007F"})
+        assert eventually(lambda: len(listeners(os.getpid())) > 1)
+        assert all(address.endswith("7F") for address in listeners(os.getpid())), "127.x.x.x, all of it loopback"
         assert children(os.getpid()) == before, "the viewer program is gone again"
         assert list(home.rglob("*")) == [], "nothing is written to the home folder"
     finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.stats import Histogram
@@ -19,7 +20,7 @@ from swarm.wire.fields import pack_column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.processes import Beat, Stats
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
 from swarm.wire.statements import MarkKind
@@ -259,6 +260,29 @@ def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recor
 def test_an_authors_older_set_does_not_replace_its_newer_one(recorder: Recorder) -> None:
     hear(recorder, marks("a0.1", 2, {}), marks("a0.1", 1, {33: (MarkKind.LETHAL, 0.0, 10)}))
     assert recorder.marked().cells.tolist() == []
+
+
+def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> None:
+    standing_by = msgspec.structs.replace(scenario(), standbys=StandbyConfig(planner=1))
+    recorder = Recorder(standing_by, GRID)
+    assert "planner t0.r1" in recorder.missing()
+
+    def titles() -> list[str]:
+        return [line.title for line in recorder.summary(0).targets]
+
+    def beat(id: str, leads: bool) -> Beat:
+        return Beat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
+
+    assert titles() == ["t0 (planner down)", "t1 (planner down)"]
+    for id in ("t0", "t0.r1", "t1"):
+        recorder.alive(Peer("planner", id, 1), True, 0)
+    hear(recorder, beat("t0", True), beat("t0.r1", False), beat("t1", True))
+    assert titles() == ["t0", "t1"]
+    recorder.alive(Peer("planner", "t0", 1), False, 0)
+    hear(recorder, beat("t0.r1", True))
+    assert titles() == ["t0 (standby 1)", "t1"]
+    hear(recorder, beat("t0.r1", False), beat("t0", True))
+    assert titles() == ["t0", "t1"]
 
 
 def test_the_live_table_has_a_line_per_target(recorder: Recorder) -> None:

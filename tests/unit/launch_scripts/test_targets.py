@@ -14,6 +14,7 @@ from launch_scripts.world.service import TargetsService
 from launch_scripts.world.targets import (
     LISTEN_NS,
     PATIENCE_NS,
+    STAY_COOL_DOWN_NS,
     Action,
     Captured,
     Publish,
@@ -25,6 +26,7 @@ from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
 from swarm.errors import ConfigError
+from swarm.wire.codec import decode, encode
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import VehicleState
@@ -214,10 +216,69 @@ def test_an_external_target_is_not_driven_but_can_be_caught() -> None:
     assert world.poses() == {}
     cell = world.grid.cell(5, 5)
     x_m, y_m = world.grid.centre_m(cell)
-    world.world.hear_pose(TargetPose(target="t", incarnation=9, seq=1, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m))
+    pose = TargetPose(target="t", incarnation=9, seq=1, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m)
+    world.world.hear_pose(pose, 0)
     assert world.poses() == {}
     assert world.hear(cell) == [Captured("t", "v", cell)]
     assert world.hear(cell) == []
+
+
+def stand_by(leader: World, **fields: Any) -> World:
+    """A standby that has heard what a leader tells."""
+    standby = World(still(**fields))
+    standby.world.lead(False)
+    for pose in leader.poses().values():
+        standby.world.hear_pose(pose, standby.now_ns)
+    return standby
+
+
+def test_a_standby_does_nothing_and_goes_on_from_where_the_leader_ended() -> None:
+    leader = World(still(), incarnation=9)
+    leader.settle()
+    cell = leader.world._targets["t"].walker.cell
+    assert leader.hear(cell) != []
+    standby = stand_by(leader)
+    assert standby.tick() == []
+    assert standby.world.ready
+    assert standby.hear(cell) == []
+    last = leader.poses()["t"]
+    standby.world.hear_pose(last, standby.now_ns)
+    standby.world.lead(True)
+    first = standby.poses()["t"]
+    assert (first.cell, first.captures, first.jumps) == (last.cell, 1, 1)
+    assert (first.incarnation, first.seq) > (last.incarnation, last.seq)
+
+
+def test_a_capture_that_the_leader_counted_counts_once_after_it_is_gone() -> None:
+    leader = World(still(caught="stay"), incarnation=9)
+    leader.settle()
+    cell = leader.world._targets["t"].walker.cell
+    assert leader.hear(cell) == [Captured("t", "v", cell)]
+    standby = stand_by(leader, caught="stay")
+    standby.world.lead(True)
+    assert standby.hear(cell) == []
+    assert standby.poses()["t"].captures == 1
+    standby.now_ns += STAY_COOL_DOWN_NS + TICK
+    assert standby.hear(cell) == [Captured("t", "v", cell)]
+    assert standby.poses()["t"].captures == 2
+
+
+def test_a_pose_with_the_highest_incarnation_that_there_is_leaves_a_standby_its_own() -> None:
+    standby = World(still(), incarnation=5)
+    standby.world.lead(False)
+    highest = (1 << 62) - 1
+    most = (1 << 53) - 1
+    lie = TargetPose(
+        target="t", incarnation=highest, seq=highest, stamp_ns=0, cell=777, x_m=0.0, y_m=0.0, captures=most,
+        jumps=most,
+    )  # fmt: skip
+    standby.world.hear_pose(lie, standby.now_ns)
+    standby.world.lead(True)
+    standby.tick(1 + STAY_COOL_DOWN_NS // TICK)
+    assert len(standby.hear(777)) == 2
+    pose = standby.poses()["t"]
+    assert (pose.incarnation, pose.captures, pose.jumps) == (5, 1, 1)
+    assert decode(encode(pose), TargetPose) == pose
 
 
 @pytest.mark.parametrize(

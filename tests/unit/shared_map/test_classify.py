@@ -211,5 +211,5 @@ def test_a_labelled_point_stands_for_nine_cells(tmp_path: Path) -> None:
 def test_bad_labels_are_refused_with_a_sentence(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(TerrainError, match=words):
         labels_file(tmp_path, text)
-    with pytest.raises(TerrainError, match="cannot be read"):
+    with pytest.raises(TerrainError, match="cannot read labels"):
         read_labels(tmp_path / "nowhere.toml", GridSpec(2, 2, 1.0))

@@ -82,6 +82,14 @@ def test_an_old_set_of_a_deleted_author_is_deleted_again() -> None:
     assert again.seq > tombstone.seq > newer.seq > older.seq
 
 
+def test_an_old_set_that_was_heard_again_is_put_back_under_a_number_that_replicas_with_the_tombstone_take() -> None:
+    own = set_of("a", 0, 1, {1: (LETHAL, 0, 10)})
+    (tombstone,) = compact([own, set_of("b", 0, 1, {1: (CLEAR, 0, 20)})], {}, {"a", "b"}, 0)
+    (again,) = compact([own], {"a": without(own, tombstone)}, {"a"}, 0)
+    assert cells_of(again) == [1]
+    assert again.seq > tombstone.seq > own.seq
+
+
 def test_an_authors_next_set_stands_above_all_compacted_sets_of_the_last() -> None:
     assert next_seq(0) == SEQ_STEP
     assert next_seq(SEQ_STEP + 7) == 2 * SEQ_STEP
@@ -89,6 +97,18 @@ def test_an_authors_next_set_stands_above_all_compacted_sets_of_the_last() -> No
     last = set_of("a", 0, 1, {})
     no_number_left = mark_set("a", "all", 0, 1, 2 * SEQ_STEP - 1, statements(last))
     assert compact([no_number_left], {}, {"a"}, 0) == []
+
+
+def test_under_the_last_number_all_that_was_dropped_is_put_back() -> None:
+    new = set_of("b", 0, 1, {1: (CLEAR, 0, 20)})
+    last = mark_set("a", "all", 0, 1, 2 * SEQ_STEP - 2, statements(set_of("a", 0, 1, {2: (LETHAL, 0, 10)})))
+    dropped = mark_set("a", "all", 0, 1, last.seq, statements(set_of("a", 0, 1, {1: (LETHAL, 0, 10)})))
+    (whole,) = compact([last, new], {"a": dropped}, {"a"}, 0)
+    assert cells_of(whole) == [1, 2]
+    assert whole.seq == 2 * SEQ_STEP - 1
+    assert compact([whole, new], {}, {"a", "b"}, 0) == []
+    full = mark_set("a", "all", 0, 1, last.seq, statements(set_of("a", 0, 1, {1: (LETHAL, 0, 10)})))
+    assert compact([full, new], {}, {"a", "b"}, 0) == []  # or nothing could put back what it would drop
 
 
 @given(st.lists(mark_sets(), max_size=12), st.sets(st.sampled_from(AUTHORS)))
@@ -210,8 +230,7 @@ def test_a_store_sets_aside_what_a_compaction_drops_until_its_author_says_someth
     store.save([tombstone], now_ns=200)
     assert list(store.load()) == []
     assert cells_of(store.set_aside(0)["a"]) == [1, 2]
-    store.forget_set_aside(200)
-    assert list(store.set_aside(0)) == ["a"]
+    assert store.tiles_set_aside() == [0]
     store.save([set_of("a", 0, 2, {3: (LETHAL, 0, 30)})])
     assert store.set_aside(0) == {}
 
@@ -250,15 +269,33 @@ def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> 
     plan.update(replica.held.ledger, 105)
     plan.heard("a", 108)
     plan.update(replica.held.ledger, 110)
-    assert plan.take_due(9, 110) == {}
+    assert plan.take_due(9, 110) == []
     plan.update(replica.held.ledger, 111)
-    assert plan.take_due(9, 111) == {3: True}  # we do not know what happened before we began
     plan.update(replica.held.ledger, 119)
-    assert plan.take_due(9, 119) == {0: False}
-    assert plan.take_due(9, 119) == {}
+    assert sorted(plan.take_due(9, 119)) == [0, 3]
+    assert plan.take_due(9, 119) == []
     plan.accepted(set_of("b", 3, 2, {}))
-    plan.put_off({0: False, 3: False})
-    assert plan.take_due(9, 119) == {3: True, 0: False}
+    plan.put_off([0, 3])
+    assert plan.take_due(9, 119) == [3, 0]
+
+
+def test_a_tile_is_due_when_an_author_dies_or_turns_out_to_live_and_when_an_earlier_life_dropped_something() -> (
+    None
+):
+    replica = MapReplica(GRID)
+    replica.merge([set_of("a", 0, 1, {1: (LETHAL, 0, 1)}), set_of("b", 3, 1, {1: (LETHAL, 0, 1)})])
+    plan = CompactionPlan(10, 100, set_aside=[2])
+    plan.heard("a", 111)
+    plan.update(replica.held.ledger, 111)
+    assert plan.take_due(9, 111) == [2, 3]
+    plan.update(replica.held.ledger, 122)
+    assert plan.take_due(9, 122) == [0]
+    plan.heard("b", 123)
+    plan.accepted(set_of("b", 5, 2, {}))  # nothing left of what it stated there before
+    plan.update(replica.held.ledger, 123)
+    assert plan.take_due(9, 123) == [5, 3]
+    plan.accepted(set_of("b", 5, 3, {}))
+    assert plan.take_due(9, 123) == []
 
 
 # --- services -----------------------------------------------------------------------------------------------

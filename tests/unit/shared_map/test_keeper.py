@@ -50,6 +50,32 @@ def test_an_older_set_never_replaces_a_newer_one_in_the_store() -> None:
     assert list(store.load()) == [set_of("a", 0, 5, {}, epoch=2)]
 
 
+def test_the_log_beside_the_store_stays_small_however_much_is_written_again(tmp_path: Path) -> None:
+    """Otherwise a small disk is full of it for good: pages of the log stay there until somebody cuts the file."""
+    log = tmp_path / "map.sqlite-wal"
+    longest = 0
+    keeper = Keeper()
+    with KeeperStore(tmp_path / "map.sqlite") as store:
+        for seq in range(1, 41):
+            for tile in range(64):
+                keeper.accept(set_of("a", tile, seq, dict.fromkeys(range(1024), (LETHAL, 0, seq))))
+            for batch in keeper.batches():
+                store.save(batch)
+                keeper.saved(batch)
+                longest = max(longest, log.stat().st_size)
+    assert longest < 3 << 20, "one batch more than its bound"
+
+
+def test_a_batch_is_what_one_commit_should_hold() -> None:
+    keeper = Keeper()
+    for tile in range(100):
+        keeper.accept(set_of("a", tile, 1, dict.fromkeys(range(1024), (LETHAL, 0, 1))))
+    batches = list(keeper.batches())
+    assert sum(map(len, batches)) == 100
+    assert len(batches) > 2
+    assert max(map(len, batches)) < 60
+
+
 def test_the_store_of_another_terrain_is_refused(tmp_path: Path) -> None:
     store = KeeperStore(tmp_path / "map.sqlite")
     store.bind("0123456789abcdef", GRID)
@@ -119,11 +145,11 @@ def test_only_what_is_on_the_disk_counts_as_committed() -> None:
     keeper = Keeper()
     first, second = set_of("a", 0, 1, {}), set_of("a", 0, 2, {})
     keeper.accept(first)
-    waiting = keeper.waiting
+    (waiting,) = keeper.batches()
     keeper.accept(second)  # while the first is being written
     assert keeper.committed.held() == {}
     keeper.saved(waiting)
-    assert keeper.waiting == [second]
+    assert list(keeper.batches()) == [[second]]
     assert keeper.committed.missing({}) == []
     assert list(keeper.committed.held()) == ["a"]
 

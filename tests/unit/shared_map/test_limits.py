@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from support.map_strategies import set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.service import THROTTLED
 from shared_map.keeper.store import KeeperStore
-from shared_map.replication.limits import Quota
+from shared_map.replication.limits import _MAX_WAITING, Capacity, Quota
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario
+from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import NOTE
+
+_EMPTY = {name: getattr(set_of("a", 0, 1, {}), name) for name in MarkSet.__struct_fields__}
 
 
 def test_an_author_that_overdraws_its_budget_waits_until_it_has_filled_up_and_others_do_not() -> None:
@@ -44,7 +48,46 @@ def test_budgets_that_are_full_again_are_forgotten() -> None:
     quota = Quota(author_marks_per_s=1)
     quota.charge("a", 1, 0)
     quota.forget(100 * NS_PER_S)
-    assert quota._authors == {}
+    assert quota._owners == {}
+
+
+def test_a_process_gains_nothing_by_writing_under_many_lives() -> None:
+    quota = Quota(author_marks_per_s=10, total_marks_per_s=100)
+    for life in range(4):
+        assert quota.admits(set_of(f"all.a0.{life}", 0, 1, {}), 0)
+        quota.charge(f"all.a0.{life}", 30, 0)
+    assert not quota.admits(set_of("all.a0.9", 0, 1, {}), 0)
+    assert not quota.admits(set_of("all.a0.8", 0, 1, {}), 0)
+    assert quota.throttled == ["all.a0"]
+    assert quota.admits(set_of("all.a1.9", 0, 1, {}), 0)
+    later_ns = 100 * NS_PER_S
+    assert [quota.due(later_ns), quota.due(later_ns), quota.due(later_ns)] == [
+        set_of("all.a0.9", 0, 1, {}), set_of("all.a0.8", 0, 1, {}), None,
+    ]  # fmt: skip
+    capacity = Capacity(max_sets=8, max_marks=100)
+    taken = [capacity.take(set_of(f"all.a0.{life}", life, 1, {}), None) for life in range(8)]
+    assert taken == [True, True] + 6 * [False]
+    assert capacity.full_for("all.a0.99")
+    assert capacity.take(set_of("all.a1.1", 0, 1, {}), None)
+    for life in range(2):
+        capacity.free(set_of(f"all.a0.{life}", life, 1, {}))
+    assert capacity.take_all("all.a0.9", 2, 2)
+
+
+@pytest.mark.parametrize("owners", [1, 9])
+def test_what_waits_is_bounded_for_one_process_and_for_all(owners: int) -> None:
+    quota = Quota(author_marks_per_s=1)
+    for owner in range(owners):
+        quota.charge(f"all.a{owner}.1", 100, 0)
+    at_most = _MAX_WAITING // 4 if owners == 1 else _MAX_WAITING
+    for tile in range(_MAX_WAITING // 4 + 10):
+        for owner in range(owners):
+            assert not quota.admits(MarkSet(**_EMPTY | {"author": f"all.a{owner}.1", "tile": tile}), 0)
+    waited = 0
+    while quota.due(10_000 * NS_PER_S) is not None:
+        waited += 1
+    assert waited == at_most
+    assert quota.throttled == []
 
 
 def test_of_all_together_only_who_exceeds_its_share_waits() -> None:
@@ -101,13 +144,13 @@ def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up()
         swarm.run(0.2)
     calm.sync.publish(calm.replica.write([5], MarkKind.LETHAL, 0.0, swarm.now_ns))
     swarm.run(1)
-    assert listener.sync.throttled == ["loud.1"]
+    assert listener.sync.throttled == ["loud"]
     assert "calm.1" in listener.replica.held.ledger.held()
-    assert keeper.counters.gauges[THROTTLED + "loud.1"] == 1
-    assert notes == ["author loud.1 exceeds its quota; its marks are delayed"]
+    assert keeper.counters.gauges[THROTTLED + "loud"] == 1
+    assert notes == ["author loud exceeds its quota; its marks are delayed"]
     swarm.run(400)
     assert listener.sync.throttled == []
-    assert THROTTLED + "loud.1" not in keeper.counters.gauges
+    assert THROTTLED + "loud" not in keeper.counters.gauges
     assert (
         listener.replica.held.fingerprint() == loud.replica.held.fingerprint() == keeper.replica.held.fingerprint()
     )

@@ -50,7 +50,7 @@ def test_an_ascii_grid_is_read_from_the_north(tmp_path: Path) -> None:
             ASC.replace("cellsize 50", "cellsize 0.001").replace("1000", "9").replace("2000", "47"),
             "looks like degrees",
         ),
-        (b"\xff\xfe\x00", "no text"),
+        (b"\xff\xfe\x00", "is not text: line 1 is not ASCII"),
         ("", "no ESRI ASCII grid"),
     ],
 )

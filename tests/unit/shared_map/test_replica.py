@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.map_strategies import GRID, Composite, merge_one, replica_of, set_of
 
-from shared_map.replication.marks import MAX_AHEAD_NS, Statements, mark_set
+from shared_map.replication.marks import MAX_AHEAD_NS, Statements, mark_set, statements
 from shared_map.replication.replica import MapReplica, PublishSet
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
-from swarm.wire.messages.marks import MarkSet, MarksRequest
+from swarm.wire.messages.marks import SEQ_STEP, MarkSet, MarksRequest
 from swarm.wire.statements import FOREVER, MarkKind
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
@@ -202,6 +202,20 @@ def test_an_author_drops_its_own_ended_statements_from_its_set() -> None:
     [action] = replica.tick(NOW + 2 * NS_PER_S)
     assert action.mark_set == set_of("a1.1", 0, 2, {6: (LETHAL, 0, NOW + NS_PER_S)})
     assert composite.kinds[[5, 6]].tolist() == [CLEAR, LETHAL]
+
+
+@pytest.mark.parametrize("untils_ns", [range(10**18, 10**18 + 500), range(10**18, 10**18 - 500, -1)])
+def test_sets_whose_statements_expire_leave_no_more_behind_than_the_last_of_them(untils_ns: range) -> None:
+    replica, composite = replica_of([])
+    for number, until_ns in enumerate(untils_ns):
+        stated = statements(set_of("a", 0, 0, {1: (LETHAL, 0, 10)}))
+        stated = stated._replace(untils_ns=np.array([until_ns], np.int64))
+        replica.merge([mark_set("a", "all", 0, 1, number * SEQ_STEP, stated)])
+    assert len(replica._expiries) < 200
+    replica.tick(until_ns - 1)
+    assert composite.kinds[1] == LETHAL
+    replica.tick(until_ns)
+    assert composite.kinds[1] == CLEAR
 
 
 def test_saying_the_same_again_prolongs_a_lifetime() -> None:

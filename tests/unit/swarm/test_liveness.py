@@ -20,6 +20,17 @@ def test_a_new_incarnation_may_appear_before_the_old_one_is_gone():
     assert not roster.is_alive("planner", "t0")
 
 
+def test_however_many_tokens_one_process_raises_only_its_newest_are_kept() -> None:
+    roster = Roster()
+    for incarnation in range(1000, 0, -1):
+        roster.appeared(Peer("agent", "a0", incarnation))
+    assert len(roster._alive["agent", "a0"]) == 64
+    assert roster.alive("agent") == {"a0": 1000}
+    for incarnation in range(1000, 0, -1):
+        roster.gone(Peer("agent", "a0", incarnation))
+    assert not roster.is_alive("agent", "a0")
+
+
 def test_the_newest_incarnation_counts_and_roles_are_apart():
     roster = Roster()
     for peer in (Peer("agent", "a1", 5), Peer("agent", "a0", 9), Peer("agent", "a0", 3), Peer("keeper", "a0", 99)):

@@ -187,6 +187,29 @@ def test_a_vehicle_drives_what_it_is_granted_and_gives_back_what_is_found_lethal
     assert [vehicle.cell for vehicle in agent.vehicles.values()][1] == GRID.cell(8, 8)
 
 
+@pytest.mark.parametrize("beside", [GRID.cell(5, 6), GRID.cell(6, 5)])
+def test_a_corner_that_is_found_lethal_is_not_cut_though_the_cell_behind_it_is_granted(beside: int) -> None:
+    """It would come into a pocket that nothing leads out of."""
+    agent = agent_of(parse_scenario(TEXT))
+    here, behind = GRID.cell(5, 5), GRID.cell(6, 6)
+    grant(agent, 1, v0=[here])
+    grant(agent, 2, v0=[here, behind])
+    agent.begin_drive(0)
+    agent.begin_drive(S // 10)
+    agent.drive()
+    assert agent.vehicles["a0-00"].motion.head == behind
+    pace = LEVEL.copy()
+    pace.reshape(-1)[beside] = np.inf
+    agent._map = dataclasses.replace(agent._map, pace=pace)
+    agent._steering._pace = pace.reshape(-1)
+    agent.map_changed(S // 5)
+    assert list(agent.holdings.path("a0-00")) == [here]
+    agent.begin_drive(2 * S)
+    while agent.drive() is not None:
+        pass
+    assert agent.vehicles["a0-00"].cell == here
+
+
 # --- assignment ---------------------------------------------------------------------------------------------
 
 ALIVE = {"t0": 1, "t1": 1, "t2": 1}

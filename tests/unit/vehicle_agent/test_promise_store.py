@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -32,16 +34,27 @@ def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
     again.close()
 
 
-def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize("written", [0, 1, 20, None], ids=["nothing", "a byte", "a part", "all but its length"])
+def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int | None) -> None:
+    """Its length is written last; and what is left of it does not spoil the next one."""
     path = tmp_path / "promises-a0"
     store = FilePromiseStore(path)
     store.save(3, table(0, 1))
+    end = store._at
     store.save(3, table(0, 2))
     store.close()
-    path.write_bytes(path.read_bytes()[:-3])
+    data = bytearray(path.read_bytes())
+    data[end : end + 4] = bytes(4)
+    if written is not None:
+        data[end + 4 + written :] = bytes(len(data) - end - 4 - written)
+    path.write_bytes(data)
     again = FilePromiseStore(path)
     assert again.saved == {0: (3, table(0, 1))}
+    again.save(4, Table(plot=1, agent="a0", epoch=4, seq=1, hosts={}, grants={}))  # a shorter one
     again.close()
+    third = FilePromiseStore(path)
+    assert {plot: promised for plot, (promised, _) in third.saved.items()} == {0: 3, 1: 4}
+    third.close()
 
 
 def test_a_second_process_on_the_same_file_is_refused(tmp_path: Path) -> None:
@@ -58,14 +71,73 @@ def test_a_file_that_is_none_of_ours_is_refused_in_words(tmp_path: Path) -> None
         FilePromiseStore(path)
 
 
-def test_a_file_that_has_grown_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(promise_store, "_LARGEST_BYTES", 2000)
+def test_a_file_that_is_full_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(promise_store, "_SIZE_BYTES", 2000)
     path = tmp_path / "promises-a0"
     store = FilePromiseStore(path)
     for seq in range(200):
         store.save(3, table(seq % 3, seq))
-        assert path.stat().st_size < 2200
+        assert path.stat().st_size == 2000
+        assert store.ready
     store.close()
     again = FilePromiseStore(path)
     assert {plot: saved.seq for plot, (_, saved) in again.saved.items()} == {0: 198, 1: 199, 2: 197}
+    again.close()
+
+
+def test_what_counts_may_grow_beyond_the_size_that_a_file_begins_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(promise_store, "_SIZE_BYTES", 2000)
+    store = FilePromiseStore(tmp_path / "promises-a0")
+    for plot in range(300):
+        store.save(3, table(plot, plot))
+        assert store.ready
+    store.close()
+    again = FilePromiseStore(tmp_path / "promises-a0")
+    assert {plot: saved.seq for plot, (_, saved) in again.saved.items()} == {n: n for n in range(300)}
+    again.close()
+
+
+class Disk:
+    """Overwrites what it has, and gives no more space while it is full."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.full = False
+        self._pwrite = os.pwrite
+        monkeypatch.setattr(os, "pwrite", self.pwrite)
+
+    def pwrite(self, file: int, data: bytes, at: int) -> int:
+        if self.full and at + len(data) > os.fstat(file).st_size:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return self._pwrite(file, data, at)
+
+
+def test_on_a_full_disk_promises_are_kept_until_the_space_is_used_up_and_again_when_there_is_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(promise_store, "_SIZE_BYTES", 2000)
+    disk, path = Disk(monkeypatch), tmp_path / "promises-a0"
+    store = FilePromiseStore(path)
+    for seq in range(30):
+        store.save(3, table(0, seq))
+    disk.full = True
+    seq = 30
+    while store.ready:
+        store.save(3, table(0, seq))
+        seq += 1
+    assert seq > 32
+    assert store.reserve() == f"cannot write {path}.spare: No space left on device"
+    store.save(3, table(0, seq))  # what one event still brings
+    assert not path.with_name("promises-a0.spare").exists(), "nobody else's space is taken for nothing"
+    store.close()
+    again = FilePromiseStore(path)  # a life that begins meanwhile
+    assert again.saved[0][1].seq == seq
+    assert not again.ready
+    disk.full = False
+    assert again.reserve() is None
+    assert again.ready
+    for later in range(seq, seq + 100):
+        again.save(3, table(0, later))
+    assert again.ready
     again.close()

@@ -52,10 +52,10 @@ def test_what_comes_after_a_cell_of_the_route_is_known_before_the_vehicle_is_the
     assert route.near(2) == [11, 12]
 
 
-def test_a_route_ends_before_the_first_closed_cell_ahead() -> None:
+def test_a_route_ends_before_the_first_step_ahead_that_is_closed() -> None:
     route = following(11, 12, 13, 14, here=12)
-    assert not route.cut({11}.__contains__)
-    assert route.cut({14}.__contains__)
+    assert not route.cut(lambda tail, head: head != 12)
+    assert route.cut(lambda tail, head: (tail, head) != (13, 14))
     assert route.ahead() == [13]
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import random
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.traffic import Grant, Stand, Standing, Stored, Table
+from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
 from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.member import Member, Refused, Save
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.warden import Warden, first_life, is_far_ahead
+from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
+from vehicle_agent.traffic.warden import BEAT_NS, Warden, first_life, is_far_ahead
 
 GRID = GridSpec(8, 8, 1.0)
 AGENTS = [f"a{n}" for n in range(5)]
@@ -126,15 +128,45 @@ def member_of(promised: int = 0) -> Member:
 
 def test_after_a_promise_nothing_older_is_stored() -> None:
     member = member_of()
-    save, stored = member.hear_table(table_of(1, 1), 0)
-    assert isinstance(save, Save)
-    assert stored == Stored(plot=0, agent=MEMBERS[0], epoch=1, seq=1)
+    assert isinstance(member.hear_table(table_of(1, 1), 0)[0], Save)
+    assert member.on_file == Stored(plot=0, agent=MEMBERS[0], epoch=1, seq=1)
     assert member.hear_claim(5, S // 10) == []  # the warden was heard just now
     assert isinstance(member.hear_claim(5, 2 * S)[0], Save)
     assert member.hear_claim(5, 9 * S) == []
-    assert [type(action) for action in member.hear_table(table_of(1, 2), 2 * S)] == [Stored]
+    assert member.hear_table(table_of(1, 2), 2 * S) == [Stored(plot=0, agent=MEMBERS[0], epoch=5, seq=0)]
     assert member.stored.stamp == (1, 1)
     assert member.hear_table(table_of(5, 1), 2 * S)[-1] == Stored(plot=0, agent=MEMBERS[0], epoch=5, seq=1)
+
+
+def test_the_second_member_says_what_the_first_has_not_said_and_something_in_each_beat() -> None:
+    first, second = (Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), set(), 0) for n in (2, 0))  # of epoch 1
+    said = first.hear_table(table_of(1, 1), S)
+    assert [type(action) for action in said] == [Save, Stored]
+    assert [type(action) for action in second.hear_table(table_of(1, 1), S)] == [Save]
+    assert second.tick(S) == [second.on_file]  # it has not heard the first
+    second.hear_table(table_of(1, 2), S)
+    second.hear_stored(Stored(plot=0, agent=MEMBERS[2], epoch=1, seq=2), S)
+    assert second.tick(S) == []
+    assert second.tick(S + BEAT_NS) == [Stored(plot=0, agent=MEMBERS[0], epoch=1, seq=2)]
+    assert second.tick(2 * S) == []
+    second.hear_table(table_of(1, 2), 2 * S)  # the warden tells it again
+    assert second.tick(2 * S) == [second.on_file]
+
+
+def test_what_has_not_changed_is_told_again_under_the_same_stamp_once_in_a_beat() -> None:
+    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1-00"})
+    first = warden.tick(0)
+    assert first is not None
+    warden.hear(standing("a1", [9, 10], seq=2), 0)
+    assert warden.tick(BEAT_NS // 2) is None
+    assert warden.tick(BEAT_NS) is first
+    warden.hear(standing("a1", [10], seq=3), BEAT_NS)
+    assert warden.tick(BEAT_NS + 1) is None  # what is only freed can wait
+    freed = warden.tick(2 * BEAT_NS)
+    assert freed is not None
+    assert (freed.seq, freed.hosts["a1"], freed.grants["a1-00"].cells) == (2, (1, 3), [10])
+    warden.hear(standing("a1", [10], seq=4, vehicles=[]), 2 * BEAT_NS)  # it wants nothing here any more
+    assert warden.tick(3 * BEAT_NS).hosts["a1"] == (1, 4)  # type: ignore[union-attr]
 
 
 def test_an_epoch_has_one_warden_only_though_a_promise_comes_twice() -> None:
@@ -193,10 +225,12 @@ def test_a_cell_given_back_is_not_asked_for_before_the_table_shows_that_it_is_fr
     hear(holdings, table_of(1, 2, a0=[9, 10, 11]))
     holdings.give_back("a0-00")
     wishes = {"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}
-    (said,) = holdings.standings(wishes)
+    (said,) = holdings.standings(wishes, S)
+    assert holdings.standings(wishes, S + BEAT_NS - 1) == []  # nothing new
+    assert len(holdings.standings(wishes, S + BEAT_NS)) == 1
     assert (said.vehicles[0].holds, said.vehicles[0].ahead, said.vehicles[0].wants) == ([9], [], [17, 1])
     hear(holdings, table_of(1, 3, a0=[9]))
-    (said,) = holdings.standings(wishes)
+    (said,) = holdings.standings(wishes, S + BEAT_NS)
     assert (said.vehicles[0].ahead, said.vehicles[0].wants) == ([10, 11], [10, 17, 1])
 
 
@@ -207,7 +241,53 @@ def test_the_older_of_two_lives_learns_that_it_is_replaced() -> None:
     hear(holdings, table)
     assert holdings.replaced
     assert list(holdings.path("a0-00")) == []
-    assert all(said.ended for said in holdings.standings({}))
+    assert all(said.ended for said in holdings.standings({}, S))
+
+
+def rights_of(agent: str, saved: dict[int, tuple[int, Table]] | None = None) -> RightOfWay:
+    spawns = {name: {f"{name}-00": n} for n, name in enumerate(AGENTS)}
+    return RightOfWay(agent, PLOTS, spawns, OwnRecord(disk=7), saved or {})
+
+
+def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there_that_it_has_stopped() -> None:
+    """Nobody else can: the later life has another file. It had left that plot long ago."""
+    table = msgspec.structs.replace(table_of(1, 1), shut=[Shut("a4", 1 << 32, [9])])
+    member = rights_of(MEMBERS[0], {0: (1, table)})
+    (*_, known) = member.answer_known(KnownRequest(agent="a4", disk=7))
+    assert isinstance(known, Known)
+    assert known.plots == [0]
+    older = rights_of("a4")
+    older.begin(0)
+    for name in AGENTS[:4]:
+        older.hear_known(Known(agent=name, disk=7, life=0, plots=[]))
+    assert older.settled
+    older.holdings.plots.clear()
+    older.holdings.replaced = True
+    assert not older.settled  # so it is asked again what is known of it
+    older.hear_known(known)
+    (said,) = older.tick({}, S)
+    assert isinstance(said, Standing)
+    assert (said.plot, said.ended) == (0, True)
+
+
+def test_whoever_waits_in_a_plot_without_a_warden_says_so() -> None:
+    rights = rights_of("a0")
+    rights.begin(0)
+    life = rights.holdings.life
+
+    def hear(seq: int, now_ns: int) -> None:
+        table = table_of(1, seq, a0=[0])
+        table.hosts["a0"] = (life, 1)
+        rights.hear_table(table, now_ns)
+        rights.hear_stored(Stored(plot=0, agent=MEMBERS[2], epoch=1, seq=seq), now_ns)
+
+    assert rights.unled(S) == {}
+    hear(1, S)
+    assert rights.unled(3 * S) == {}
+    (sentence,) = rights.unled(4 * S).values()
+    assert all(member in sentence for member in MEMBERS)
+    hear(1, 4 * S)  # told again
+    assert rights.unled(5 * S) == {}
 
 
 @pytest.mark.parametrize("lie", [[0, -8], [-8], [56, 64], [1 << 31]])

@@ -1,0 +1,69 @@
+"""The file of revoked names beside a router's certificate. A router of ours reads it again and again."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+
+from swarm.config.scenario import CommonName, NetworkConfig
+from swarm.errors import ConfigError, StoreError
+
+FILE = "revoked"
+_MOST_BYTES = 1 << 20
+
+
+def revoked_in(folder: Path) -> tuple[str, ...]:
+    """The names in a folder's file of revoked names, one a line; none where there is no file. Raises ConfigError at
+    a line that is no name in a certificate, StoreError where the file cannot be read."""
+    path = folder / FILE
+    try:
+        with path.open(encoding="utf-8") as file:
+            text = file.read(_MOST_BYTES + 1)
+    except FileNotFoundError:
+        return ()
+    except UnicodeDecodeError as error:
+        raise ConfigError(
+            f"{path}: not UTF-8 text ({error.reason}), but names of certificates, one a line"
+        ) from error
+    except OSError as error:
+        raise StoreError(f"cannot read {path}: {error.strerror or error}") from error
+    if len(text) > _MOST_BYTES:
+        raise ConfigError(f"{path}: more than {_MOST_BYTES} characters")
+    names = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1)]
+    return tuple(_checked(name, f"{path}, line {number}") for number, name in names if name)
+
+
+def with_revocations(network: NetworkConfig) -> NetworkConfig:
+    """The network of a router which denies, beside the names that its scenario revokes, those in the file beside
+    its certificate."""
+    if network.tls is None:
+        return network
+    found = revoked_in(Path(network.tls.certificate).parent)
+    return msgspec.structs.replace(network, revoked=tuple(dict.fromkeys((*network.revoked, *found))))
+
+
+def revoke(folder: Path, names: list[str]) -> Path:
+    """Add names to a folder's file of revoked names, whole or not at all. Returns its path."""
+    path = folder / FILE
+    checked = [_checked(name, "a name to revoke") for name in names]
+    every = dict.fromkeys((*revoked_in(folder), *checked))
+    new = path.with_name(f"{FILE}.new")
+    try:
+        with new.open("w", encoding="utf-8") as file:
+            file.write("".join(f"{name}\n" for name in every))
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    return path
+
+
+def _checked(name: str, where: str) -> str:
+    try:
+        return msgspec.convert(name, CommonName)
+    except msgspec.ValidationError as error:
+        example = "agent.all.a0~2"
+        raise ConfigError(f"{where}: {name!r} is no name in a certificate, such as {example}: {error}") from error

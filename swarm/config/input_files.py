@@ -1,0 +1,154 @@
+"""Reading files that somebody hands us: refused by size before they are read, in one sentence.
+
+`FileKind` is the table of what may be read and how much of it. A new kind of file is a row.
+"""
+
+from __future__ import annotations
+
+import re
+import stat
+import tomllib
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
+from swarm.grid import MAX_CELLS
+
+MAX_LINE_BYTES = 16 << 20
+"""Longest line of a text that is read line by line."""
+MAX_DEPTH = 16
+"""Deepest nesting of brackets and dotted keys in TOML. The parser's time grows with the square of it."""
+
+
+class FileKind(Enum):
+    """What a file is to us: its name in sentences, how many bytes are read at most, the error that refuses it."""
+
+    SCENARIO = ("scenario", 1 << 19, ConfigError)
+    CERTIFICATE = ("certificate or key", 1 << 16, StoreError)
+    LABELS = ("labels", 4 << 20, TerrainError)
+    ROS_MAP = ("terrain", 1 << 16, TerrainError)
+    TEXT_GRID = ("terrain", 32 * MAX_CELLS, TerrainError)
+    ARRAYS = ("terrain", 12 * MAX_CELLS, TerrainError)
+    IMAGE = ("image", 8 * MAX_CELLS, TerrainError)
+    VIRTUAL_RASTER = ("raster", 4 << 20, TerrainError)
+    FIELD = ("field", 9 * MAX_CELLS, TerrainError)
+    PREPARED = ("prepared terrain", 1 << 20, TerrainError)
+    EXPORTED_MAP = ("exported map", 512 << 20, StoreError)
+    STORE = ("store", 4 << 30, StoreError)
+    PROMISES = ("promises", 256 << 20, StoreError)
+
+    def __init__(self, what: str, most_bytes: int, error: type[SwarmError]) -> None:
+        self.what = what
+        self.most_bytes = most_bytes
+        self.error = error
+
+    def refusal(self, path: Path, why: str) -> SwarmError:
+        """The error which says that a file cannot be read."""
+        return self.error(f"cannot read {self.what} {path}: {why}")
+
+    def unreadable(self, path: Path, error: OSError) -> SwarmError:
+        return self.refusal(path, error.strerror or str(error))
+
+
+def check_bytes(path: Path, kind: FileKind) -> int:
+    """Bytes of a file. Raises the kind's error if it is larger than is read, no file, or cannot be looked at."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise kind.refusal(path, why) from error
+    if not stat.S_ISREG(found.st_mode):
+        what = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or pipe"
+        raise kind.refusal(path, f"it is {what}, not a file")
+    if found.st_size > kind.most_bytes:
+        raise kind.refusal(path, f"it has {size(found.st_size)}; at most {size(kind.most_bytes)} are read")
+    return found.st_size
+
+
+def read_bytes(path: Path, kind: FileKind) -> bytes:
+    """The content of a file."""
+    check_bytes(path, kind)
+    try:
+        with path.open("rb") as file:
+            data = file.read(kind.most_bytes + 1)
+    except OSError as error:
+        raise kind.unreadable(path, error) from error
+    if len(data) > kind.most_bytes:  # it has grown since
+        raise kind.refusal(path, f"it has more than {size(kind.most_bytes)}")
+    return data
+
+
+def read_text(path: Path, kind: FileKind, encoding: str = "utf-8") -> str:
+    try:
+        return read_bytes(path, kind).decode(encoding)
+    except UnicodeDecodeError as error:
+        raise kind.error(f"{kind.what} {path} is not text: {error.reason} at byte {error.start}") from error
+
+
+def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
+    """The lines of a text in ASCII, without their ends, one after the other: only one is held."""
+    check_bytes(path, kind)
+    try:
+        with path.open("rb") as file:
+            number = 0
+            while line := file.readline(MAX_LINE_BYTES + 1):
+                number += 1
+                if len(line) > MAX_LINE_BYTES:
+                    raise kind.refusal(path, f"line {number} is longer than {size(MAX_LINE_BYTES)}")
+                yield line.decode("ascii").rstrip("\r\n")
+    except OSError as error:
+        raise kind.unreadable(path, error) from error
+    except UnicodeDecodeError as error:
+        raise kind.error(f"{kind.what} {path} is not text: line {number} is not ASCII") from error
+
+
+def size(count: int) -> str:
+    """Bytes, readable."""
+    for power, unit in ((9, "GB"), (6, "MB")):
+        if count >= 10 ** (power - 1):
+            return f"{count / 10**power:.1f} {unit}"
+    return f"{count} bytes"
+
+
+# --- TOML ---------------------------------------------------------------------------------------------------
+
+_NOT_STRUCTURE = re.compile(
+    r"""
+    "{3} (?: \\. | [^\\] )*? (?: "{3} | \Z )
+    | '{3} .*? (?: '{3} | \Z )
+    | " (?: \\. | [^"\\\n] )* "?
+    | ' [^'\n]* '?
+    | [#] [^\n]*
+    """,
+    re.DOTALL | re.VERBOSE,
+)
+"""Strings and comments. Every alternative matches once begun, so a scan takes time in proportion to the text."""
+_WORD = re.compile(r"[^\s.=,\[\]{}]+")
+_DOTTED = re.compile(r"(?:k?\.){" + str(MAX_DEPTH) + "}")
+
+
+def parse_toml(text: str, source: str, error: type[SwarmError]) -> dict[str, Any]:
+    """The values of a TOML text. Raises `error` with one sentence that begins with `source`."""
+    depth = 0
+    bare = _NOT_STRUCTURE.sub("s", text)
+    for bracket in re.finditer(r"[\[\]{}]", bare):
+        depth = depth + 1 if bracket[0] in "[{" else depth - 1
+        if depth > MAX_DEPTH:
+            raise error(f"{source}: not TOML that is read here: brackets are nested deeper than {MAX_DEPTH}")
+    words = _WORD.sub("k", bare).replace(" ", "").replace("\t", "")
+    if _DOTTED.search(words):
+        raise error(f"{source}: not TOML that is read here: a key has more than {MAX_DEPTH} parts")
+    try:
+        return tomllib.loads(text)
+    except ValueError as fault:  # a TOMLDecodeError, or a number of more digits than Python reads
+        raise error(f"{source}: not TOML: {fault}") from fault
+
+
+def shown(value: object) -> str:
+    """A value as a sentence quotes it, however large it is."""
+    if isinstance(value, int) and value.bit_length() > 256:
+        return f"a whole number of {value.bit_length()} bits"
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,0 +1,133 @@
+"""Which of several processes with one job leads: by rank, by beats and by a lease. Pure: time is an argument.
+
+Leader election as in Garcia-Molina's bully algorithm, without its messages: ranks are fixed, and everybody tells
+the others regularly whether it is ready and whether it leads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
+from swarm.ranks import split_rank
+from swarm.wire.messages.processes import Beat
+
+BEAT_NS = NS_PER_S // 10
+LEASE_NS = 6 * BEAT_NS
+"""A leader that has been silent for so long is replaced."""
+SETTLED_NS = 2 * NS_PER_S
+"""A better process takes over from a ready leader once it has been there and ready for so long. A process that was
+just started has the whole map by then, and one that keeps stalling never comes so far."""
+_MOST_OTHERS = 64
+"""Lives of other candidates that are remembered."""
+
+_Order = tuple[bool, int, int]
+"""The lower, the better: not ready, rank, older life."""
+
+
+@dataclass(slots=True)
+class _Other:
+    """The last beat of another candidate, and when it was heard."""
+
+    order: _Order
+    leads: bool
+    heard_ns: int
+
+
+class Leadership:
+    """One candidate's view of who leads.
+
+    - Who leads stops when it hears a better one lead. Better is: ready, then of lower rank, then the younger life.
+    - Who hears nobody lead for a lease begins, unless a better one is there, which does so itself.
+    - Who hears a worse one lead begins once it has been ready for `SETTLED_NS`, or for a lease if that one is not
+      ready.
+    - A leader that stalls for a lease stops if another was ready to replace it.
+
+    All periods are measured on a clock that counts the time between two ticks for half a lease at most: while this
+    process stalls, the beats of others wait unread, and nobody is taken for dead because of that.
+
+    alone    there is no other candidate: this one leads, always
+    period_ns  time between two ticks
+    """
+
+    def __init__(self, id: str, incarnation: int, *, alone: bool, period_ns: int) -> None:
+        self.leads = alone
+        """Whether this process leads. Changed by `tick` only."""
+        self.lease_ns = max(LEASE_NS, 4 * period_ns)
+        self._alone = alone
+        self._rank = split_rank(id)[1]
+        self._incarnation = incarnation
+        self._awake_ns = 0
+        """The clock, at the last tick."""
+        self._ticked_ns: int | None = None
+        """When that was, on the caller's clock."""
+        self._led_ns = 0
+        """When a leader was last heard; at first, when this began to listen."""
+        self._better_since_ns: int | None = None
+        """Since when this has been ready while a worse one leads; None if it is not so."""
+        self._others: dict[tuple[int, int], _Other] = {}
+        """(rank, incarnation) -> its last beat. Forgotten after a lease."""
+
+    def hear(self, beat: Beat, now_ns: int) -> None:
+        """What another candidate says."""
+        rank = split_rank(beat.id)[1]
+        key = (rank, beat.incarnation)
+        if key == (self._rank, self._incarnation):
+            return
+        if key not in self._others and len(self._others) >= _MOST_OTHERS:
+            return
+        heard_ns = self._awake_ns + self._counted(now_ns)
+        before = self._others.get(key)
+        order = _order(beat.ready, rank, beat.incarnation)
+        self._others[key] = _Other(order, beat.leads, heard_ns)
+        if beat.leads:
+            self._led_ns = heard_ns
+        elif before is not None and before.leads:
+            self._led_ns = heard_ns - self.lease_ns  # it has stopped: there is nothing to wait for
+
+    def tick(self, ready: bool, now_ns: int) -> bool:
+        """Decide whether this process leads from now on. `ready`: whether it can do its job."""
+        if self._alone:
+            return True
+        stalled = self._ticked_ns is not None and now_ns - self._ticked_ns >= self.lease_ns
+        if stalled:
+            self._better_since_ns = None
+            if any(not other.order[0] for other in self._others.values()):
+                self.leads = False
+        self._awake_ns += self._counted(now_ns)
+        self._ticked_ns = now_ns
+        earliest_ns = self._awake_ns - self.lease_ns
+        self._others = {key: other for key, other in self._others.items() if other.heard_ns > earliest_ns}
+        order = _order(ready, self._rank, self._incarnation)
+        leader = min((other.order for other in self._others.values() if other.leads), default=None)
+        self.leads = self._still(order, leader) if self.leads else self._begins(order, leader)
+        if self.leads:
+            self._led_ns = self._awake_ns
+        return self.leads
+
+    def _still(self, order: _Order, leader: _Order | None) -> bool:
+        self._better_since_ns = None
+        return leader is None or order < leader
+
+    def _begins(self, order: _Order, leader: _Order | None) -> bool:
+        if leader is None:
+            self._better_since_ns = None
+            silent_ns = self._awake_ns - self._led_ns
+            better = any(other.order < order for other in self._others.values())
+            return silent_ns >= self.lease_ns and not better
+        if leader < order:
+            self._better_since_ns = None
+            return False
+        if self._better_since_ns is None:
+            self._better_since_ns = self._awake_ns
+        return self._awake_ns - self._better_since_ns >= (self.lease_ns if leader[0] else SETTLED_NS)
+
+    def _counted(self, now_ns: int) -> int:
+        """What the time since the last tick counts."""
+        if self._ticked_ns is None:
+            return 0
+        return min(max(now_ns - self._ticked_ns, 0), self.lease_ns // 2)
+
+
+def _order(ready: bool, rank: int, incarnation: int) -> _Order:
+    return (not ready, rank, -incarnation)

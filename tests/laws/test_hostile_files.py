@@ -1,0 +1,294 @@
+"""The law of files: whatever lies in a file that a command reads, it is read, or refused in one sentence with an
+exit code; soon, and with little memory."""
+
+from __future__ import annotations
+
+import io
+import json
+import resource
+import struct
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from shared_map.keeper.export import from_json
+from shared_map.terrain.importers.array_files import read_npy
+from shared_map.terrain.importers.labels import read_labels
+from shared_map.terrain.importers.sources import load_source
+from swarm.config.input_files import FileKind, parse_toml, read_bytes
+from swarm.config.load import load_scenario
+from swarm.config.scenario import TerrainConfig
+from swarm.errors import ConfigError, StoreError, SwarmError
+from swarm.grid import GridSpec
+
+COMMAND = """
+import resource, sys
+from launch_scripts.cli import main
+try:
+    code = main()
+except SystemExit as end:
+    code = end.code or 0
+print("PEAK", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)
+sys.exit(code)
+"""
+MOST_MB = 400
+"""Of a command that refuses its input. It takes 150 with the libraries of rasters."""
+
+
+def npy(shape: tuple[int, ...], descr: str = "<f4", body: bytes = b"") -> bytes:
+    head = str({"descr": descr, "fortran_order": False, "shape": shape}).encode() + b" " * 20 + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + body
+
+
+def archive(path: Path, **members: bytes | int) -> Path:
+    """An .npz; a number stands for so many megabytes of zeros after the head of their array."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            with file.open(f"{name}.npy", "w", force_zip64=True) as member:
+                if isinstance(content, bytes):
+                    member.write(content)
+                    continue
+                member.write(npy((content << 20,), "|u1"))
+                for _ in range(content):
+                    member.write(bytes(1 << 20))
+    return path
+
+
+def sparse(path: Path, head: bytes = b"", length: int = 20 << 30) -> Path:
+    """A file of which only the head takes space on the disk."""
+    with path.open("wb") as file:
+        file.write(head)
+        file.truncate(length)
+    return path
+
+
+def raster(path: Path, rows: int, cols: int, **how: object) -> Path:
+    import rasterio
+    from rasterio.transform import from_origin
+
+    where = {"crs": "EPSG:32632", "transform": from_origin(5e5, 5e6, 0.01, 0.01), "SPARSE_OK": True}
+    with rasterio.open(
+        path, "w", driver="GTiff", count=1, dtype="float32", height=rows, width=cols, **where, **how
+    ):
+        pass
+    return path
+
+
+def run(*arguments: object, within_s: float = 100) -> tuple[int, str, int]:
+    """(exit code, all that was said, megabytes at most) of a command of `swarm`."""
+    command = [sys.executable, "-c", COMMAND, *map(str, arguments)]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=within_s, check=False)
+    said, _, peak = told.stdout.rpartition("PEAK")
+    return told.returncode, said + told.stderr, int(peak)
+
+
+TOML = {
+    "brackets": "a = " + "[" * 100_000 + "]" * 100_000,
+    "dotted": ".".join(["a"] * 100_000) + " = 1",
+    "headers": "[" + ".".join(["a"] * 3000) + "]\n" + "".join(f"k{i}=1\n" for i in range(20_000)),
+    "digits": "seed = " + "9" * 5000,
+    "hexadecimal": "seed = 0x" + "f" * 400_000,
+    "targets": "".join(f'[[targets]]\nname="t{i}"\n' for i in range(20_000)),
+    "counts": "".join(f'[[targets]]\ncount=1000\nname="t{i}"\n' for i in range(300)),
+    "key": "a" * 400_000 + " = 1",
+    "value": f"name = '{'a' * 400_000}'",
+}
+
+
+@pytest.mark.parametrize("text", TOML.values(), ids=TOML)
+def test_a_scenario_that_explodes_is_refused_in_a_short_sentence(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as refused:
+        load_scenario(path)
+    assert str(path) in str(refused.value)
+    assert len(str(refused.value)) < 600
+
+
+def test_endless_and_huge_files_are_refused_by_a_look(tmp_path: Path) -> None:
+    (tmp_path / "zero.toml").symlink_to("/dev/zero")
+    for path in (tmp_path / "zero.toml", sparse(tmp_path / "huge.toml")):
+        code, said, peak_mb = run("up", path, "--runs", tmp_path)
+        assert (code, said.count("\n")) == (2, 1), said
+        assert f"swarm: cannot read scenario {path}: it " in said
+        assert peak_mb < MOST_MB
+
+
+BOMBS: dict[str, Callable[[Path], Path]] = {
+    "elevation of 5 GB": lambda p: archive(p / "a.npz", elevation=npy((1 << 16, 1 << 16))),
+    "elevation of 2 TB": lambda p: archive(p / "a.npz", elevation=npy((1 << 20, 1 << 20))),
+    "objects": lambda p: archive(p / "a.npz", elevation=npy((2, 2), "|O", b"abc")),
+    "long text": lambda p: archive(p / "a.npz", elevation=npy((2, 2), "|S2147483647")),
+    "nested header": lambda p: archive(p / "a.npz", elevation=b"\x93NUMPY\x01\0\x28\x23" + b"(" * 8999 + b"\n"),
+    "not so long": lambda p: archive(p / "a.npz", elevation=npy((8000, 8000), "<f4", bytes(1 << 20))),
+    "members": lambda p: archive(p / "a.npz", **{f"m{n}": b"" for n in range(30_000)}),
+    "asc": lambda p: sparse(p / "a.asc", b"ncols 10\n"),
+    "line": lambda p: sparse(p / "a.asc", b"ncols 10\nnrows 10\ncellsize 10\n", 1 << 30),
+    "map": lambda p: sparse(p / "a.map", b"type octile\nheight 3\nwidth 4\nmap\n"),
+    "yaml": lambda p: sparse(p / "a.yaml"),
+    "vrt": lambda p: sparse(p / "a.vrt", b"<VRTDataset"),
+    "pixels": lambda p: raster(p / "a.tif", 200_000, 200_000, tiled=True, compress="deflate"),
+    "one block": lambda p: raster(p / "a.tif", 16_000, 16_000, compress="deflate", blockysize=16_000),
+}
+
+
+@pytest.mark.parametrize("make", BOMBS.values(), ids=BOMBS)
+def test_a_terrain_that_explodes_is_refused_in_a_sentence(tmp_path: Path, make: Callable[[Path], Path]) -> None:
+    path = make(tmp_path)
+    code, said, peak_mb = run("terrain", "info", path, "--resolution-m", 10)
+    assert code == 3, said
+    assert "Traceback" not in said
+    assert str(path) in said
+    assert peak_mb < MOST_MB
+
+
+def test_members_that_nobody_asked_for_are_not_unpacked(tmp_path: Path) -> None:
+    small = npy((8, 8), body=bytes(256))
+    path = archive(tmp_path / "a.npz", elevation=small, x=700, y=700)
+    code, said, peak_mb = run("terrain", "info", path, "--resolution-m", 10)
+    assert code == 0, said
+    assert peak_mb < MOST_MB
+
+
+def test_a_raster_that_names_others_reaches_nothing_on_the_network(tmp_path: Path) -> None:
+    import http.server
+    import threading
+
+    asked: list[str] = []
+
+    class Ear(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+
+        def do_HEAD(self) -> None:
+            asked.append(self.path)
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Ear) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        path = tmp_path / "a.vrt"
+        path.write_text(
+            '<VRTDataset rasterXSize="9" rasterYSize="9"><SRS>EPSG:32632</SRS><GeoTransform>0,9,0,0,0,-9'
+            '</GeoTransform><VRTRasterBand dataType="Float32" band="1"><SimpleSource><SourceFilename>/vsicurl/'
+            f"http://127.0.0.1:{server.server_address[1]}/x.tif</SourceFilename></SimpleSource></VRTRasterBand>"
+            "</VRTDataset>"
+        )
+        code, said, _ = run("terrain", "info", path)
+        server.shutdown()
+    assert code == 3, said
+    assert asked == []
+
+
+def test_an_export_that_explodes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError):
+        from_json('{"format":' + "[" * 200_000)
+    with pytest.raises(StoreError, match=r"it has 21\.5 GB; at most 0\.5 GB are read"):
+        read_bytes(sparse(tmp_path / "a.json"), FileKind.EXPORTED_MAP)
+
+
+# --- flipped, cut, mixed -----------------------------------------------------------------------------------
+
+
+def _seeds() -> dict[str, bytes]:
+    import rasterio
+    from rasterio.io import MemoryFile
+
+    heights = np.arange(64, dtype=np.float32).reshape(8, 8)
+    packed = io.BytesIO()
+    np.savez_compressed(packed, elevation=heights, resolution_m=10.0)
+    with MemoryFile() as memory:
+        with memory.open(
+            driver="GTiff", height=8, width=8, count=1, dtype="float32", crs="EPSG:32632", compress="deflate",
+            transform=rasterio.transform.from_origin(5e5, 5e6, 10, 10),
+        ) as file:  # fmt: skip
+            file.write(heights, 1)
+        tiff = bytes(memory.getbuffer())
+    return {
+        "a.npz": packed.getvalue(),
+        "a.tif": tiff,
+        "a.asc": b"ncols 3\nnrows 2\nxllcorner 1000\nyllcorner 2000\ncellsize 50\n1 2 3\n4 -9999 6\n",
+        "a.map": b"type octile\nheight 3\nwidth 4\nmap\n..@T\nGS.W\nO...\n",
+        "a.yaml": b"image: a.pgm\nresolution: 0.05\norigin: [-1.0, -2.0, 0.0]\noccupied_thresh: 0.65\n"
+        b"free_thresh: 0.25\n",
+        "a.pgm": b"P5\n# made by hand\n3 2\n255\n\xfe\x00\xcd\xfe\xfe\x00",
+        "a.toml": b'seed = 3\n[terrain]\nsource = "synthetic"\nrows = 60\n[[targets]]\nstart = [3, 4]\n',
+        "labels.toml": b'[[labels]]\nclass = "water"\npolygon_m = [[0, 0], [40, 0], [40, 40]]\n'
+        b'[[labels]]\nclass = "grass"\npoints_m = [[55, 55]]\n',
+        "a.npy": npy((4, 4), "<f4", bytes(64)),
+        "a.json": json.dumps(
+            {"format": "swarm-map/1", "terrain": "t", "grid": {"rows": 9, "cols": 9, "resolution_m": 1.0},
+             "sets": [{"author": "a.1", "group": "all", "tile": 0, "epoch": 1, "seq": 16,
+                       "marks": [[0, 1, "lethal", None, 5]]}]}
+        ).encode(),
+    }  # fmt: skip
+
+
+SEEDS = _seeds()
+
+
+def _read(path: Path) -> None:
+    match path.name:
+        case "a.toml":
+            load_scenario(path)
+        case "labels.toml":
+            read_labels(path, GridSpec(8, 8, 10.0))
+        case "a.npy":
+            read_npy(path, FileKind.FIELD)
+        case "a.json":
+            from_json(path.read_bytes())
+        case "a.pgm":
+            path.with_name("a.yaml").write_bytes(SEEDS["a.yaml"])
+            load_source(TerrainConfig(source=str(path.with_name("a.yaml"))), 1)
+        case "a.tif" | "a.npz":
+            load_source(TerrainConfig(source=str(path), resolution_m=10.0), 1)
+        case _:
+            load_source(TerrainConfig(source=str(path)), 1)
+
+
+@pytest.mark.parametrize("name", SEEDS)
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_flipped_cut_and_mixed_files_are_read_or_refused_in_one_line(
+    tmp_path: Path, name: str, data: st.DataObject
+) -> None:
+    content = bytearray(SEEDS[name])
+    places = st.integers(0, len(content) - 1)
+    for place, byte in data.draw(st.lists(st.tuples(places, st.integers(0, 255)), max_size=6)):
+        content[place] = byte
+    if data.draw(st.booleans()):
+        at = data.draw(places)
+        content[at : at + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
+    if data.draw(st.integers(0, 3)) == 0:
+        del content[data.draw(st.integers(0, len(content))) :]
+    path = tmp_path / name
+    path.write_bytes(content)
+    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+    said = ""
+    try:
+        _read(path)
+    except SwarmError as refused:
+        said = str(refused)
+    assert "\n" not in said
+    assert len(said) < 1000
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10) - before_mb < MOST_MB
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.lists(
+        st.sampled_from(['"', "'", '"""', "'''", "\\", "[", "]", "{", "}", ".", "a", "=", "#", "\n", " ", ","])
+    )
+)
+def test_no_text_gets_past_the_bounds_of_toml(parts: list[str]) -> None:
+    """What is parsed nests no deeper than its bound: the scan sees what the parser sees."""
+    try:
+        values = parse_toml("".join(parts), "x", ConfigError)
+    except ConfigError:
+        return
+    assert len(repr(values)) < 10_000

@@ -1,0 +1,82 @@
+"""A whole swarm on a disk that becomes full, and has space again."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.live_swarm import SWARM, write_scenario
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+SIZE_MB = 40
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("needs the right to mount a file system")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def lines_of(path: Path) -> list[str]:
+    return [" ".join(line.split()) for line in path.read_text().splitlines()]
+
+
+def until(path: Path, words: str, within_s: float) -> None:
+    deadline_s = time.monotonic() + within_s
+    while words not in path.read_text():
+        assert time.monotonic() < deadline_s, f"{words!r} not within {within_s:g} s:\n{path.read_text()}"
+        time.sleep(0.2)
+
+
+def fill(path: Path) -> None:
+    with path.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(1 << 14))
+
+
+def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: Path, disk: Path) -> None:
+    out = tmp_path / "out.txt"
+    command = [*SWARM, "up", str(write_scenario(tmp_path)), "--runs", str(disk / "runs"), "--plain"]
+    with out.open("w") as file:
+        swarm = subprocess.Popen([*command, "--seconds", "45"], stdout=file, stderr=subprocess.STDOUT)
+    try:
+        until(out, "routes are served", 240)
+        (run_dir,) = (disk / "runs").iterdir()
+        filler = disk / "filler"
+        with pytest.raises(OSError, match="No space"):
+            fill(filler)
+        until(out, f"cannot write to {run_dir}: No space left on device", 20)
+        until(out, "has ended: No space left on device; another begins when there is space", 20)
+        for role in ("agent", "keeper"):  # one that dies meanwhile lives again on the full disk
+            name = next(path.stem for path in run_dir.glob(f"{role}*.log"))
+            pid = next(
+                line.split("pid ")[1].split(",")[0] for line in lines_of(run_dir / f"{name}.log") if "pid " in line
+            )
+            subprocess.run(["kill", "-9", pid], check=True)
+        time.sleep(8)
+        filler.unlink()
+        until(out, f"{run_dir} can be written again", 20)
+        until(out, "the recording goes on in", 30)
+        assert swarm.wait(timeout=120) == 0, out.read_text()
+    finally:
+        if swarm.poll() is None:
+            swarm.terminate()
+            swarm.wait(timeout=20)
+    said = lines_of(out)
+    assert "vehicles that had a route 12" in said
+    assert "collisions 0" in said
+    assert "restarts 2" in said
+    assert "Traceback" not in out.read_text()
+    assert all("Traceback" not in path.read_text() for path in run_dir.glob("*.log*"))
+    assert (run_dir / "report.json").is_file()
+    assert (run_dir / "report.png").is_file()

@@ -1,0 +1,128 @@
+"""The machine of the leading planners dies or hangs, and the standbys on another one answer."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.live_swarm import SWARM, LiveSwarm, client
+from support.processes import eventually, session_of
+
+from swarm.bus.bus import Event, Heard, Replied
+from swarm.bus.endpoints import listening
+from swarm.bus.zenoh_bus import ZenohBus
+from swarm.runtime.inbox import Inbox
+from swarm.wire.messages.planning import RouteReply, RouteRequest
+from swarm.wire.messages.processes import Beat, Stats
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import LEAD, ROUTE, STATS
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+ASK_S = 0.05
+LONGEST_GAP_S = 3.0
+SECONDS_PER_CASE = 6.0
+
+
+class Asker:
+    """A client that asks for a route every 50 ms, and notes when an answer came and from whom."""
+
+    def __init__(self, bus: ZenohBus, target: str) -> None:
+        self.bus = bus
+        self.target = target
+        self.inbox = Inbox()
+        self.answers: list[tuple[float, int]] = []
+
+    def ask_for(self, seconds: float) -> None:
+        until_s = time.monotonic() + seconds
+        due_s = time.monotonic()
+        while (now_s := time.monotonic()) < until_s:
+            if now_s >= due_s:
+                due_s += ASK_S
+                request = RouteRequest(row=8, col=8)
+                self.bus.ask(ROUTE, request, self.inbox.post, tag="asker", timeout_s=1.0, target=self.target)
+            event = self.inbox.take(max(due_s - time.monotonic(), 0.0))
+            reply = event.message if isinstance(event, Replied) else None
+            if isinstance(reply, RouteReply) and reply.routes[0].status is not RouteStatus.NO_TARGET:
+                self.answers.append((time.monotonic(), reply.incarnation))
+
+    def longest_gap_s(self) -> float:
+        return max(late - early for (early, _), (late, _) in itertools.pairwise(self.answers))
+
+
+class Leaders:
+    """Who leads now, by what each tells."""
+
+    def __init__(self, bus: ZenohBus) -> None:
+        self.told: dict[str, bool] = {}
+        self.lost = 0.0
+        bus.subscribe(LEAD, self._take)
+        bus.subscribe(STATS, self._take, role="agent")
+
+    def _take(self, event: Event) -> None:
+        match event:
+            case Heard(message=Beat() as beat):
+                self.told[beat.id] = beat.leads
+            case Heard(message=Stats() as stats):
+                self.lost = stats.gauges.get("lost", 0.0)
+
+    def are(self, **told: bool) -> bool:
+        """Whether the planner of t0 and its standby lead: `first`, `second`."""
+        return {"first": self.told.get("t0"), "second": self.told.get("t0.r1")} == told
+
+
+@contextlib.contextmanager
+def machine(live: LiveSwarm, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A launcher elsewhere, with the planners that lead, in a session of its own."""
+    options = ["--connect", live.endpoint, "--only", "planner", "--rank", "0", "--plain", "--runs", str(folder)]
+    with (folder / "output.txt").open("w") as output:
+        launcher = subprocess.Popen(
+            [*SWARM, "up", str(live.path), *options], stdout=output, stderr=output, start_new_session=True
+        )
+    try:
+        yield launcher
+    finally:
+        if session_of(launcher.pid):
+            os.killpg(launcher.pid, signal.SIGKILL)
+        launcher.wait(10)
+
+
+def test_vehicles_and_clients_are_answered_again_soon_after_the_planners_machine_is_gone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts = [option for role in ("router", "keeper", "targets", "planner", "agent") for option in ("--only", role)]
+    live = LiveSwarm(tmp_path, *parts, "--rank", "1", also="\n[standbys]\nplanner = 1\ntargets = 1\n")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    gaps_s: dict[str, float] = {}
+    try:
+        eventually(lambda: listening(live.endpoint), 60, "the router")
+        with client(live.network) as bus, machine(live, elsewhere) as launcher:
+            leaders = Leaders(bus)
+            eventually(lambda: leaders.are(first=True, second=False), 150, "the planner of rank 0 to lead")
+            for how, number in (("hangs", signal.SIGSTOP), ("is dead", signal.SIGKILL)):
+                asker = Asker(bus, "t0")
+                asker.ask_for(2.0)
+                before = {life for _, life in asker.answers}
+                os.killpg(launcher.pid, number)
+                asker.ask_for(SECONDS_PER_CASE)
+                gaps_s[how] = asker.longest_gap_s()
+                assert asker.answers[-1][1] not in before, how
+                assert gaps_s[how] < LONGEST_GAP_S, (how, live.output.read_text())
+                if number == signal.SIGSTOP:
+                    os.killpg(launcher.pid, signal.SIGCONT)
+                    eventually(lambda: leaders.are(first=True, second=False), 60, "rank 0 to lead again")
+            assert leaders.lost == 0
+    finally:
+        live.kill()
+        told = ", ".join(f"{gap_s:.2f} s when the machine {how}" for how, gap_s in gaps_s.items())
+        with capsys.disabled():
+            sys.stdout.write(f"\nlongest time without an answer: {told}\n")

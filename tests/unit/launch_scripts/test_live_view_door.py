@@ -1,0 +1,165 @@
+"""The law of the live view's door: pages of this machine come in, those of other sites neither read nor connect;
+and nobody can keep it busy."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import socket
+import threading
+import time
+import urllib.parse
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from launch_scripts.monitor import loopback_guard, stream_gate
+from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.loopback_guard import MOST_CONNECTIONS, refusal
+from launch_scripts.monitor.scene import TerrainMesh
+from launch_scripts.monitor.sinks import Sinks
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.scenario import MonitorConfig
+
+pytestmark = pytest.mark.network
+
+READ = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
+GRPC_WEB = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"}
+
+
+@pytest.fixture(scope="module")
+def sinks() -> Iterator[Sinks]:
+    mesh = TerrainMesh(terrain_of_pace(np.ones((8, 8), np.float32)))
+    opened = Sinks("r", None, MonitorConfig(grpc_port=0, web_port=0), make_blueprint(mesh))
+    opened.rec.log("secret", rr.TextLog("where everybody is"))
+    yield opened
+    opened.close()
+
+
+def ports(sinks: Sinks) -> tuple[int, int]:
+    """Of the page and of the stream."""
+    page, stream = (urllib.parse.urlsplit(url or "").port or 0 for url in (sinks.live_url, sinks.stream_url))
+    return page, stream
+
+
+def ask(port: int, method: str, path: str, headers: dict[str, str], body: bytes = b"") -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    with contextlib.closing(connection):
+        connection.putrequest(method, path, skip_host="Host" in headers)
+        for name, value in headers.items():
+            connection.putheader(name, value)
+        connection.putheader("Content-Length", str(len(body)))
+        connection.endheaders(body)
+        reply = connection.getresponse()
+        return reply.status, reply.read1(500)
+
+
+FOREIGN = [
+    {"Host": "evil.example"},
+    {"Host": "evil.example:{port}", "Origin": "http://evil.example:{port}"},
+    {"Host": "127.0.0.1.evil.example:{port}"},
+    {"Host": "[::ffff:10.0.0.1]:{port}"},
+    {"Host": "localhost@evil.example"},
+    {"Host": ""},
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Origin": "http://localhost.evil.example"},
+    {"Origin": "https://app.rerun.io"},
+]
+OWN = [
+    {},
+    {"Host": "localhost:8080"},
+    {"Host": "127.0.0.1:{port}", "Origin": "http://127.0.0.1:9090"},
+    {"Host": "[::1]:{port}", "Origin": "http://[::1]:1"},
+]
+
+
+@pytest.mark.parametrize("headers", FOREIGN, ids=str)
+def test_pages_of_other_sites_are_refused_by_both_servers(sinks: Sinks, headers: dict[str, str]) -> None:
+    page, stream = ports(sinks)
+    filled = {name: value.format(port=page) for name, value in headers.items()}
+    assert ask(page, "GET", "/", filled)[0] == 403
+    filled = {name: value.format(port=stream) for name, value in headers.items()}
+    for method in ("POST", "OPTIONS", "GET"):
+        status, body = ask(stream, method, READ, {**GRPC_WEB, **filled}, bytes(5))
+        assert status == 403
+        assert b"where everybody is" not in body
+
+
+@pytest.mark.parametrize("headers", OWN, ids=str)
+def test_pages_of_this_machine_come_in_through_tunnels_too(sinks: Sinks, headers: dict[str, str]) -> None:
+    page, stream = ports(sinks)
+    filled = {name: value.format(port=page) for name, value in headers.items()}
+    assert ask(page, "GET", "/", filled)[0] == 302
+    status, body = ask(stream, "POST", READ, {**GRPC_WEB, **filled}, bytes(5))
+    assert (status, len(body) > 50) == (200, True)
+
+
+def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sinks: Sinks) -> None:
+    _, port = ports(sinks)
+    own = b"OPTIONS / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n"
+    foreign = f"POST {READ} HTTP/1.1\r\nHost: evil.example\r\nContent-Type: application/grpc-web+proto\r\n"
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as both:
+        both.sendall(own + foreign.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
+        told = b""
+        with contextlib.suppress(ConnectionError):
+            while piece := both.recv(4096):
+                told += piece
+    assert told.count(b"HTTP/1.1 ") == 1, told
+
+
+def test_two_hosts_are_no_host() -> None:
+    why, _ = stream_gate._checked(b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: evil.example\r\n\r\n")
+    assert why is not None
+    why, _ = stream_gate._checked(b"GET / HTTP/1.1\r\nHost : localhost\r\n\r\n")
+    assert why is not None
+    assert refusal({}) is not None
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["page", "stream"])
+def test_connections_and_their_threads_are_bounded_and_the_idle_ones_cut(
+    sinks: Sinks, which: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = (sinks._page._server if sinks._page else None, sinks._gate)[which]
+    assert server is not None
+    monkeypatch.setattr(server, "lasts_s", 1.5)
+    port, before = ports(sinks)[which], threading.active_count()
+    with contextlib.ExitStack() as stack:
+        for _ in range(4 * MOST_CONNECTIONS):
+            with contextlib.suppress(OSError):
+                idle = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+                idle.sendall(b"GET / HT")
+        time.sleep(0.5)
+        assert threading.active_count() - before <= MOST_CONNECTIONS
+        deadline_s = time.monotonic() + 15
+        while threading.active_count() > before and time.monotonic() < deadline_s:
+            time.sleep(0.1)
+        assert threading.active_count() <= before, "they are still open at our end, and cut at theirs"
+    monkeypatch.undo()
+    assert ask(port, "GET", "/", {"Host": "evil.example"})[0] == 403
+
+
+def test_a_reader_that_takes_nothing_is_cut_off(sinks: Sinks, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream_gate, "_SEND_WITHIN_S", 1.0)
+    before = threading.active_count()
+    head = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/grpc-web+proto\r\n"
+    with socket.socket() as slow:
+        slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        slow.connect(("127.0.0.1", ports(sinks)[1]))
+        slow.sendall(head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
+        for _ in range(60):
+            sinks.rec.log("noise", rr.Image(np.random.default_rng(1).integers(0, 255, (400, 400, 3), np.uint8)))
+        sinks.rec.flush(timeout_sec=10)
+        deadline_s = time.monotonic() + 20
+        while threading.active_count() > before and time.monotonic() < deadline_s:
+            time.sleep(0.1)
+        assert threading.active_count() <= before
+
+
+def test_rerun_itself_listens_where_nobody_looks(sinks: Sinks) -> None:
+    assert sinks._gate is not None
+    host, port = sinks._gate.behind
+    assert host.startswith("127.")
+    assert (host, port) != (loopback_guard.LOOPBACK, ports(sinks)[1])
