@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass
+from zlib import crc32
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
@@ -24,6 +25,13 @@ _AGE_BITS = 12
 the older most of the time, or each lets its own wait for the other."""
 _LIFE_BITS = 32
 _FURTHEST_LIFE = 1 << 16
+
+
+def _turn(stand: Stand) -> tuple[int, int, str]:
+    """Who goes first: the older; of one age, another one in each step of it. By name, those of the last agent would
+    always give way where many are of one age, as all are who began the run together."""
+    step = stand.age_ms >> _AGE_BITS
+    return -step, crc32(f"{stand.vehicle}/{step}".encode()), stand.vehicle
 
 
 def first_life(after: int, chance: int) -> int:
@@ -208,7 +216,7 @@ class Warden:
             for stand in host.standing.vehicles
             if stand.vehicle in self._vehicles and agent_of(stand.vehicle) == name
         ]
-        return sorted(stands, key=lambda stand: (-(stand.age_ms >> _AGE_BITS), stand.vehicle))
+        return sorted(stands, key=_turn)
 
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
         """The cells ahead of one that is under way, from where all that it has been granted ends."""

@@ -119,6 +119,22 @@ def test_a_life_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
     assert not is_far_ahead(first_life(0, 3), 0)
 
 
+def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
+    """As all are that began the run together: those of the last agent must not always give way."""
+    places = {"a0": 18, "a1": 19, "a2": 20, "a3": 26, "a4": 28}
+    first = set()
+    for step in range(30):
+        held = table_of(1, 1, **{host: [cell] for host, cell in places.items()})
+        warden = Warden(PLOTS, "a0", 3, held, set(held.grants))
+        for host, cell in places.items():
+            stand = Stand(f"{host}-00", cell, cell, [cell], [27], [27], 1, step << 12)
+            warden.hear(standing(host, [cell], seq=2, vehicles=[stand]), 0)
+        table = warden.tick(0)
+        assert table is not None
+        first.update(vehicle for vehicle, grant in table.grants.items() if 27 in grant.cells)
+    assert first == set(held.grants)
+
+
 # --- members ------------------------------------------------------------------------------------------------
 
 
