@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib
 import os
+import signal
 import sys
 import time
 from importlib.metadata import version
@@ -335,6 +336,8 @@ _mount(
 
 def main() -> int:
     """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
+    # A shell starts what it puts into the background deaf to SIGINT. Whoever sends it means it.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         try:
             app(prog_name="swarm")

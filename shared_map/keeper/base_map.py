@@ -19,7 +19,7 @@ from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import Terrain, finished
 from swarm.config.scenario import CostConfig
 from swarm.errors import ProtocolError, TerrainError
-from swarm.grid import MAX_CELLS, REGION_TILES, TILE_CELLS, GridSpec, Window
+from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec, Window
 from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap, BaseMapTile
 
 REGION_CELLS = REGION_TILES * TILE_CELLS
@@ -128,17 +128,13 @@ class BaseMapCopy:
     Raises
     ------
     TerrainError
-        If the description cannot be that of the run's terrain, lacks a layer, or has more than `MAX_CELLS` cells.
+        If the description cannot be that of the run's terrain, or lacks a layer.
     """
 
     def __init__(self, described: BaseMap, terrain: str, layers: tuple[str, ...] = NEEDED) -> None:
         who = f"the base map of keeper {described.keeper}"
         if described.terrain != terrain:
             raise TerrainError(f"{who} is terrain {described.terrain}, the run has {terrain}")
-        if described.rows * described.cols > MAX_CELLS:
-            raise TerrainError(
-                f"{who} has {described.rows} x {described.cols} cells, at most {MAX_CELLS} are taken"
-            )
         for layer in layers:
             if layer not in described.digests:
                 raise TerrainError(f"{who} lacks the layer {layer}: it has {', '.join(sorted(described.digests))}")

@@ -56,8 +56,8 @@ def after_lives(lives: int, compacts: bool, seed: int = 1) -> dict[str, float]:
         "authors": len(keeper.held.ledger.authors),
         "sets": len(sets),
         "marks": sum(len(each.kinds) for each in sets),
-        "marks_set_aside": sum(len(each.kinds) for each in aside),
-        "payload_kib": round(sum(15 * len(each.kinds) + 40 for each in sets) / 1024),
+        "aside": sum(len(each.kinds) for each in aside),
+        "sets_kib": round(sum(15 * len(each.kinds) + 40 for each in sets) / 1024),
         "digest_kib": math.ceil(digest_bytes / 1024),
     }
 

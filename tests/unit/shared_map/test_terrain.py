@@ -161,9 +161,9 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     from rasterio.transform import from_origin
 
     text = (Path(__file__).parents[3] / "docs" / "tutorial" / "terrain.md").read_text()
-    block = re.search(r"^```toml\n# mine\.toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    assert block is not None
-    (tmp_path / "mine.toml").write_text(block[1])
+    blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 2
+    (tmp_path / "mine.toml").write_text("".join(blocks))
     base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(5e5, 5e6, 20, 20)}
     with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
         file.write(np.random.default_rng(1).uniform(0, 2, (60, 70)).astype(np.float32), 1)
