@@ -51,7 +51,6 @@ def after_lives(lives: int, compacts: bool, seed: int = 1) -> dict[str, float]:
         sets = list(store.load())
     digest_bytes = sum(len(rows) for rows in keeper.held.ledger.held().values())
     return {
-        "lives": lives,
         "cells_marked": marked,
         "authors": len(keeper.held.ledger.authors),
         "sets": len(sets),
@@ -69,4 +68,4 @@ def run(lives: int, seed: int = 1, progress: Progress | None = None) -> dict[str
         rows.append({"compact": "yes" if compacts else "no", **after_lives(lives, compacts, seed)})
         if progress is not None:
             progress(done, 2)
-    return {"rows": rows, **machine()}
+    return {"lives": lives, "rows": rows, **machine()}
