@@ -79,10 +79,8 @@ class Member:
         self._due_ns = now_ns
         self._wanted_ns: int | None = None
         self._acked_ns = now_ns
-        self._said = self._other_said = (
-            0,
-            0,
-        )  # the newest table that we, and the third member, said to have stored
+        self._said = self._other_said = (0, 0)
+        """Stamps of the newest tables that we, and the third member, said to have stored."""
         self._said_ns = now_ns
 
     # --- what hosts say -------------------------------------------------------------------------------------

@@ -249,8 +249,10 @@ class RightOfWay:
     def _member(self, plot: int, now_ns: int) -> Member | None:
         """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is
         not known to be the first, and what was promised in the first is not in it."""
-        known = None if self.silent else self._members.get(plot)
-        if self.silent or known is not None or not 0 <= plot < self.plots.count:
+        if self.silent:
+            return None
+        known = self._members.get(plot)
+        if known is not None or not 0 <= plot < self.plots.count:
             return known
         members = self.plots.members(plot)
         if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):
