@@ -77,7 +77,10 @@ class PlannerService:
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._sync.start(now_ns)
-        self._bus.subscribe(SIGHTED if self._untracked else POSE, self._post, target=self._target)
+        if self._untracked:
+            self._bus.subscribe(SIGHTED, self._post, target=self._target)
+        else:
+            self._bus.collect(POSE, target=self._target)
         self._bus.subscribe(FLEET, self._post)
         self._candidacy.start()
         self._lead(self._candidacy.leads, now_ns)
@@ -88,8 +91,6 @@ class PlannerService:
         if self._candidacy.handle(event, now_ns):
             return
         match event:
-            case Heard(message=TargetPose() as pose):
-                self._planner.hear_pose(pose, now_ns)
             case Heard(message=Sighted() as sighted):
                 if self._sightings.hear(sighted, now_ns):
                     for seen in self._sightings.best(now_ns).values():
@@ -109,6 +110,9 @@ class PlannerService:
                 pass
 
     def tick(self, now_ns: int) -> None:
+        for heard in self._bus.collected(POSE):
+            assert isinstance(heard.message, TargetPose)
+            self._planner.hear_pose(heard.message, now_ns)
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)

@@ -84,7 +84,7 @@ class RightOfWaySync:
         self._bus.serve(KNOWN, self._post, agent=self._id)
         self._bus.serve(TABLE, self._post, agent=self._id)
         for plot in sorted(self._seats):
-            self._bus.subscribe(STANDING, self._post, plot=plot)
+            self._bus.collect(STANDING, plot=plot)
         self._listen(self._seats)
         self._ask_known()
 
@@ -93,8 +93,6 @@ class RightOfWaySync:
         core = self.core
         core.silent = not self._store.ready
         match event:
-            case Heard(message=Standing() as standing):
-                core.hear_standing(standing, now_ns)
             case Heard(message=Table() as table):
                 actions, placed = core.hear_table(table, now_ns)
                 self._perform(actions)
@@ -132,6 +130,9 @@ class RightOfWaySync:
         if places:
             holdings.watch(sorted(self._near.update(places)))
         self._listen(self._seats.union(holdings.plots))
+        for heard in self._bus.collected(STANDING):
+            assert isinstance(heard.message, Standing)
+            self.core.hear_standing(heard.message, now_ns)
         self._perform(self.core.tick(wishes, now_ns))
         self._tell_unled(now_ns)
 

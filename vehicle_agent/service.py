@@ -119,9 +119,9 @@ class AgentService:
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
         self._sync.start(now_ns)
-        self._bus.subscribe(POSE, self._post)
+        self._bus.collect(POSE)
         if self._untracked.targets:
-            self._bus.subscribe(TRUE_POSE, self._post)
+            self._bus.collect(TRUE_POSE)
             for target in sorted(self._untracked.targets):
                 self._bus.subscribe(SIGHTED, self._post, target=target)
         self._bus.subscribe(PUSHED_ROUTE, self._post, agent=self._setup.id)
@@ -134,10 +134,6 @@ class AgentService:
             return
         agent = self._agent
         match event:
-            case Heard(topic=topic, message=TargetPose() as pose):
-                self._detector.set_truth(pose, now_ns)
-                if topic is POSE and pose.target not in self._untracked.targets:
-                    agent.hear_pose(pose, now_ns)
             case Heard(message=Sighted() as sighted):
                 self._hear_sighted(sighted, now_ns)
             case Heard(message=PushedRoute() as pushed):
@@ -165,6 +161,8 @@ class AgentService:
 
     def tick(self, now_ns: int) -> None:
         self._now_ns = now_ns
+        for heard in (*self._bus.collected(POSE), *self._bus.collected(TRUE_POSE)):
+            self._hear_pose(heard, now_ns)
         self._member.tick(now_ns)
         self._sync.tick(now_ns)
         agent = self._agent
@@ -219,6 +217,13 @@ class AgentService:
             self.counters.count("targets_sighted")
             self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
             self._hear_sighted(sighted, now_ns)
+
+    def _hear_pose(self, heard: Heard, now_ns: int) -> None:
+        pose = heard.message
+        assert isinstance(pose, TargetPose)
+        self._detector.set_truth(pose, now_ns)
+        if heard.topic is POSE and pose.target not in self._untracked.targets:
+            self._agent.hear_pose(pose, now_ns)
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
         pose = self._untracked.hear(sighted, now_ns)

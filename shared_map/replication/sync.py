@@ -15,7 +15,7 @@ from shared_map.replication.mark_sets import packed, unpacked
 from shared_map.replication.pending_digests import PendingDigest, PendingDigests
 from shared_map.replication.replica import MapReplica, Merged, PublishSet
 from shared_map.replication.tiles import region_tiles
-from swarm.bus.bus import Asked, AskEnded, Bus, Event, Heard, HeardMany, LinkChanged, Post, Replied
+from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
 from swarm.wire.messages.base import Message
@@ -104,7 +104,7 @@ class MapSync:
         if self._regions is None:
             self._bus.subscribe(MARKS, self._post, together=True)
             self._join()
-        self._bus.subscribe(DIGEST, self._post)
+        self._bus.collect(DIGEST)
         if self._serves_all:
             self._bus.serve(MARKS, self._post)
         elif self.replica.author is not None:
@@ -132,8 +132,6 @@ class MapSync:
         match event:
             case HeardMany(topic=topic, samples=samples) if topic is MARKS:
                 self._hear(samples, now_ns)
-            case Heard(topic=topic, message=Digest() as digest) if topic is DIGEST:
-                self._hear_digest(digest, now_ns)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag in (_JOIN, _ENTER):
                 self._merge(self._sets_in(event), measured=False)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag.startswith(_RESYNC):
@@ -156,6 +154,9 @@ class MapSync:
 
     def tick(self, now_ns: int) -> None:
         """Publish what is due, compare the digests that have waited long enough, ask for what is missing."""
+        for heard in self._bus.collected(DIGEST):
+            assert isinstance(heard.message, Digest)
+            self._hear_digest(heard.message, now_ns)
         self._merge_waiting(now_ns)
         self.publish(self.replica.tick(now_ns))
         if self._join_due_ns is not None and now_ns >= self._join_due_ns:

@@ -2,7 +2,7 @@
 
 Everything is encoded and decoded as on the wire, once per message; all subscribers share the frozen result. A
 `LinkModel` decides what a link does to a message (delay, loss, repetition, partition), so that a seed replays a
-run. Nothing is buffered: a handler takes no simulated time, so no reader falls behind.
+run. Nothing is buffered but what is collected: a handler takes no simulated time, so no reader falls behind.
 """
 
 from __future__ import annotations
@@ -142,6 +142,8 @@ class MemoryBus:
         """Topic -> what is served, in order; subscriptions are the network's."""
         self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
+        self._kept: dict[str, dict[tuple[str | int, ...], _Sample]] = {}
+        """Topic -> what waits for `collected`, the newest of each key."""
         self.tokens: list[Peer] = []
         """Raised with `declare_alive`; visible to others while the bus is open and connected."""
 
@@ -166,6 +168,35 @@ class MemoryBus:
         post = as_batches(post) if together else checking_key(post, self.counts)
         subscriptions = self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions())
         subscriptions.add(declare(self, topic, fields, post))
+
+    def collect(self, topic: Topic, **fields: str | int) -> None:
+        subscriptions = self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions())
+        subscriptions.add(declare(self, topic, fields, None))
+
+    def collected(self, topic: Topic) -> list[Heard]:
+        kept = self._kept.pop(topic.name, {})
+        heard: list[Heard] = []
+        post = checking_key(heard.append, self.counts)  # type: ignore[arg-type]
+        for sample in kept.values():
+            self.hear(sample, post)
+        return heard
+
+    def keep(self, sample: _Sample) -> None:
+        """Keep a sample for `collected`."""
+        topic = sample.topic
+        key = tuple(sample.fields.values()) if topic.newest else (self.counts["messages_in"],)
+        kept = self._kept.setdefault(topic.name, {})
+        kept[key] = sample
+        if len(kept) > topic.buffer:
+            del kept[next(iter(kept))]
+
+    def hear(self, sample: _Sample, post: Post) -> None:
+        """Post the event of a sample. A payload that does not parse is counted and dropped."""
+        heard = sample.heard(self)
+        if heard is None:
+            self.counts["payloads_dropped"] += 1
+        else:
+            post(heard)
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         narrow = narrowed(topic, fields)
@@ -217,6 +248,7 @@ class MemoryBus:
         parsed = decode(payload, topic.request)
         code = code_of(self.authenticator, topic, topic.below(wanted), payload)
         for index, queryable in enumerate(queryables):
+            assert queryable.post is not None
             for when_ns in self.network.arrivals_ns(self, queryable.bus, topic.name):
                 answerer = MemoryAnswerer(asking, queryable, index, when_ns)
                 event = Asked(topic, wanted, parsed, answerer)
@@ -319,7 +351,7 @@ class _Sample:
 
 @dataclass(eq=False, slots=True)
 class _Arrival:
-    """The arrival of a sample at a subscription. A payload that does not parse is counted and dropped."""
+    """The arrival of a sample at a subscription."""
 
     source: MemoryBus
     subscription: Declaration
@@ -330,11 +362,10 @@ class _Arrival:
         if not bus.traced(self.source, self.sample.topic.name, self.sample.payload):
             return
         bus.counts["messages_in"] += 1
-        heard = self.sample.heard(bus)
-        if heard is None:
-            bus.counts["payloads_dropped"] += 1
+        if self.subscription.post is None:
+            bus.keep(self.sample)
         else:
-            self.subscription.post(heard)
+            bus.hear(self.sample, self.subscription.post)
 
 
 @dataclass(eq=False, slots=True)

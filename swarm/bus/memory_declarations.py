@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False, slots=True)
 class Declaration:
-    """One subscription or queryable of one bus. `narrow` holds the fields of its key that are no wildcard."""
+    """One subscription or queryable of one bus. `narrow` holds the fields of its key that are no wildcard; a
+    subscription without `post` keeps its samples until they are collected."""
 
     bus: MemoryBus
     narrow: dict[str, str]
-    post: Post
+    post: Post | None
 
     def meets(self, fields: Mapping[str, str]) -> bool:
         """Whether this and another key of the topic, either with wildcards, can name the same value."""
@@ -31,7 +32,7 @@ class Declaration:
         return True
 
 
-def declare(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post) -> Declaration:
+def declare(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post | None) -> Declaration:
     return Declaration(bus, narrowed(topic, fields), post)
 
 

@@ -11,13 +11,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import zenoh
 
 from swarm.bus.bus import (
     TIMEOUT_PARAMETER,
-    USUAL_TIMEOUT_S,
     Appeared,
     Asked,
     AskEnded,
@@ -29,8 +29,9 @@ from swarm.bus.bus import (
     Replied,
 )
 from swarm.bus.endpoints import listening, wait_for_router
+from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
-from swarm.bus.zenoh_threads import attached, guarded, timeout_of, waiting_in
+from swarm.bus.zenoh_threads import attached, guarded, taken_from, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
@@ -108,6 +109,8 @@ class ZenohBus:
         """All that was declared and not yet undeclared, in order; `close` undeclares it backwards."""
         self._subscribers: dict[str, list[Any]] = {}
         """Key expression -> its subscribers, for `unsubscribe`."""
+        self._collecting: dict[str, list[Any]] = {}
+        """Topic -> its subscribers that nobody reads before `collected`."""
         self._queryables: dict[str, list[Any]] = {}
         """Key expression -> its queryables, for `unserve`."""
         self._threads: list[threading.Thread] = []
@@ -155,17 +158,9 @@ class ZenohBus:
 
         def arrive(sample: zenoh.Sample) -> None:
             self._count("messages_in")
-            key = str(sample.key_expr)
-            try:
-                named = self._fields(topic, key)
-                payload = sample.payload.to_bytes()
-                check_code(self._authenticator, attached(sample), topic, key, payload)
-                message = decode(payload, topic.message)
-                topic.check_key(named, message)
-            except ProtocolError as error:
-                self._drop(key, error)
-                return
-            post(Heard(topic, named, message))
+            heard = self._heard(topic, sample)
+            if heard is not None:
+                post(heard)
 
         def arrive_together(samples: list[zenoh.Sample]) -> None:
             self._count("messages_in", len(samples))
@@ -180,16 +175,79 @@ class ZenohBus:
             if heard:
                 post(HeardMany(topic, heard))
 
-        expression = topic.expression(self._namespace, **fields)
-        subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
-        self._subscribers.setdefault(expression, []).append(subscriber)
+        subscriber = self._subscriber(topic, fields)
         if together:
             self._read(subscriber, arrive_together, f"sub-{topic.name}", together=True)
         else:
             self._read(subscriber, arrive, f"sub-{topic.name}")
 
+    def collect(self, topic: Topic, **fields: str | int) -> None:
+        subscriber = self._subscriber(topic, fields)
+        self._entities.append(subscriber)
+        self._collecting.setdefault(topic.name, []).append(subscriber)
+
+    def collected(self, topic: Topic) -> list[Heard]:
+        heard = []
+        for subscriber in self._collecting.get(topic.name, ()):
+            samples = taken_from(subscriber.handler, topic.buffer)
+            if samples:
+                self._count("messages_in", len(samples))
+            if topic.newest and len(samples) > 1:
+                samples = list({str(sample.key_expr): sample for sample in samples}.values())
+            heard += [each for each in (self._heard(topic, sample) for sample in samples) if each is not None]
+        return heard
+
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        self._undeclare_all(self._subscribers.pop(topic.expression(self._namespace, **fields), ()))
+        subscribers = self._subscribers.pop(topic.expression(self._namespace, **fields), ())
+        collecting = self._collecting.get(topic.name, ())
+        self._collecting[topic.name] = [each for each in collecting if each not in subscribers]
+        self._undeclare_all(subscribers)
+
+    def _reply(
+        self,
+        topic: Topic,
+        concrete: Mapping[str, str],
+        as_json: bool,
+        query: zenoh.Query,
+        asked: bytes,
+        message: Message | str,
+        fields: Mapping[str, str | int],
+    ) -> None:
+        """Send one answer to a query, or as a text why there is none."""
+        if self._closed:
+            return
+        if isinstance(message, str):
+            query.reply_err(message.encode())
+            return
+        key = topic.keyed(self._namespace, **{**concrete, **fields})
+        if not query.key_expr.intersects(zenoh.KeyExpr(key)):
+            return
+        self._count("messages_out")
+        if as_json:
+            query.reply(key, encode_readable(message), encoding=zenoh.Encoding.APPLICATION_JSON)
+        else:
+            payload = encode(message)
+            query.reply(key, payload, attachment=code_of(self._authenticator, topic, key, payload, asked))
+
+    def _subscriber(self, topic: Topic, fields: Mapping[str, str | int]) -> Any:
+        expression = topic.expression(self._namespace, **fields)
+        subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
+        self._subscribers.setdefault(expression, []).append(subscriber)
+        return subscriber
+
+    def _heard(self, topic: Topic, sample: zenoh.Sample) -> Heard | None:
+        """The event of a sample; None, counted and logged, if it is rejected."""
+        key = str(sample.key_expr)
+        try:
+            named = self._fields(topic, key)
+            payload = sample.payload.to_bytes()
+            check_code(self._authenticator, attached(sample), topic, key, payload)
+            message = decode(payload, topic.message)
+            topic.check_key(named, message)
+        except ProtocolError as error:
+            self._drop(key, error)
+            return None
+        return Heard(topic, named, message)
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         request_type = topic.request
@@ -202,7 +260,8 @@ class ZenohBus:
             key = str(query.key_expr)
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
             timeout = parameters.pop(TIMEOUT_PARAMETER, "")
-            answerer = _ZenohAnswerer(self, topic, query, concrete, parameters.get("format") == "json")
+            as_json = parameters.get("format") == "json"
+            answerer = ZenohAnswerer(query, partial(self._reply, topic, concrete, as_json))
             try:
                 answerer.timeout_s = timeout_of(timeout)
                 check_code(self._authenticator, attached(query), topic, key, answerer.asked)
@@ -372,50 +431,3 @@ class ZenohBus:
                 self._logged_s.clear()
             self._logged_s[key] = now_s
             log.warning("dropped a payload on %s: %s", key[:200], error)
-
-
-class _ZenohAnswerer:
-    """The answers to one query, which arrives when this is made.
-
-    `concrete` are the fields that `serve` was given, `asked` is the question's payload; `_query` is None after the
-    end.
-    """
-
-    def __init__(
-        self, bus: ZenohBus, topic: Topic, query: zenoh.Query, concrete: dict[str, str], as_json: bool
-    ) -> None:
-        self._bus = bus
-        self._topic = topic
-        self._query: zenoh.Query | None = query
-        self._concrete = concrete
-        self._as_json = as_json
-        self.asked = b"" if query.payload is None else query.payload.to_bytes()
-        self._arrived_s = time.monotonic()
-        self.timeout_s = USUAL_TIMEOUT_S
-
-    def waited_s(self) -> float:
-        return time.monotonic() - self._arrived_s
-
-    def answer(self, message: Message, fields: Mapping[str, str | int]) -> None:
-        if self._query is None:
-            raise RuntimeError("answered after the end")
-        key = self._topic.keyed(self._bus.namespace, **{**self._concrete, **fields})
-        if self._bus._closed or not self._query.key_expr.intersects(zenoh.KeyExpr(key)):
-            return
-        self._bus._count("messages_out")
-        if self._as_json:
-            self._query.reply(key, encode_readable(message), encoding=zenoh.Encoding.APPLICATION_JSON)
-        else:
-            payload = encode(message)
-            code = code_of(self._bus._authenticator, self._topic, key, payload, self.asked)
-            self._query.reply(key, payload, attachment=code)
-
-    def refuse(self, reason: str) -> None:
-        if self._query is not None and not self._bus._closed:
-            self._query.reply_err(reason.encode())
-
-    def end(self) -> None:
-        # Zenoh ends a query when its last handle goes; `drop` does it now, not at the next garbage collection.
-        if self._query is not None:
-            self._query.drop()  # type: ignore[no-untyped-call]
-            self._query = None

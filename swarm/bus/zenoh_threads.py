@@ -25,6 +25,14 @@ def waiting_in(channel: Any) -> list[Any]:
     return items
 
 
+def taken_from(channel: Any, most: int) -> list[Any]:
+    """The items that wait in a channel, at most so many; none if none does."""
+    items: list[Any] = []
+    while len(items) < most and (item := channel.try_recv()) is not None:
+        items.append(item)
+    return items
+
+
 def guarded(callback: Callable[..., None]) -> Callable[..., None]:
     """A callback for Zenoh's own threads, which swallow an error: it ends like one of a thread of ours."""
 

@@ -53,6 +53,43 @@ def test_samples_that_wait_are_heard_together_in_order_with_their_keys_and_witho
     assert len(box.of(HeardMany)) == len(box)
 
 
+def test_what_is_collected_waits_and_of_each_key_the_newest_is_left(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    b.collect(POSE)
+    box = Box()
+    b.subscribe(POSE, box)
+    world.settle()
+    for seq in range(5):
+        for target in ("t0", "t1"):
+            a.publish(POSE, pose(target, seq=seq), target=target)
+        world.put_bytes(a, POSE, b"garbage", target="t2")
+    world.until(lambda: len(box) == 10 and b.counts["payloads_dropped"] == 5)
+    assert b.collected(POSE) == [Heard(POSE, {"target": each}, pose(each, seq=4)) for each in ("t0", "t1")]
+    assert b.collected(POSE) == []
+    assert b.counts["payloads_dropped"] == 6  # the newest of five that were collected, and each that was heard
+
+
+def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    b.collect(NOTE)
+    box = Box()
+    b.subscribe(NOTE, box)
+    world.settle()
+    for n in range(NOTE.buffer + 50):
+        a.publish(NOTE, note(f"n{n}"), role="agent", id="a0")
+        if n % 200 == 0:
+            world.settle()
+    world.until(lambda: bool(box) and box[-1].message.text == f"n{NOTE.buffer + 49}")
+    texts = [each.message.text for each in b.collected(NOTE)]
+    assert texts[-1] == f"n{NOTE.buffer + 49}"
+    assert len(texts) == NOTE.buffer  # of a topic whose values all count, the newest so many
+    b.unsubscribe(NOTE)
+    world.settle()
+    a.publish(NOTE, note("late"), role="agent", id="a0")
+    world.settle()
+    assert b.collected(NOTE) == []
+
+
 def test_an_answer_may_carry_many_values_where_the_topic_says_so(world: World):
     a, b = world.bus("a"), world.bus("b")
     [many] = packed([marks("a0.1", tile) for tile in range(3)])
