@@ -8,24 +8,21 @@ from hashlib import blake2s
 
 from msgspec.structs import replace
 
-from shared_map.replication.interest import Interest
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.traffic import Claim, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.topics import KNOWN, STANDING, STORED, TABLE
+from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
+from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE
 from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.traffic.holdings import Wish
+from vehicle_agent.traffic.holdings import Tell, Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
 
-_LEAD_CELLS = 8
-"""Tables of a plot are listened to so far ahead of the vehicles."""
 _FIRST_ANSWERS_S = 0.3
 """A new life waits so long for the others' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
@@ -66,9 +63,7 @@ class RightOfWaySync:
         self._warn = warn
         seed = f"{store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
-        self._near = Interest(grid, _LEAD_CELLS)
         self._seats = frozenset(plot for plot in range(plots.count) if setup.id in plots.members(plot))
-        self._listens_to: frozenset[int] = frozenset()
         self._asking = False
         self._ask_due_ns = 0
         self._ask_wait_ns = _ASK_AGAIN_NS
@@ -84,8 +79,10 @@ class RightOfWaySync:
         self._bus.serve(KNOWN, self._post, agent=self._id)
         self._bus.serve(TABLE, self._post, agent=self._id)
         for plot in sorted(self._seats):
-            self._bus.collect(STANDING, plot=plot)
-        self._listen(self._seats)
+            self._bus.collect(STANDING, plot=plot, member=self._id)
+            self._bus.subscribe(TABLE, self._post, plot=plot)
+            self._bus.subscribe(STORED, self._post, plot=plot)
+        self._bus.collect(GRANTED, host=self._id)
         self._ask_known()
 
     def handle(self, event: Event, now_ns: int) -> bool:
@@ -94,11 +91,9 @@ class RightOfWaySync:
         core.silent = not self._store.ready
         match event:
             case Heard(message=Table() as table):
-                actions, placed = core.hear_table(table, now_ns)
-                self._perform(actions)
-                self._placed(placed)
+                self._perform(core.hear_table(table, now_ns))
             case Heard(message=Stored() as stored):
-                self._placed(core.hear_stored(stored, now_ns))
+                self._perform(core.hear_stored(stored, now_ns))
             case Asked(topic=topic, request=Claim() as claim) if topic is TABLE:
                 if event.fields["plot"].isdecimal():
                     self._answer(event, core.hear_claim(int(event.fields["plot"]), claim.epoch, now_ns))
@@ -122,14 +117,16 @@ class RightOfWaySync:
                 return False
         return True
 
-    def tick(self, wishes: Mapping[str, Wish], places: Sequence[int], now_ns: int) -> None:
+    def hear_granted(self, now_ns: int) -> None:
+        """Take in what wardens have granted since the last time. Called before vehicles drive."""
+        for heard in self._bus.collected(GRANTED):
+            assert isinstance(heard.message, Granted)
+            self._placed(self.core.hear_granted(heard.message, now_ns))
+
+    def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
         if not self._asking and not self.core.settled and now_ns >= self._ask_due_ns:
             self._ask_known()
         self._look_after_store(now_ns)
-        holdings = self.core.holdings
-        if places:
-            holdings.watch(sorted(self._near.update(places)))
-        self._listen(self._seats.union(holdings.plots))
         for heard in self._bus.collected(STANDING):
             assert isinstance(heard.message, Standing)
             self.core.hear_standing(heard.message, now_ns)
@@ -174,15 +171,6 @@ class RightOfWaySync:
         self._ask_due_ns = now_ns + self._ask_wait_ns
         self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
 
-    def _listen(self, plots: frozenset[int]) -> None:
-        for plot in sorted(plots - self._listens_to):
-            self._bus.subscribe(TABLE, self._post, plot=plot)
-            self._bus.subscribe(STORED, self._post, plot=plot)
-        for plot in sorted(self._listens_to - plots):
-            self._bus.unsubscribe(TABLE, plot=plot)
-            self._bus.unsubscribe(STORED, plot=plot)
-        self._listens_to = plots
-
     def _answer(self, asked: Asked, actions: Sequence[Action]) -> None:
         """Perform what has to be done first, and answer with the last."""
         for action in actions:
@@ -203,8 +191,11 @@ class RightOfWaySync:
                     self._ask_known()
                 case OwnRecord():
                     self._store.save_own(action)
-                case Standing():
-                    self._bus.publish(STANDING, action, plot=action.plot, agent=self._id)
+                case Tell(members, standing):
+                    for member in members:
+                        self._bus.publish(STANDING, standing, plot=standing.plot, member=member, agent=self._id)
+                case Granted():
+                    self._bus.publish(GRANTED, action, plot=action.plot, host=action.host, agent=self._id)
                 case Table():
                     self._bus.publish(TABLE, action, plot=action.plot, agent=self._id)
                 case Stored():

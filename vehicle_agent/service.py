@@ -166,6 +166,7 @@ class AgentService:
         self._member.tick(now_ns)
         self._sync.tick(now_ns)
         agent = self._agent
+        self._right_of_way.hear_granted(now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
         if self._cost_map.take_dirty():
@@ -184,7 +185,7 @@ class AgentService:
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
-        self._right_of_way.tick(agent.wishes, agent.places, now_ns)
+        self._right_of_way.tick(agent.wishes, now_ns)
         self._gauge()
 
     def stop(self, now_ns: int) -> None:

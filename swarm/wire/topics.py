@@ -25,7 +25,7 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.traffic import Claim, Known, KnownRequest, Standing, Stored, Table
+from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
 from swarm.wire.messages.vehicles import Fleet, Followed
 
 
@@ -178,17 +178,22 @@ FLEET = Topic(
     access(put="agent:author", hear="agent planner targets monitor"),
 )  # fmt: skip
 STANDING = Topic(
-    "standing", "standing/{plot}/{agent}", Standing,
-    "where a host's vehicles are in a plot and where they would go; for its members",
-    "on change, else 5 Hz",
-    access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
+    "standing", "standing/{plot}/{member}/{agent}", Standing,
+    "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
+    "none is heard", "on change, else 5 Hz",
+    access(put="agent:agent", hear="agent:member"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
     "table", "table/{plot}/{agent}", Table,
-    "which cells the warden of a plot has granted; a member that is asked promises an epoch and answers with what "
-    "it has stored", "on change, at least 5 Hz where vehicles are",
+    "which cells the warden of a plot has granted, for its members; a member that is asked promises an epoch and "
+    "answers with what it has stored", "on change, at least 5 Hz where vehicles are",
     access(put="agent:agent", serve="agent:agent", ask="agent", hear="agent"),
     request=Claim, trusted=True, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+GRANTED = Topic(
+    "granted", "granted/{plot}/{host}/{agent}", Granted,
+    "which cells of a plot its warden has granted to one host, on file with its members", "on change, else 5 Hz",
+    access(put="agent:agent", hear="agent:host"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
     "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file",
@@ -258,9 +263,8 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, STANDING, TABLE, STORED, KNOWN, FOLLOWED, PUSHED_ROUTE, POSE,
-    SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, LEAD, STATS,
-    NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, STANDING, TABLE, GRANTED, STORED, KNOWN, FOLLOWED,
+    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, LEAD, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

@@ -138,7 +138,12 @@ def test_a_warden_that_dies_is_replaced_within_a_second_and_the_vehicles_go_on()
 
 
 def usable_without_majority(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Holdings, "_on_file", lambda self, view, table: True)
+    lead = Member._lead
+
+    def hasty(self: Member, warden: Warden, now_ns: int):  # type: ignore[no-untyped-def]
+        return [*lead(self, warden, now_ns), *self._on_file(warden, warden.seq, now_ns)]
+
+    patch.setattr(Member, "_lead", hasty)
 
 
 def restart_without_file(patch: pytest.MonkeyPatch) -> None:
@@ -185,14 +190,13 @@ def frees_what_nobody_reported(patch: pytest.MonkeyPatch) -> None:
 
 
 def an_older_life_goes_on(patch: pytest.MonkeyPatch) -> None:
-    use = Holdings._use
+    hear = Holdings.hear_granted
 
-    def unfenced(self: Holdings, view, place):  # type: ignore[no-untyped-def]
-        for table in view.tables.values():
-            self.life = max(self.life, table.hosts.get(self._agent, (0, 0))[0])
-        return use(self, view, place)
+    def unfenced(self: Holdings, granted, place, now_ns):  # type: ignore[no-untyped-def]
+        self.life = max(self.life, granted.life)
+        return hear(self, granted, place, now_ns)
 
-    patch.setattr(Holdings, "_use", unfenced)
+    patch.setattr(Holdings, "hear_granted", unfenced)
 
 
 def forgets_where_an_older_life_may_stand(patch: pytest.MonkeyPatch) -> None:

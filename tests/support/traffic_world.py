@@ -12,8 +12,8 @@ from functools import cache
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.wire.messages.traffic import Known, KnownRequest, Standing, Stored, Table
-from vehicle_agent.traffic.holdings import Wish
+from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Stored, Table
+from vehicle_agent.traffic.holdings import Tell, Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
 from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
@@ -85,25 +85,30 @@ class Process:
                 case AskPromises():
                     for member in action.members:
                         self.world.claim(self, action, member)
-                case Standing():
-                    for member in self.world.plots.members(action.plot):
-                        self.world.send(self, member, lambda to, s=action: to.rights.hear_standing(s, to.now_ns))
+                case Tell(members, standing):
+                    for member in members:
+                        self.world.send(self, member, lambda to, s=standing: to.rights.hear_standing(s, to.now_ns))
                 case Table():
-                    self.world.send(self, None, lambda to, t=action: to.hear_table(t))
+                    for member in self.world.plots.members(action.plot):
+                        self.world.send(self, member, lambda to, t=action: to.hear_table(t))
                 case Stored():
-                    self.world.send(self, None, lambda to, s=action: to.hear_stored(s))
+                    for member in self.world.plots.members(action.plot):
+                        self.world.send(self, member, lambda to, s=action: to.hear_stored(s))
+                case Granted():
+                    self.world.send(self, action.host, lambda to, g=action: to.hear_granted(g))
                 case OwnRecord():
                     self.disk.own = action
                 case Refused():
                     self.world.refused.append(action.text)
 
     def hear_table(self, table: Table) -> None:
-        actions, placed = self.rights.hear_table(table, self.now_ns)
-        self.perform(actions)
-        self.place(placed)
+        self.perform(self.rights.hear_table(table, self.now_ns))
 
     def hear_stored(self, stored: Stored) -> None:
-        self.place(self.rights.hear_stored(stored, self.now_ns))
+        self.perform(self.rights.hear_stored(stored, self.now_ns))
+
+    def hear_granted(self, granted: Granted) -> None:
+        self.place(self.rights.hear_granted(granted, self.now_ns))
 
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:

@@ -1,4 +1,4 @@
-"""Which cells the vehicles of one host hold: what wardens granted, as far as it is on file with a majority."""
+"""Which cells the vehicles of one host hold: what wardens granted, once it is on file with a majority."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 
-from swarm.wire.messages.traffic import Stamp, Stand, Standing, Stored, Table
+from swarm.wire.messages.traffic import Granted, Stamp, Stand, Standing
 from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.warden import BEAT_NS
 
-_TABLES_KEPT = 16
+_UNHEARD_NS = 5 * BEAT_NS // 2
+"""A host that has not heard a plot's warden for so long speaks to all members of the plot."""
 _BEFORE_ALL: Stamp = (0, 0)
 
 
@@ -28,23 +29,33 @@ class Wish:
     age_ms: int = 0
 
 
+_NO_WISH = Wish()
+
+
+@dataclass(frozen=True, slots=True)
+class Tell:
+    """Send a standing to these members of its plot."""
+
+    members: tuple[str, ...]
+    standing: Standing
+
+
 @dataclass(slots=True)
 class _View:
     """What a host knows of one plot.
 
-    tables   those heard that are newer than the one in use, by stamp
-    stored   member -> the newest stamp that it has on file
+    warden   who granted last, and when that was heard
     knows    stamp of the table in use; it never goes back, not even when the vehicles leave the plot and return
     heard    the newest standing of ours that the table in use takes into account
     seen     vehicle -> the cells that the table in use grants it
     pushed   vehicle -> the age with which it is to make way into another plot
-    others   the cells that are granted to vehicles of other hosts, or to nobody
+    others   cells beside our vehicles that are granted to vehicles of other hosts, or to nobody
     quiet    the first standing from which on we want nothing here; None while we do
     told     what was last told of our vehicles, and when
     """
 
-    tables: dict[Stamp, Table] = field(default_factory=dict)
-    stored: dict[str, Stamp] = field(default_factory=dict)
+    warden: str = ""
+    heard_ns: int = 0
     knows: Stamp = _BEFORE_ALL
     heard: int = 0
     seen: dict[str, list[int]] = field(default_factory=dict)
@@ -53,6 +64,15 @@ class _View:
     quiet: int | None = None
     told: object = None
     told_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Said:
+    """What is told of one vehicle while nothing about it changes: by plot a stand, and what of it is news."""
+
+    wish: Wish
+    path: list[int]
+    stands: list[tuple[int, Stand, object]]
 
 
 class Holdings:
@@ -67,7 +87,7 @@ class Holdings:
     def __init__(self, plots: Plots, agent: str, vehicles: Collection[str]) -> None:
         self._plots = plots
         self._agent = agent
-        self._vehicles = list(vehicles)
+        self._vehicles = frozenset(vehicles)
         self.end()
 
     def end(self) -> None:
@@ -79,6 +99,9 @@ class Holdings:
         self._paths: dict[str, list[int]] = {}
         self._cells: set[int] | None = None
         """All cells of our paths; None when they have changed."""
+        self._others: set[int] | None = None
+        """The cells beside our vehicles that others hold; None when they have changed."""
+        self._said: dict[str, _Said] = {}
         self._views: dict[int, _View] = {}
         self._seq = 0
 
@@ -98,10 +121,12 @@ class Holdings:
         return max((view.pushed.get(vehicle, 0) for view in self._views.values()), default=0)
 
     def occupied(self, cell: int) -> bool:
-        """Whether another vehicle holds a cell, as far as the tables in use tell."""
+        """Whether a vehicle holds a cell to which one of ours at rest could go, as far as wardens tell."""
         if self._cells is None:
             self._cells = {cell for path in self._paths.values() for cell in path}
-        return cell in self._cells or any(cell in self._views[plot].others for plot in self.plots)
+        if self._others is None:
+            self._others = {cell for plot in self.plots for cell in self._views[plot].others}
+        return cell in self._cells or cell in self._others
 
     def moved(self, vehicle: str, cell: int) -> None:
         """It has come to the next cell of its path."""
@@ -118,7 +143,7 @@ class Holdings:
         """The vehicles that hold cells of a plot, as far as its table in use tells."""
         return list(self._views[plot].seen) if plot in self._views else []
 
-    # --- what members say -----------------------------------------------------------------------------------
+    # --- what wardens say -----------------------------------------------------------------------------------
 
     def watch(self, plots: Collection[int]) -> None:
         """Let these plots concern us, until they are seen to hold nothing of ours."""
@@ -126,73 +151,46 @@ class Holdings:
             self.plots.setdefault(plot)
             self._views.setdefault(plot, _View())
 
-    def hear_table(self, table: Table, place: Callable[[str, Sequence[int]], int]) -> list[str]:
-        """Take in a warden's table. Returns the vehicles that have found their place.
+    def hear_granted(self, granted: Granted, place: Callable[[str, Sequence[int]], int], now_ns: int) -> list[str]:
+        """Act on what a warden says to us, if it is newer than what we know. Returns the vehicles that have found
+        their place.
 
         place  tells on which of the cells that it was granted a vehicle stands
         """
-        view = self._views.setdefault(table.plot, _View())
-        if table.agent != self._plots.warden(table.plot, table.epoch) or table.stamp <= view.knows:
+        view = self._views.setdefault(granted.plot, _View())
+        if granted.agent != self._plots.warden(granted.plot, granted.epoch) or granted.stamp < view.knows:
             return []
-        view.tables[table.stamp] = table
-        if len(view.tables) > _TABLES_KEPT:
-            del view.tables[min(view.tables)]
-        return self._use(view, place)
-
-    def hear_stored(self, stored: Stored, place: Callable[[str, Sequence[int]], int]) -> list[str]:
-        if stored.agent not in self._plots.members(stored.plot):
-            return []
-        view = self._views.setdefault(stored.plot, _View())
-        stamp = (stored.epoch, stored.seq)
-        if stamp <= view.stored.get(stored.agent, _BEFORE_ALL):
-            return []
-        view.stored[stored.agent] = stamp
-        return self._use(view, place)
-
-    def _use(self, view: _View, place: Callable[[str, Sequence[int]], int]) -> list[str]:
-        """Act on the newest table that a majority has stored, if it is newer than the one in use."""
-        stamp = max((stamp for stamp, table in view.tables.items() if self._on_file(view, table)), default=None)
-        if stamp is None:
-            return []
-        table = view.tables[stamp]
-        life, heard = table.hosts.get(self._agent, (0, 0))
-        self.newest = max(self.newest, life)
-        self.replaced = self.replaced or life > self.life
-        view.tables = {each: other for each, other in view.tables.items() if each > stamp}
-        if life != self.life:
+        view.warden, view.heard_ns = granted.agent, now_ns
+        self.newest = max(self.newest, granted.life)
+        self.replaced = self.replaced or granted.life > self.life
+        if granted.stamp == view.knows or granted.life != self.life:
             return []  # what it grants was granted to another life
-        view.knows, view.heard = stamp, heard
-        self._cells = None
-        view.pushed = {id: age for id, age in table.pushed.items() if id in self._paths}
-        view.others = frozenset(
-            cell
-            for cells in (
-                *(grant.cells for vehicle, grant in table.grants.items() if vehicle not in self._paths),
-                *(shut.cells for shut in table.shut),
-            )
-            for cell in cells
-        )
+        view.knows, view.heard = granted.stamp, granted.heard
+        view.pushed = {id: age for id, age in granted.pushed.items() if id in self._paths}
+        view.others = frozenset(granted.occupied)
+        self._cells = self._others = None
+        return self._take(view, granted, place)
+
+    def _take(self, view: _View, granted: Granted, place: Callable[[str, Sequence[int]], int]) -> list[str]:
+        """Take in the cells that are granted to each vehicle."""
+        before, view.seen = view.seen, {}
+        for vehicle in before.keys() - granted.grants.keys():
+            self._said.pop(vehicle, None)
         placed = []
-        for vehicle in self._vehicles:
-            grant = table.grants.get(vehicle)
-            seen = view.seen.pop(vehicle, [])
-            if grant is None or any(self._plots.of(cell) != table.plot for cell in grant.cells):
+        for vehicle, cells in granted.grants.items():
+            if vehicle not in self._vehicles or any(self._plots.of(cell) != granted.plot for cell in cells):
                 continue
-            view.seen[vehicle] = grant.cells
+            view.seen[vehicle] = cells
+            seen = before.get(vehicle, [])
+            if cells == seen and vehicle in self._paths:
+                continue
+            self._said.pop(vehicle, None)
             if vehicle in self._paths:
-                self._extend(vehicle, grant.cells, seen)
+                self._extend(vehicle, cells, seen)
             else:
-                self._paths[vehicle] = [place(vehicle, grant.cells)]
+                self._paths[vehicle] = [place(vehicle, cells)]
                 placed.append(vehicle)
         return placed
-
-    def _on_file(self, view: _View, table: Table) -> bool:
-        """Whether a majority has stored the table or a later one of its epoch; the warden has before it speaks."""
-        have = {table.agent}
-        have.update(
-            member for member, (epoch, seq) in view.stored.items() if epoch == table.epoch and seq >= table.seq
-        )
-        return len(have) >= self._plots.majority
 
     def _extend(self, vehicle: str, cells: Sequence[int], seen: Sequence[int]) -> None:
         """Take the cells that are granted anew. One that does not follow the path is left, and so given back."""
@@ -205,74 +203,83 @@ class Holdings:
 
     # --- what to say ----------------------------------------------------------------------------------------
 
-    def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Standing]:
-        """What to tell the members of each plot that concerns us, where it is new or the last word is a beat old.
-        Cells left out are given back."""
+    def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
+        """What to tell of each plot that concerns us, where it is new or the last word is a beat old. Cells left out
+        are given back."""
         self._seq += 1
-        by_plot: dict[int, list[Stand]] = {plot: [] for plot in self.plots}
+        by_plot: dict[int, list[tuple[int, Stand, object]]] = {plot: [] for plot in self.plots}
         for vehicle, path in self._paths.items():
-            wish = self._askable(vehicle, path, wishes.get(vehicle, Wish()))
-            near = [*path, *wish.ahead[:1], *wish.wants]
-            for plot in dict.fromkeys(plot for plot in map(self._plots.of, near) if plot >= 0):
-                by_plot.setdefault(plot, []).append(self._stand(vehicle, path, wish, plot))
+            wish = wishes.get(vehicle, _NO_WISH)
+            said = self._said.get(vehicle)
+            if said is None or said.wish is not wish or said.path != path:
+                said = self._said[vehicle] = self._say(vehicle, path, wish)
+            for each in said.stands:
+                by_plot.setdefault(each[0], []).append(each)
         self._forget_left(by_plot)
         return [
-            Standing(
-                plot=plot,
-                agent=self._agent,
-                life=self.life,
-                seq=self._seq,
-                knows=self._views[plot].knows,
-                vehicles=stands,
-                dead=self._dead,
-                ended=self.replaced,
-            )
-            for plot, stands in by_plot.items()
-            if self._is_news(plot, stands, now_ns)
+            Tell(self._listeners(plot, now_ns), self._standing(plot, [stand for _, stand, _ in said]))
+            for plot, said in by_plot.items()
+            if self._is_news(plot, said, now_ns)
         ]
 
-    def _is_news(self, plot: int, stands: Sequence[Stand], now_ns: int) -> bool:
+    def _standing(self, plot: int, stands: list[Stand]) -> Standing:
+        return Standing(
+            plot=plot,
+            agent=self._agent,
+            life=self.life,
+            seq=self._seq,
+            knows=self._views[plot].knows,
+            vehicles=stands,
+            dead=self._dead,
+            ended=self.replaced,
+        )
+
+    def _listeners(self, plot: int, now_ns: int) -> tuple[str, ...]:
+        view = self._views[plot]
+        if view.warden and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
+            return (view.warden,)
+        return self._plots.members(plot)
+
+    def _is_news(self, plot: int, said: Sequence[tuple[int, Stand, object]], now_ns: int) -> bool:
         view = self._views[plot]
         # What a table grants and we do not hold is freed only if we say so, knowing that table.
-        in_step = view.seen == {stand.vehicle: stand.holds for stand in stands if stand.holds}
-        told = (
-            self.replaced,
-            view.knows[0] if in_step else view.knows,
-            [(stand.vehicle, stand.cell, stand.holds, stand.ahead, stand.better) for stand in stands],
-        )
+        in_step = view.seen == {stand.vehicle: stand.holds for _, stand, _ in said if stand.holds}
+        told = (self.replaced, view.knows[0] if in_step else view.knows, [news for _, _, news in said])
         if told == view.told and 0 <= now_ns - view.told_ns < BEAT_NS:
             return False
         view.told, view.told_ns = told, now_ns
         return True
 
+    def _say(self, vehicle: str, path: Sequence[int], wish: Wish) -> _Said:
+        asked = self._askable(vehicle, path, wish)
+        still = len(path) == 1
+        wants = list(asked.wants) if still else []
+        better = asked.better if still else 0
+        ahead = list(asked.ahead)
+        plots = [self._plots.of(cell) for cell in path]
+        near = [*plots, *map(self._plots.of, (*asked.ahead[:1], *wants))]
+        stands: list[tuple[int, Stand, object]] = []
+        for plot in dict.fromkeys(plot for plot in near if plot >= 0):
+            holds = [cell for cell, of in zip(path, plots, strict=True) if of == plot]
+            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, asked.age_ms)
+            stands.append((plot, stand, (vehicle, path[0], holds, ahead, better)))
+        return _Said(wish, list(path), stands)
+
     def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
         """Without cells that were left or given back while a table still grants them: granted anew, such a cell
         could not be told from one that is about to be freed."""
-        lapsed = {cell for plot in self.plots for cell in self._views[plot].seen.get(vehicle, ())}.difference(path)
+        lapsed = {cell for view in self._views.values() for cell in view.seen.get(vehicle, ())}.difference(path)
         if lapsed.isdisjoint(wish.ahead) and lapsed.isdisjoint(wish.wants):
             return wish
         ahead = list(takewhile(lambda cell: cell not in lapsed, wish.ahead))
         better = sum(cell not in lapsed for cell in wish.wants[: wish.better])
         return Wish(ahead, [cell for cell in wish.wants if cell not in lapsed], better, wish.age_ms)
 
-    def _stand(self, vehicle: str, path: Sequence[int], wish: Wish, plot: int) -> Stand:
-        still = len(path) == 1
-        return Stand(
-            vehicle=vehicle,
-            cell=path[0],
-            end=path[-1],
-            holds=[cell for cell in path if self._plots.of(cell) == plot],
-            ahead=list(wish.ahead),
-            wants=list(wish.wants) if still else [],
-            better=wish.better if still else 0,
-            age_ms=wish.age_ms,
-        )
-
-    def _forget_left(self, by_plot: dict[int, list[Stand]]) -> None:
+    def _forget_left(self, by_plot: Mapping[int, Sequence[object]]) -> None:
         """Leave the plots where we hold and want nothing, once their tables show that they know it."""
-        for plot, stands in by_plot.items():
+        for plot, said in by_plot.items():
             view = self._views.setdefault(plot, _View())
-            if stands:
+            if said:
                 view.quiet = None
             elif view.quiet is None:
                 view.quiet = self._seq
@@ -283,3 +290,4 @@ class Holdings:
             or self._views[plot].heard < quiet
             or self._views[plot].seen
         }
+        self._others = None

@@ -6,11 +6,11 @@ stored must be on file before anybody is told. No clock decides anything but whe
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
-from swarm.wire.messages.traffic import Standing, Stored, Table
+from swarm.wire.messages.traffic import Granted, Standing, Stored, Table
 from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.warden import BEAT_NS, Warden
 
@@ -21,6 +21,7 @@ _START_NS = 3 * NS_PER_S // 10
 _WANTED_NS = NS_PER_S
 """Where no host has spoken for so long, nobody needs a warden."""
 _FURTHEST_EPOCH = 3 << 20
+_TABLES_KEPT = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ class Refused:
     text: str
 
 
-MemberAction = Save | AskPromises | Refused | Table | Stored
+MemberAction = Save | AskPromises | Refused | Table | Stored | Granted
 
 
 class Member:
@@ -56,10 +57,18 @@ class Member:
     promised  no table of a lower epoch is stored any more
     stored    the newest table on file; the table of the run's start until there is another
     warden    the warden itself, while this member is in charge
+
+    fleets    agent -> its vehicles, all of the run
     """
 
     def __init__(
-        self, plots: Plots, me: str, promised: int, stored: Table, vehicles: Container[str], now_ns: int
+        self,
+        plots: Plots,
+        me: str,
+        promised: int,
+        stored: Table,
+        fleets: Mapping[str, Collection[str]],
+        now_ns: int,
     ) -> None:
         self.plot = stored.plot
         self.promised = promised
@@ -67,7 +76,7 @@ class Member:
         self.warden: Warden | None = None
         self._plots = plots
         self._me = me
-        self._vehicles = vehicles
+        self._fleets = fleets
         self._members = plots.members(self.plot)
         self._others = tuple(member for member in self._members if member != me)
         self._rank = self._members.index(me)
@@ -79,6 +88,8 @@ class Member:
         self._due_ns = now_ns
         self._wanted_ns: int | None = None
         self._acked_ns = now_ns
+        self._told: list[Table] = []
+        """As warden: tables that have been told, the oldest first, from the newest one that is on file on."""
         self._said = self._other_said = (0, 0)
         """Stamps of the newest tables that we, and the third member, said to have stored."""
         self._said_ns = now_ns
@@ -87,7 +98,9 @@ class Member:
 
     def hear_standing(self, standing: Standing, now_ns: int) -> None:
         if self._wanted_ns is None or now_ns - self._wanted_ns > _WANTED_NS:
-            wait_ns = _START_NS if self.promised else 0  # nobody can be in charge of a plot that is new
+            # Nobody can be in charge of a plot that is new; and whoever was until now, hosts hear no more.
+            led = self.promised and now_ns >= self._led_until_ns + LEASE_NS
+            wait_ns = _START_NS if led else 0
             self._due_ns = max(self._due_ns, now_ns + wait_ns + self._rank * _RANK_NS)
             self._acked_ns = now_ns
         self._wanted_ns = now_ns
@@ -153,16 +166,27 @@ class Member:
             self._promises[member] = table
             self._take_charge(now_ns)
 
-    def hear_stored(self, stored: Stored, now_ns: int) -> None:
+    def hear_stored(self, stored: Stored, now_ns: int) -> list[MemberAction]:
+        """As warden: what is granted by the tables that are on file now."""
         if stored.agent not in self._others:
-            return
+            return []
         self._other_said = max(self._other_said, (stored.epoch, stored.seq))
         if self.warden is None:
-            return
+            return []
         if stored.epoch == self.warden.epoch:
             self._acked_ns = now_ns
-        elif self.promised < stored.epoch <= self.promised + _FURTHEST_EPOCH:
+            return self._on_file(self.warden, stored.seq, now_ns)
+        if self.promised < stored.epoch <= self.promised + _FURTHEST_EPOCH:
             self._claim_above = stored.epoch
+        return []
+
+    def _on_file(self, warden: Warden, seq: int, now_ns: int) -> list[MemberAction]:
+        """Another member has stored the table of this number, or a later one: with ours that is a majority."""
+        while len(self._told) > 1 and self._told[1].seq <= seq:
+            del self._told[0]
+        if not self._told or self._told[0].seq > seq:
+            return []
+        return [*warden.granted(self._told[0], now_ns)]
 
     # --- being warden ---------------------------------------------------------------------------------------
 
@@ -197,14 +221,18 @@ class Member:
         if table is not None:
             if table is not self.stored:
                 self.stored = table
+                self._told = [*self._told[-_TABLES_KEPT:], table]
                 actions.append(Save(self.promised, table))
             actions.append(table)
+            if self._plots.majority == 1:
+                actions += self._on_file(warden, table.seq, now_ns)
         return actions
 
     def _take_charge(self, now_ns: int) -> None:
         if self.warden is None and len(self._promises) >= self._plots.majority:
             newest = max(self._promises.values(), key=lambda table: table.stamp)
-            self.warden = Warden(self._plots, self._me, self._claimed, newest, self._vehicles)
+            self.warden = Warden(self._plots, self._me, self._claimed, newest, self._fleets)
+            self._told = []
             self._acked_ns = now_ns
             # Once in an epoch: a promise that comes again after the warden has resigned must not begin it anew.
             self._claimed, self._promises = 0, {}

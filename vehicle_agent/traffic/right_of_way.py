@@ -15,8 +15,8 @@ from msgspec.structs import replace
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.liveness import Peer, Roster
-from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Standing, Stored, Table
-from vehicle_agent.traffic.holdings import Holdings, Wish
+from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Standing, Stored, Table
+from vehicle_agent.traffic.holdings import Holdings, Tell, Wish
 from vehicle_agent.traffic.member import Member, MemberAction
 from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.warden import first_life, is_far_ahead
@@ -54,7 +54,7 @@ class AskKnown:
     """Ask the other agents what they have on file about this one, then `begin`."""
 
 
-Action = MemberAction | Standing | OwnRecord | Known | AskKnown
+Action = MemberAction | Tell | OwnRecord | Known | AskKnown
 
 
 class RightOfWay:
@@ -84,15 +84,14 @@ class RightOfWay:
         self.own = own
         self.holdings = Holdings(plots, agent, spawns[agent])
         self._spawns = spawns
-        self._vehicles = {vehicle: cell for each in spawns.values() for vehicle, cell in each.items()}
         self._saved = dict(saved)
         self._place = place
         self._members: dict[int, Member] = {}
         self._known_life = 0
         self._twins = Roster()
         self._alone_since_ns: int | None = None
-        self._table_ns: dict[int, int] = {}
-        """Plot that concerns us -> when a table of it was heard last."""
+        self._led_ns: dict[int, int] = {}
+        """Plot that concerns us -> when its warden was heard last."""
         self.silent = False
 
     # --- beginning a life -----------------------------------------------------------------------------------
@@ -187,25 +186,20 @@ class RightOfWay:
         if member is not None and standing.agent in self._spawns:
             member.hear_standing(standing, now_ns)
 
-    def hear_table(self, table: Table, now_ns: int) -> tuple[list[Action], list[str]]:
-        """Returns what to do, and which vehicles have found their place."""
+    def hear_table(self, table: Table, now_ns: int) -> list[Action]:
         member = self._member(table.plot, now_ns)
-        actions: list[Action] = [] if member is None else [*member.hear_table(table, now_ns)]
-        placed = []
-        if self.holdings.life and table.plot in self.holdings.plots:
-            self._table_ns[table.plot] = now_ns
-            placed = self.holdings.hear_table(table, self._place)
-            if member is not None:
-                placed += self.holdings.hear_stored(member.on_file, self._place)
-        return actions, placed
+        return [] if member is None else [*member.hear_table(table, now_ns)]
 
-    def hear_stored(self, stored: Stored, now_ns: int) -> list[str]:
+    def hear_stored(self, stored: Stored, now_ns: int) -> list[Action]:
         member = self._members.get(stored.plot)
-        if member is not None:
-            member.hear_stored(stored, now_ns)
-        if not self.holdings.life or stored.plot not in self.holdings.plots:
+        return [] if member is None else [*member.hear_stored(stored, now_ns)]
+
+    def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
+        """A warden's word to us. Returns the vehicles that have found their place."""
+        if not self.holdings.life or granted.plot not in self.holdings.plots:
             return []
-        return self.holdings.hear_stored(stored, self._place)
+        self._led_ns[granted.plot] = now_ns
+        return self.holdings.hear_granted(granted, self._place, now_ns)
 
     def hear_claim(self, plot: int, epoch: int, now_ns: int) -> list[Action]:
         """Another member asks for our promise: `Save`, then the table to answer with; or nothing."""
@@ -235,9 +229,9 @@ class RightOfWay:
     def unled(self, now_ns: int) -> dict[int, str]:
         """Why vehicles of ours wait: plot -> that no warden of it is heard."""
         plots = self.holdings.plots
-        self._table_ns = {plot: self._table_ns.get(plot, now_ns) for plot in plots}
+        self._led_ns = {plot: self._led_ns.get(plot, now_ns) for plot in plots}
         found = {}
-        for plot, heard_ns in self._table_ns.items():
+        for plot, heard_ns in self._led_ns.items():
             if now_ns - heard_ns > _UNLED_NS and (vehicles := self.holdings.waiting(plot)):
                 members = self.plots.members(plot)
                 found[plot] = (
@@ -258,14 +252,15 @@ class RightOfWay:
         if self.agent not in members or not {self.agent, *self.own.noted_by}.issuperset(members):
             return None
         promised, stored = self._saved.get(plot) or (0, self._at_start(plot))
-        made = self._members[plot] = Member(self.plots, self.agent, promised, stored, self._vehicles, now_ns)
+        made = self._members[plot] = Member(self.plots, self.agent, promised, stored, self._spawns, now_ns)
         return made
 
     def _at_start(self, plot: int) -> Table:
         """The table from before any warden: vehicles stand where the run begins."""
         grants = {
             vehicle: Grant([cell], (0, 0))
-            for vehicle, cell in self._vehicles.items()
+            for fleet in self._spawns.values()
+            for vehicle, cell in fleet.items()
             if self.plots.of(cell) == plot
         }
         return Table(plot=plot, agent=self.agent, epoch=0, seq=0, hosts={}, grants=grants)

@@ -6,13 +6,12 @@ alone on its cells (see decision 25 for the proof).
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from zlib import crc32
 
 from swarm.clock import NS_PER_S
-from swarm.config.agents import agent_of
-from swarm.wire.messages.traffic import Grant, Shut, Stamp, Stand, Standing, Table
+from swarm.wire.messages.traffic import Grant, Granted, Shut, Stamp, Stand, Standing, Table
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.plots import Plots
 
@@ -23,6 +22,8 @@ SILENT_NS = NS_PER_S
 _AGE_BITS = 12
 """Ages are compared in steps of 4 s: two wardens hear the same two at different times, and have to agree which is
 the older most of the time, or each lets its own wait for the other."""
+_TOLD_AGAIN_NS = 3 * BEAT_NS // 4
+"""A host is told the same again after so long: somewhat less than a beat, so that a beat tells it."""
 _LIFE_BITS = 32
 _FURTHEST_LIFE = 1 << 16
 
@@ -46,24 +47,34 @@ def is_far_ahead(life: int, known: int) -> bool:
 
 @dataclass(slots=True)
 class _Host:
+    """What was heard of a host: its newest standing of its newest life; when any came of any of its lives.
+
+    told  what was granted to it last, and when
+    """
+
     standing: Standing
     heard_ns: int
+    spoke_ns: int
+    told: object = None
+    told_ns: int = 0
 
 
 class Warden:
     """Holds one plot's table in one epoch. Every `tick` may make a new one, which counts once a majority stored it.
 
-    vehicles  all of the run
+    fleets  agent -> its vehicles, all of the run
     """
 
-    def __init__(self, plots: Plots, me: str, epoch: int, table: Table, vehicles: Container[str]) -> None:
+    def __init__(
+        self, plots: Plots, me: str, epoch: int, table: Table, fleets: Mapping[str, Collection[str]]
+    ) -> None:
         self.epoch = epoch
         self.seq = 0
         self.refused: list[str] = []
         self._plots = plots
         self._plot = table.plot
         self._me = me
-        self._vehicles = vehicles
+        self._fleets = fleets
         self._lives = dict(table.hosts)  # agent -> (life, seq) of the newest standing that counts
         self._grants: dict[str, tuple[list[int], Stamp]] = {
             vehicle: (list(grant.cells), grant.stamp) for vehicle, grant in table.grants.items()
@@ -84,6 +95,8 @@ class Warden:
 
     def hear(self, standing: Standing, now_ns: int) -> None:
         host = standing.agent
+        if host in self._hosts:
+            self._hosts[host].spoke_ns = now_ns
         for dead in standing.dead:
             if self._shut.pop((host, dead), None) is not None:
                 self._granted = True
@@ -102,9 +115,17 @@ class Warden:
         if not standing.vehicles and (host not in self._hosts or self._hosts[host].standing.vehicles):
             self._changed = True  # it leaves the plot as soon as a table counts this
         holds = {stand.vehicle: stand.holds for stand in standing.vehicles}
-        for vehicle in [vehicle for vehicle in self._grants if agent_of(vehicle) == host]:
+        for vehicle in self._granted_to(host):
             self._free(vehicle, holds.get(vehicle, []), standing.knows)
-        self._hosts[host] = _Host(standing, now_ns)
+        known = self._hosts.get(host)
+        if known is None:
+            self._hosts[host] = _Host(standing, now_ns, now_ns)
+        else:
+            known.standing, known.heard_ns = standing, now_ns
+
+    def _granted_to(self, host: str) -> list[str]:
+        """The vehicles of a host that are granted cells."""
+        return [vehicle for vehicle in self._fleets.get(host, ()) if vehicle in self._grants]
 
     def _ended(self, host: str, ended: int, life: int) -> None:
         """A life's own word that it drives no more."""
@@ -120,7 +141,7 @@ class Warden:
     def _succeed(self, host: str, before: int) -> None:
         """A new life of a host speaks. What the one before it was granted stays shut until that is known to have
         ended; the new one is granted the same cells, and has to see that before it can give any back."""
-        mine = [vehicle for vehicle in self._grants if agent_of(vehicle) == host]
+        mine = self._granted_to(host)
         if (host, before) in self._shut:
             del self._shut[host, before]
         elif before and mine:
@@ -173,6 +194,39 @@ class Warden:
             pushed=dict(self._pushed),
         )
 
+    def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
+        """What a table says to each host that has spoken lately, where it is new or the last word is a beat old."""
+        held = {cell for grant in table.grants.values() for cell in grant.cells}
+        held.update(cell for shut in table.shut for cell in shut.cells)
+        for name, host in self._hosts.items():
+            if now_ns - host.spoke_ns > SILENT_NS:
+                continue
+            life, heard = table.hosts.get(name, (0, 0))
+            mine = [vehicle for vehicle in self._fleets.get(name, ()) if vehicle in table.grants]
+            grants = {vehicle: table.grants[vehicle].cells for vehicle in mine}
+            own = {cell for cells in grants.values() for cell in cells}
+            occupied = [
+                cell for stand in host.standing.vehicles for cell in stand.wants if cell in held and cell not in own
+            ]
+            pushed = {vehicle: table.pushed[vehicle] for vehicle in mine if vehicle in table.pushed}
+            leaves = not host.standing.vehicles
+            says = (life, grants, pushed, occupied, heard if leaves else 0)
+            if says == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
+                continue
+            host.told, host.told_ns = says, now_ns
+            yield Granted(
+                plot=table.plot,
+                host=name,
+                agent=table.agent,
+                epoch=table.epoch,
+                seq=table.seq,
+                life=life,
+                heard=heard,
+                grants=grants,
+                pushed=pushed,
+                occupied=list(dict.fromkeys(occupied)),
+            )
+
     def _plan(self, now_ns: int) -> None:
         stands = self._stands(now_ns)
         held = {cell for cells, _ in self._grants.values() for cell in cells}
@@ -214,7 +268,7 @@ class Warden:
             for name, host in self._hosts.items()
             if now_ns - host.heard_ns <= SILENT_NS
             for stand in host.standing.vehicles
-            if stand.vehicle in self._vehicles and agent_of(stand.vehicle) == name
+            if stand.vehicle in self._fleets.get(name, ())
         ]
         return sorted(stands, key=_turn)
 

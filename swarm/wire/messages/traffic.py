@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta
 
 from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Plot, VehicleId
@@ -38,7 +39,8 @@ class Stand(Bounded, frozen=True, array_like=True):
 
 
 class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
-    """All vehicles of a host that hold or want a cell of one plot. The newest replaces the older.
+    """All vehicles of a host that hold or want a cell of one plot, told to one of its members. The newest replaces
+    the older.
 
     life   which life of the host speaks; a later one is greater
     knows  the newest table that the host acts on: of what that granted, it holds no more than it lists here
@@ -56,7 +58,7 @@ class Standing(Message, frozen=True, kw_only=True, tag=schema_of("standing")):
     ended: bool = False
 
 
-class Grant(Bounded, frozen=True, array_like=True):
+class Grant(msgspec.Struct, frozen=True, array_like=True):
     """The cells that one vehicle may stand on or enter, in driving order.
 
     stamp  of the table that last added one
@@ -75,8 +77,8 @@ class Shut(Bounded, frozen=True, array_like=True):
 
 
 class Table(Message, frozen=True, kw_only=True, tag=schema_of("table")):
-    """Who may be where in one plot. In a publication its author is the plot's warden; in a reply, a member which
-    tells what it has stored.
+    """Who may be where in one plot, for its members. In a publication its author is the plot's warden; in a reply,
+    a member which tells what it has stored.
 
     hosts   agent -> [life, seq] of the newest standing that counts in this table
     grants  vehicle -> its cells
@@ -105,6 +107,33 @@ class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):
     agent: Id
     epoch: Natural
     seq: Natural
+
+
+class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted")):
+    """What a plot's table says to one host, once a majority of the plot's members has it on file.
+
+    agent        the plot's warden
+    epoch, seq   of the table
+    life, heard  the newest standing of the host that counts in the table; 0 if none does
+    grants       vehicle of the host -> its cells, in driving order
+    pushed       vehicle of the host -> the age with which it is to make way into another plot
+    occupied     of the cells that vehicles of the host at rest could go to, those that others hold
+    """
+
+    plot: Plot
+    host: Id
+    agent: Id
+    epoch: Natural
+    seq: Natural
+    life: Natural
+    heard: Natural
+    grants: Annotated[dict[VehicleId, Annotated[list[Cell], Meta(min_length=1, max_length=64)]], SMALL] = {}
+    pushed: Annotated[dict[VehicleId, Milliseconds], SMALL] = {}
+    occupied: Annotated[list[Cell], LARGE] = []
+
+    @property
+    def stamp(self) -> Stamp:
+        return self.epoch, self.seq
 
 
 class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
