@@ -16,7 +16,7 @@ from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, Window
 from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
@@ -29,6 +29,8 @@ from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
+_WISH_LASTS_NS = NS_PER_S
+"""A wish that has not changed is made anew so often, as it tells the vehicle's age."""
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
@@ -110,9 +112,14 @@ class Agent:
         self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
         self._unassigned = False
         """Whether vehicles have been placed that nobody has asked a target for yet."""
+        sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
+        self._sight_cells = max(sense_cells, config.reserve_cells + 1)
+        """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
         self._driven_ns: int | None = None
         self._left_s: dict[str, float] = {}
         self._look_from: dict[int, None] = {}
+        self._wished: dict[str, tuple[object, ...]] = {}
+        """Vehicle under way -> what its wish was made of."""
 
     # --- where vehicles start -------------------------------------------------------------------------------
 
@@ -122,12 +129,14 @@ class Agent:
             cell = self.holdings.path(id)[0]
             self.vehicles[id] = Vehicle(id, self._map.grid, cell)
             self._look_from[cell] = None
+            self._wished.pop(id, None)
             self._unassigned = True
 
     def stand_down(self) -> None:
         """Another process drives the vehicles now."""
         self.vehicles.clear()
         self.wishes.clear()
+        self._wished.clear()
 
     @property
     def places(self) -> list[int]:
@@ -182,17 +191,25 @@ class Agent:
                 return left_s
         return 0.0
 
-    def map_changed(self, now_ns: int, *, look: bool = False) -> None:
+    def map_changed(self, changed: Sequence[Window], now_ns: int, *, look: bool = False) -> None:
         """End routes before cells that are lethal now, and paths also before corners that are.
 
-        look  another agent changed the map: compare what is in sight with it again
+        changed  the windows with all cells that have changed
+        look     another agent changed the map: compare what is in sight with it again
         """
-        pace = self._map.pace.reshape(-1)
-        for vehicle in self.vehicles.values():
+        if not changed or not self.vehicles:
+            return
+        vehicles = list(self.vehicles.values())
+        cols, sight, pace = self._map.grid.cols, self._sight_cells, self._map.pace.reshape(-1)
+        cells = np.array([divmod(vehicle.cell, cols) for vehicle in vehicles], np.int64)
+        routes = np.array([vehicle.route.bounds(cols) for vehicle in vehicles], np.int64)
+        for index in np.flatnonzero(_meet(routes, changed, 1) | _meet(np.hstack((cells, cells)), changed, sight)):
+            vehicle = vehicles[index]
             ahead = vehicle.route.ahead()
-            if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable):
+            if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable_steps):
                 vehicle.cut_route(now_ns)
             self._end_path(vehicle)
+            self._wished.pop(vehicle.id, None)
             if look:
                 self._look_from[vehicle.cell] = None
 
@@ -223,9 +240,7 @@ class Agent:
             ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)
-            in_reach = partial(self._in_reach, vehicle.target)
-            pushed = self.holdings.pushed(vehicle.id)
-            self.wishes[vehicle.id] = self._steering.wish(vehicle, path, pushed, in_reach, now_ns)
+            self._wish(vehicle, path, now_ns)
             self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
@@ -247,6 +262,16 @@ class Agent:
             self._requests += 1
             actions.append(self._assignment.ask(self._requests, self.vehicles, now_ns))
         return actions
+
+    def _wish(self, vehicle: Vehicle, path: Sequence[int], now_ns: int) -> None:
+        """Say where the vehicle would go. While it is under way, only what is listed here can change that."""
+        pushed, route, second = self.holdings.pushed(vehicle.id), vehicle.route, now_ns // _WISH_LASTS_NS
+        made_of = (path[0], path[-1], route.changes, vehicle.target, vehicle.in_reach, pushed, second)
+        if len(path) > 1 and self._wished.get(vehicle.id) == made_of:
+            return
+        self._wished[vehicle.id] = made_of
+        in_reach = partial(self._in_reach, vehicle.target)
+        self.wishes[vehicle.id] = self._steering.wish(vehicle, path, pushed, in_reach, now_ns)
 
     def _in_reach(self, target: str | None, cell: int) -> bool:
         pose = self._poses.get(target) if target is not None else None
@@ -352,7 +377,7 @@ class Agent:
         begun = vehicle.give_route(given, path, now_ns)
         if begun is None:
             return []
-        if vehicle.route.cut(self._steering.passable):
+        if vehicle.route.cut(self._steering.passable_steps):
             vehicle.cut_route(now_ns)
         on_route = set(cells)
         if path[-1] not in on_route:  # it was granted cells along another route
@@ -368,3 +393,17 @@ class Agent:
     def costs_ended(self, request: int, now_ns: int) -> None:
         """No more answers to `AskCosts` will come."""
         self._assignment.costs_ended(request, self.vehicles, self._planners, now_ns)
+
+
+def _meet(boxes: NDArray[np.int64], windows: Sequence[Window], margin: int) -> NDArray[np.bool_]:
+    """Which boxes lie within `margin` cells of any window.
+
+    boxes  int64 (n, 4): the smallest row and column of each, and the greatest
+    """
+    row0, col0, row1, col1 = boxes.T
+    met = np.zeros(len(boxes), np.bool_)
+    for window in windows:
+        rows = (row0 < window.row1 + margin) & (row1 >= window.row0 - margin)
+        met |= rows & (col0 < window.col1 + margin) & (col1 >= window.col0 - margin)
+    met &= row0 <= row1
+    return met

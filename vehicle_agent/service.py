@@ -37,6 +37,7 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
+from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
@@ -107,7 +108,7 @@ class AgentService:
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._roster = Roster()
         self._now_ns = 0
-        self._fleet = FleetReport(grid, self._author, group)
+        self._fleet = FleetReport(self._author, group)
         self._asked_ns: dict[str, int] = {}
         """Tag of each open route request -> when it was sent."""
 
@@ -169,8 +170,7 @@ class AgentService:
         self._right_of_way.hear_granted(now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
-        if self._cost_map.take_dirty():
-            agent.map_changed(now_ns, look=True)
+        agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
         if agent.places:
             self._sync.enter(self._near_marks.update(agent.places))
         agent.begin_drive(now_ns)
@@ -178,12 +178,13 @@ class AgentService:
             if len(findings):
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
-                agent.map_changed(now_ns)
-        self._tell_sighted(now_ns)
+                agent.map_changed(self._cost_map.take_dirty(), now_ns)
+        places = Places(self._cost_map.grid, agent.vehicles.values())
+        self._tell_sighted(places, now_ns)
         self._perform(agent.decide(now_ns), now_ns)
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
-        for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
+        for region, fleet in self._fleet.reports(places, now_ns):
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
         self._gauge()
@@ -212,9 +213,9 @@ class AgentService:
 
     # --- targets in sight -----------------------------------------------------------------------------------
 
-    def _tell_sighted(self, now_ns: int) -> None:
+    def _tell_sighted(self, places: Places, now_ns: int) -> None:
         self._untracked.expire(now_ns)
-        for sighted in self._detector.look(self._agent.vehicles.values(), now_ns):
+        for sighted in self._detector.look(places, now_ns):
             self.counters.count("targets_sighted")
             self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
             self._hear_sighted(sighted, now_ns)

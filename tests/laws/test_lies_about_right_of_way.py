@@ -14,8 +14,8 @@ from swarm.bus.bus import Event, Heard
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.base import Message
-from swarm.wire.messages.traffic import Shut, Standing, Stored, Table
-from swarm.wire.topics import STANDING, STORED, TABLE
+from swarm.wire.messages.traffic import Granted, Shut, Standing, Stored, Table
+from swarm.wire.topics import GRANTED, STANDING, STORED, TABLE
 from vehicle_agent.service import AgentService
 
 LEAPS = (-1, 1, 2, 3, 100, 1 << 20, 1 << 32, (1 << 33) + 5, 1 << 40, 1 << 47)
@@ -47,6 +47,17 @@ def near_the_truth(said: Message, cells: int, chance: random.Random) -> Message:
                     replace(said, seq=said.seq + 1, shut=[Shut(each, 1, anywhere) for each in said.hosts]),
                 )
             )
+        case Granted():
+            anywhere = [chance.randrange(cells) for _ in range(5)]
+            return chance.choice(
+                (
+                    replace(said, epoch=said.epoch + 3 * abs(leap)),
+                    replace(said, seq=said.seq + abs(leap)),
+                    replace(said, seq=said.seq + 1, life=said.life + leap),
+                    replace(said, seq=said.seq + 1, heard=said.heard + abs(leap), grants={}),
+                    replace(said, seq=said.seq + 1, grants=dict.fromkeys(said.grants, anywhere)),
+                )
+            )
         case Stored():
             return replace(said, epoch=said.epoch + leap) if leap % 2 else replace(said, seq=said.seq + leap)
     raise TypeError(said)
@@ -62,7 +73,7 @@ def lied_to(simulation: Simulation, seconds: float, chance: random.Random) -> in
         if isinstance(event, Heard) and encode(event.message) not in lies:
             heard.append(event)
 
-    for topic in (STANDING, TABLE, STORED):
+    for topic in (STANDING, TABLE, GRANTED, STORED):
         bus.subscribe(topic, post)
     end_s = simulation.now_s + seconds
     while simulation.now_s < end_s:

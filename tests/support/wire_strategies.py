@@ -23,7 +23,18 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.traffic import Claim, Grant, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
+from swarm.wire.messages.traffic import (
+    Claim,
+    Grant,
+    Granted,
+    Known,
+    KnownRequest,
+    Shut,
+    Stand,
+    Standing,
+    Stored,
+    Table,
+)
 from swarm.wire.messages.vehicles import (
     NO_TARGET,
     Fleet,
@@ -182,6 +193,11 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         shut=st.lists(st.builds(Shut, agent=ids, life=naturals, cells=few_cells), max_size=2),
         pushed=st.dictionaries(ids, milliseconds, max_size=2),
     ),
+    Granted: st.builds(
+        Granted, plot=plots, host=ids, agent=ids, epoch=naturals, seq=naturals, life=naturals, heard=naturals,
+        grants=st.dictionaries(ids, st.lists(cells, min_size=1, max_size=4), max_size=3),
+        pushed=st.dictionaries(ids, milliseconds, max_size=2), occupied=few_cells,
+    ),
     Stored: st.builds(Stored, plot=plots, agent=ids, epoch=naturals, seq=naturals),
     Claim: st.builds(Claim, epoch=naturals),
     KnownRequest: st.builds(KnownRequest, agent=ids, disk=naturals),
@@ -269,6 +285,10 @@ EXAMPLES: tuple[Message, ...] = (
     Table(
         plot=0, agent="a1", epoch=3, seq=17, hosts={"a0": (1 << 32, 8)}, grants={"a0-00": Grant([4, 5], (3, 16))},
         shut=[Shut("a2", 1 << 32, [9])], pushed={"a0-00": 900},
+    ),
+    Granted(
+        plot=0, host="a0", agent="a1", epoch=3, seq=17, life=1 << 32, heard=8, grants={"a0-00": [4, 5]},
+        pushed={"a0-00": 900}, occupied=[6],
     ),
     Stored(plot=0, agent="a2", epoch=3, seq=17),
     Claim(epoch=4),

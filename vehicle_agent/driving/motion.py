@@ -32,6 +32,11 @@ class Motion:
         return self.tail if 2.0 * self.done_m < self._length_m else self.head
 
     @property
+    def share(self) -> float:
+        """How much of the step is driven, 0 to 1."""
+        return self.done_m / self._length_m if self._length_m else 0.0
+
+    @property
     def at_rest(self) -> bool:
         """Whether it stands in the middle of a cell, so that it may set out in any direction."""
         return self.tail == self.head
@@ -79,7 +84,7 @@ class Motion:
     def place_m(self) -> tuple[float, float]:
         """(east, south) in metres from the north-west corner of the grid."""
         cols, resolution_m = self._grid.cols, self._grid.resolution_m
-        share = self.done_m / self._length_m if self._length_m else 0.0
+        share = self.share
         row0, col0 = divmod(self.tail, cols)
         row1, col1 = divmod(self.head, cols)
         row = row0 + share * (row1 - row0)

@@ -15,13 +15,18 @@ _SKIPPED_CELLS = 24
 
 
 class Follower:
-    """The cells of a route and how far along it the vehicle is. Without a route no cell is ahead."""
+    """The cells of a route and how far along it the vehicle is. Without a route no cell is ahead.
 
-    __slots__ = ("_at", "_cells", "partial")
+    changes  how often it has been another route: begun, dropped or cut
+    """
+
+    __slots__ = ("_at", "_bounds", "_cells", "changes", "partial")
 
     def __init__(self) -> None:
         self._cells: list[int] = []
         self._at = 0
+        self._bounds: tuple[int, int, int, int] | None = None
+        self.changes = 0
         self.partial = False
         """Whether the route ends before its target, because the planner gave a part of it."""
 
@@ -31,15 +36,25 @@ class Follower:
         at = next((cells.index(cell) for cell in path if cell in cells), None)
         if at is None:
             return False
-        self._cells = list(cells)
-        self._at = at
+        self._set(list(cells), at)
         self.partial = partial
         return True
 
     def drop(self) -> None:
-        self._cells = []
-        self._at = 0
+        self._set([], 0)
         self.partial = False
+
+    def _set(self, cells: list[int], at: int) -> None:
+        self._cells, self._at, self._bounds = cells, at, None
+        self.changes += 1
+
+    def bounds(self, cols: int) -> tuple[int, int, int, int]:
+        """The smallest (row, col) and the greatest of all its cells in a grid of so many columns; of no cells a
+        rectangle that holds nothing."""
+        if self._bounds is None:
+            rows, east = np.divmod(np.array(self._cells or [0], np.int64), cols)
+            self._bounds = (int(rows.min()), int(east.min()), int(rows.max()), int(east.max()))
+        return self._bounds if self._cells else (1, 1, 0, 0)
 
     def moved(self, cell: int) -> None:
         """The vehicle has entered a cell: the next one of its route, or one further on, or none."""
@@ -67,14 +82,17 @@ class Follower:
         """How many cells are ahead."""
         return max(len(self._cells) - self._at - 1, 0)
 
-    def cut(self, passable: Callable[[int, int], bool]) -> bool:
-        """End the route before the first step ahead that is not passable; True if there is one."""
-        for index in range(self._at + 1, len(self._cells)):
-            if not passable(self._cells[index - 1], self._cells[index]):
-                del self._cells[index:]
-                self.partial = False
-                return True
-        return False
+    def cut(self, passable: Callable[[Sequence[int]], int]) -> bool:
+        """End the route before the first step ahead that is not passable; True if there is one.
+
+        passable  how many steps from the first of some cells on are
+        """
+        keep = self._at + 1 + passable(self._cells[self._at :])
+        if keep >= len(self._cells):
+            return False
+        self._set(self._cells[:keep], self._at)
+        self.partial = False
+        return True
 
 
 def route_cells(grid: GridSpec, start: int, directions: bytes) -> tuple[int, ...] | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
+
+import numpy as np
 
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings, pose_of
@@ -11,7 +12,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.wire.messages.targets import Sighted, TargetPose
-from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.driving.places import Places
 
 _TELL_NS = NS_PER_S // 2
 """Period of the sightings of a target that stays in sight."""
@@ -46,17 +47,16 @@ class TargetDetector:
         if self._newest.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
             self._true[pose.target] = pose
 
-    def look(self, vehicles: Iterable[Vehicle], now_ns: int) -> list[Sighted]:
+    def look(self, places: Places, now_ns: int) -> list[Sighted]:
         """The sightings to publish now: of each target in sight one, by the nearest vehicle."""
         due = [id for id in self._true if now_ns - self._told_ns.get(id, -_TELL_NS) >= _TELL_NS]
-        if not due:
+        if not due or not places.vehicles:
             return []
-        places = [vehicle.motion.place_m() for vehicle in vehicles]
         seen = []
         for id in due:
             pose = self._true[id]
             east_m, south_m = pose.x_m - self._grid.west_m, self._grid.north_m - pose.y_m
-            distance_m = min((math.hypot(e - east_m, s - south_m) for e, s in places), default=math.inf)
+            distance_m = float(np.hypot(places.east_m - east_m, places.south_m - south_m).min())
             if distance_m <= self._range_m:
                 self._told_ns[id] = now_ns
                 seen.append(self._sighted(pose, distance_m, now_ns))

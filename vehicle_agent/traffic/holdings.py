@@ -101,6 +101,8 @@ class Holdings:
         """All cells of our paths; None when they have changed."""
         self._others: set[int] | None = None
         """The cells beside our vehicles that others hold; None when they have changed."""
+        self._pushed: dict[str, int] | None = None
+        """Vehicle -> the age with which it is asked to make way; None when a warden has spoken."""
         self._said: dict[str, _Said] = {}
         self._views: dict[int, _View] = {}
         self._seq = 0
@@ -118,7 +120,12 @@ class Holdings:
 
     def pushed(self, vehicle: str) -> int:
         """The age with which it is asked to make way into another plot; 0 if it is not."""
-        return max((view.pushed.get(vehicle, 0) for view in self._views.values()), default=0)
+        if self._pushed is None:
+            self._pushed = {}
+            for view in self._views.values():
+                for id, age in view.pushed.items():
+                    self._pushed[id] = max(age, self._pushed.get(id, 0))
+        return self._pushed.get(vehicle, 0)
 
     def occupied(self, cell: int) -> bool:
         """Whether a vehicle holds a cell to which one of ours at rest could go, as far as wardens tell."""
@@ -168,7 +175,7 @@ class Holdings:
         view.knows, view.heard = granted.stamp, granted.heard
         view.pushed = {id: age for id, age in granted.pushed.items() if id in self._paths}
         view.others = frozenset(granted.occupied)
-        self._cells = self._others = None
+        self._cells = self._others = self._pushed = None
         return self._take(view, granted, place)
 
     def _take(self, view: _View, granted: Granted, place: Callable[[str, Sequence[int]], int]) -> list[str]:
@@ -204,8 +211,8 @@ class Holdings:
     # --- what to say ----------------------------------------------------------------------------------------
 
     def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
-        """What to tell of each plot that concerns us, where it is new or the last word is a beat old. Cells left out
-        are given back."""
+        """What to tell of each plot that concerns us, where it is new or the last word is a beat old. What is left
+        out is given back."""
         self._seq += 1
         by_plot: dict[int, list[tuple[int, Stand, object]]] = {plot: [] for plot in self.plots}
         for vehicle, path in self._paths.items():

@@ -74,6 +74,19 @@ class Steering:
             return True
         return not (self.closed(tail + col) or self.closed(tail + rows * cols))
 
+    def passable_steps(self, cells: Sequence[int]) -> int:
+        """How many steps along some cells, each next to the one before, the map allows."""
+        if len(cells) < 2:
+            return 0
+        at = np.array(cells, np.int64)
+        lethal = np.isinf(self._pace[at[1:]])
+        if not self._corner_cutting:
+            rows, cols = np.divmod(at, self._grid.cols)
+            south, east = np.diff(rows), np.diff(cols)
+            beside = np.isinf(self._pace[at[:-1] + east]) | np.isinf(self._pace[at[:-1] + south * self._grid.cols])
+            lethal |= beside & (south != 0) & (east != 0)
+        return int(lethal.argmax()) if lethal.any() else len(cells) - 1
+
     def wish(
         self, vehicle: Vehicle, path: Sequence[int], pushed_ms: int, in_reach: Callable[[int], bool], now_ns: int
     ) -> Wish:

@@ -18,6 +18,7 @@ from swarm.grid import GridSpec
 from swarm.liveness import POSE_SILENCE_NS
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.topics import POSE, SIGHTED
+from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.sensing.target_detector import TargetDetector
 
@@ -100,11 +101,11 @@ def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
     x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
     detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m), 0)
     far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
-    assert detector.look([far], 0) == []
-    (told,) = detector.look([far, near], 0)
+    assert detector.look(Places(GRID, [far]), 0) == []
+    (told,) = detector.look(Places(GRID, [far, near]), 0)
     assert (told.cell, told.until_ns, told.uncertainty_m) == (410, 2_000_000_000, 5.0 + 0.02 * 50.0)
-    assert detector.look([near], 400_000_000) == []  # not so often
-    assert len(detector.look([near], 500_000_000)) == 1
+    assert detector.look(Places(GRID, [near]), 400_000_000) == []  # not so often
+    assert len(detector.look(Places(GRID, [near]), 500_000_000)) == 1
 
 
 def test_the_store_keeps_where_each_target_was_seen_last() -> None:

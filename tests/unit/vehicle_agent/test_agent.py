@@ -18,11 +18,12 @@ from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.traffic import Grant, Table
+from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes, LocalMap
 from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
+from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.fleet import FleetReport
 from vehicle_agent.placement import spawn_cells
@@ -55,12 +56,11 @@ def agent_of(scenario: Scenario, index: int = 0) -> Agent:
 
 
 def grant(agent: Agent, seq: int, **cells: list[int]) -> None:
-    """The table of a plot's only member grants cells to a0-00 and a0-01, named by their last digit."""
-    plots = Plots(GRID, ["a0", "a1"])
-    grants = {f"a0-0{name[1:]}": Grant(each, (1, seq)) for name, each in cells.items()}
-    hosts = {"a0": (1, seq)}
-    table = Table(plot=0, agent=plots.warden(0, 1), epoch=1, seq=seq, hosts=hosts, grants=grants)
-    agent.place(agent.holdings.hear_table(table, lambda vehicle, found: found[0]))
+    """The warden of a plot grants cells to a0-00 and a0-01, named by their last digit."""
+    warden = Plots(GRID, ["a0", "a1"]).warden(0, 1)
+    grants = {f"a0-0{name[1:]}": each for name, each in cells.items()}
+    granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
+    agent.place(agent.holdings.hear_granted(granted, lambda vehicle, found: found[0], seq))
 
 
 @pytest.fixture
@@ -181,7 +181,7 @@ def test_a_vehicle_drives_what_it_is_granted_and_gives_back_what_is_found_lethal
     agent._map = dataclasses.replace(agent._map, pace=LEVEL.copy())
     agent._steering._pace = agent._map.pace.reshape(-1)
     agent._map.pace.reshape(-1)[here + 2] = np.inf
-    agent.map_changed(S)
+    agent.map_changed([GRID.window], S)
     assert here + 2 not in agent.holdings.path("a0-00")
     assert agent.holdings.path("a0-00")[-1] == here + 1
     assert [vehicle.cell for vehicle in agent.vehicles.values()][1] == GRID.cell(8, 8)
@@ -202,7 +202,7 @@ def test_a_corner_that_is_found_lethal_is_not_cut_though_the_cell_behind_it_is_g
     pace.reshape(-1)[beside] = np.inf
     agent._map = dataclasses.replace(agent._map, pace=pace)
     agent._steering._pace = pace.reshape(-1)
-    agent.map_changed(S // 5)
+    agent.map_changed([GRID.window], S // 5)
     assert list(agent.holdings.path("a0-00")) == [here]
     agent.begin_drive(2 * S)
     while agent.drive() is not None:
@@ -280,12 +280,12 @@ def test_explicit_places_come_first_and_are_left_free_by_all_others() -> None:
 
 def test_a_region_that_the_vehicles_have_left_is_told_so_once() -> None:
     grid = GridSpec(300, 300, 1.0)
-    report = FleetReport(grid, "a0.1", "all")
+    report = FleetReport("a0.1", "all")
     near, far = Vehicle("u", grid, grid.cell(0, 0)), Vehicle("v", grid, grid.cell(0, 299))
-    told = dict(report.reports([near, far], S))
+    told = dict(report.reports(Places(grid, [near, far]), S))
     assert [told[0].ids, told[1].ids] == [["u"], ["v"]]
     assert column(told[1].east_m, "<f4").tolist() == [299.5]
-    told = dict(report.reports([near], 2 * S))
+    told = dict(report.reports(Places(grid, [near]), 2 * S))
     assert [told[0].ids, told[1].ids] == [["u"], []]
     assert told[0].seq == told[1].seq == 2
-    assert list(dict(report.reports([near], 3 * S))) == [0]
+    assert list(dict(report.reports(Places(grid, [near]), 3 * S))) == [0]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.traffic import Known, KnownRequest, Standing, Table
+from swarm.wire.messages.traffic import Known, KnownRequest, Table
+from vehicle_agent.traffic.holdings import Tell
 from vehicle_agent.traffic.member import AskPromises, Save
 from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
@@ -26,7 +27,7 @@ def test_a_silent_member_says_nothing_and_remembers_nothing_that_is_not_on_file(
     epoch = next(n for n in range(1, 9) if PLOTS.warden(0, n) == "a1")
     table = Table(plot=0, agent="a1", epoch=epoch, seq=1, hosts={}, grants={})
     assert rights.hear_claim(0, epoch, 5 * S) == []
-    assert rights.hear_table(table, 5 * S) == ([], [])
+    assert rights.hear_table(table, 5 * S) == []
     assert rights.answer_known(KnownRequest(agent="a1", disk=7)) == []
     assert rights.hear_known(Known(agent="a1", disk=1, life=0, plots=[])) == []
     assert rights.tick({}, 9 * S) == []
@@ -47,7 +48,7 @@ def test_a_silent_warden_sends_no_table_and_its_host_still_tells_where_its_vehic
     rights.silent = True
     said = _through(rights, range(40, 80))
     assert not any(isinstance(action, Table | Save | AskPromises) for action in said)
-    assert any(isinstance(action, Standing) for action in said), "its host goes on"
+    assert any(isinstance(action, Tell) for action in said), "its host goes on"
 
 
 def _through(rights: RightOfWay, ticks: range) -> list[Action]:
@@ -56,6 +57,6 @@ def _through(rights: RightOfWay, ticks: range) -> list[Action]:
     for tick in ticks:
         for action in rights.tick({}, tick * S // 10):
             said.append(action)
-            if isinstance(action, Standing):
-                rights.hear_standing(action, tick * S // 10)
+            if isinstance(action, Tell):
+                rights.hear_standing(action.standing, tick * S // 10)
     return said

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import random
+from itertools import pairwise
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.clock import NS_PER_S
+from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
-from swarm.wire.messages.traffic import Grant, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
-from vehicle_agent.traffic.holdings import Holdings, Wish
+from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
+from vehicle_agent.traffic.holdings import Holdings, Tell, Wish
 from vehicle_agent.traffic.member import Member, Refused, Save
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
+from vehicle_agent.traffic.steering import Steering
 from vehicle_agent.traffic.warden import BEAT_NS, Warden, first_life, is_far_ahead
 
 GRID = GridSpec(8, 8, 1.0)
@@ -83,11 +87,26 @@ def test_a_round_of_planning_sends_no_two_to_one_cell_and_lets_the_oldest_throug
         assert round.to["v0"] == movers[0].wants[0]
 
 
+@given(st.integers(0, 1 << 32), st.booleans(), st.floats(0.0, 0.4))
+def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(
+    seed: int, corners: bool, share: float
+) -> None:
+    chance = random.Random(seed)
+    pace = np.where([chance.random() < share for _ in range(GRID.cells)], np.inf, 0.1).astype(np.float32)
+    rules = PlannerConfig(corner_cutting=corners)
+    steering = Steering(GRID, pace.reshape(8, 8), rules, 4, chance, lambda cell: False)
+    cells = [chance.randrange(GRID.cells)]
+    for _ in range(chance.randint(0, 20)):
+        cells.append(chance.choice([other for _, other in GRID.neighbours(cells[-1])]))
+    one_by_one = [steering.passable(tail, head) for tail, head in pairwise(cells)]
+    assert steering.passable_steps(cells) == [*one_by_one, False].index(False)
+
+
 # --- the warden ---------------------------------------------------------------------------------------------
 
 
 def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:
-    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10, 11]), {"a1-00"})
+    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10, 11]), {"a1": ["a1-00"]})
     assert warden.tick(0).grants["a1-00"].cells == [9, 10, 11]  # type: ignore[union-attr]
     warden.hear(standing("a1", [10, 11], seq=2), 0)
     assert warden.tick(S).grants["a1-00"].cells == [10, 11]  # type: ignore[union-attr]
@@ -100,7 +119,7 @@ def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:
 
 def test_what_an_older_life_may_stand_on_stays_shut_until_it_has_stopped_or_is_proved_dead() -> None:
     for end in (standing("a1", [9], seq=9, ended=True), standing("a1", [9], seq=9, life=1 << 33, dead=[1])):
-        warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1-00"})
+        warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
         warden.hear(standing("a1", [9], seq=1, life=1 << 32, vehicles=[]), 0)
         table = warden.tick(0)
         assert table is not None
@@ -111,7 +130,7 @@ def test_what_an_older_life_may_stand_on_stays_shut_until_it_has_stopped_or_is_p
 
 
 def test_a_life_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
-    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9]), {"a1-00"})
+    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9]), {"a1": ["a1-00"]})
     warden.hear(standing("a1", [9], seq=1, life=1 << 61), 0)
     assert "a1 names a life" in warden.refused[0]
     assert warden.tick(0).hosts["a1"] == (1, 1)  # type: ignore[union-attr]
@@ -125,7 +144,7 @@ def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
     first = set()
     for step in range(30):
         held = table_of(1, 1, **{host: [cell] for host, cell in places.items()})
-        warden = Warden(PLOTS, "a0", 3, held, set(held.grants))
+        warden = Warden(PLOTS, "a0", 3, held, {host: [f"{host}-00"] for host in places})
         for host, cell in places.items():
             stand = Stand(f"{host}-00", cell, cell, [cell], [27], [27], 1, step << 12)
             warden.hear(standing(host, [cell], seq=2, vehicles=[stand]), 0)
@@ -139,7 +158,7 @@ def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
 
 
 def member_of(promised: int = 0) -> Member:
-    return Member(PLOTS, MEMBERS[0], promised, table_of(0, 0), set(), 0)
+    return Member(PLOTS, MEMBERS[0], promised, table_of(0, 0), {}, 0)
 
 
 def test_after_a_promise_nothing_older_is_stored() -> None:
@@ -155,7 +174,7 @@ def test_after_a_promise_nothing_older_is_stored() -> None:
 
 
 def test_the_second_member_says_what_the_first_has_not_said_and_something_in_each_beat() -> None:
-    first, second = (Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), set(), 0) for n in (2, 0))  # of epoch 1
+    first, second = (Member(PLOTS, MEMBERS[n], 0, table_of(0, 0), {}, 0) for n in (2, 0))  # of epoch 1
     said = first.hear_table(table_of(1, 1), S)
     assert [type(action) for action in said] == [Save, Stored]
     assert [type(action) for action in second.hear_table(table_of(1, 1), S)] == [Save]
@@ -170,7 +189,7 @@ def test_the_second_member_says_what_the_first_has_not_said_and_something_in_eac
 
 
 def test_what_has_not_changed_is_told_again_under_the_same_stamp_once_in_a_beat() -> None:
-    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1-00"})
+    warden = Warden(PLOTS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
     first = warden.tick(0)
     assert first is not None
     warden.hear(standing("a1", [9, 10], seq=2), 0)
@@ -218,17 +237,44 @@ def holdings_of() -> Holdings:
     return holdings
 
 
-def hear(holdings: Holdings, table: Table) -> None:
-    holdings.hear_table(table, lambda vehicle, cells: cells[0])
-    other = next(member for member in MEMBERS if member != table.agent)
-    stored = Stored(plot=0, agent=other, epoch=table.epoch, seq=table.seq)
-    holdings.hear_stored(stored, lambda vehicle, cells: cells[0])
+def granted_of(table: Table, host: str = "a0") -> Granted:
+    """What a table says to one host."""
+    life, heard = table.hosts.get(host, (0, 0))
+    grants = {vehicle: grant.cells for vehicle, grant in table.grants.items() if vehicle.startswith(host)}
+    return Granted(
+        plot=table.plot, host=host, agent=table.agent, epoch=table.epoch, seq=table.seq, life=life, heard=heard,
+        grants=grants,
+    )  # fmt: skip
 
 
-def test_a_table_counts_once_two_of_three_members_have_stored_it() -> None:
+def hear(holdings: Holdings, table: Table, now_ns: int = 0) -> None:
+    holdings.hear_granted(granted_of(table), lambda vehicle, cells: cells[0], now_ns)
+
+
+def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() -> None:
+    fleets = {"a0": ["a0-00"], "a1": ["a1-00"]}
+    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[20]), fleets, 0)
+    member.hear_standing(standing("a0", [9], seq=1), 2 * S)
+    claim = member.tick(2 * S)[0]
+    assert isinstance(claim, Save)
+    member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
+    wants = [Stand("a0-00", 9, 9, [9], [], [20, 10], 2, 0)]
+    member.hear_standing(standing("a0", [9], seq=2, vehicles=wants), 2 * S)
+    (_, table) = member.tick(2 * S)
+    assert isinstance(table, Table)
+    stored = Stored(plot=0, agent=MEMBERS[1], epoch=table.epoch, seq=table.seq)
+    for too_old in (msgspec.structs.replace(stored, seq=0), msgspec.structs.replace(stored, epoch=0)):
+        assert member.hear_stored(too_old, 2 * S) == []
+    (granted,) = member.hear_stored(stored, 2 * S)  # only a0 has spoken
+    assert isinstance(granted, Granted)
+    assert (granted.host, granted.stamp, granted.heard) == ("a0", table.stamp, 2)
+    assert (granted.grants, granted.occupied) == ({"a0-00": [9, 10]}, [20])
+    assert member.hear_stored(stored, 2 * S) == []  # told just now
+    assert [type(each) for each in member.hear_stored(stored, 2 * S + BEAT_NS)] == [Granted]
+
+
+def test_a_host_takes_what_follows_its_path() -> None:
     holdings = holdings_of()
-    holdings.hear_table(table_of(1, 1, a0=[9]), lambda vehicle, cells: cells[0])
-    assert list(holdings.path("a0-00")) == []
     hear(holdings, table_of(1, 1, a0=[9]))
     assert list(holdings.path("a0-00")) == [9]
     hear(holdings, table_of(1, 2, a0=[9, 10, 20]))
@@ -241,12 +287,14 @@ def test_a_cell_given_back_is_not_asked_for_before_the_table_shows_that_it_is_fr
     hear(holdings, table_of(1, 2, a0=[9, 10, 11]))
     holdings.give_back("a0-00")
     wishes = {"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}
-    (said,) = holdings.standings(wishes, S)
+    (told,) = holdings.standings(wishes, S)
+    said = told.standing
     assert holdings.standings(wishes, S + BEAT_NS - 1) == []  # nothing new
     assert len(holdings.standings(wishes, S + BEAT_NS)) == 1
     assert (said.vehicles[0].holds, said.vehicles[0].ahead, said.vehicles[0].wants) == ([9], [], [17, 1])
     hear(holdings, table_of(1, 3, a0=[9]))
-    (said,) = holdings.standings(wishes, S + BEAT_NS)
+    (told,) = holdings.standings(wishes, S + BEAT_NS)
+    said = told.standing
     assert (said.vehicles[0].ahead, said.vehicles[0].wants) == ([10, 11], [10, 17, 1])
 
 
@@ -257,7 +305,19 @@ def test_the_older_of_two_lives_learns_that_it_is_replaced() -> None:
     hear(holdings, table)
     assert holdings.replaced
     assert list(holdings.path("a0-00")) == []
-    assert all(said.ended for said in holdings.standings({}, S))
+    assert all(told.standing.ended for told in holdings.standings({}, S))
+
+
+def test_a_host_speaks_to_the_warden_that_it_hears_and_else_to_all_members() -> None:
+    holdings = holdings_of()
+    assert [told.members for told in holdings.standings({}, S)] == [MEMBERS]
+    hear(holdings, table_of(1, 1, a0=[9]), 2 * S)
+    assert [told.members for told in holdings.standings({}, 2 * S)] == [(PLOTS.warden(0, 1),)]
+    hear(holdings, table_of(1, 1, a0=[9]), 3 * S)  # told again
+    assert [told.members for told in holdings.standings({}, 3 * S)] == [(PLOTS.warden(0, 1),)]
+    assert [told.members for told in holdings.standings({}, 4 * S)] == [MEMBERS]
+    hear(holdings, table_of(0, 9, a0=[9]), 5 * S)  # of one that was replaced
+    assert [told.members for told in holdings.standings({}, 5 * S)] == [MEMBERS]
 
 
 def rights_of(agent: str, saved: dict[int, tuple[int, Table]] | None = None) -> RightOfWay:
@@ -281,8 +341,9 @@ def test_a_replaced_life_finds_the_plots_that_keep_its_cells_shut_and_says_there
     older.holdings.replaced = True
     assert not older.settled  # so it is asked again what is known of it
     older.hear_known(known)
-    (said,) = older.tick({}, S)
-    assert isinstance(said, Standing)
+    (told,) = older.tick({}, S)
+    assert isinstance(told, Tell)
+    said = told.standing
     assert (said.plot, said.ended) == (0, True)
 
 
@@ -294,8 +355,7 @@ def test_whoever_waits_in_a_plot_without_a_warden_says_so() -> None:
     def hear(seq: int, now_ns: int) -> None:
         table = table_of(1, seq, a0=[0])
         table.hosts["a0"] = (life, 1)
-        rights.hear_table(table, now_ns)
-        rights.hear_stored(Stored(plot=0, agent=MEMBERS[2], epoch=1, seq=seq), now_ns)
+        rights.hear_granted(granted_of(table), now_ns)
 
     assert rights.unled(S) == {}
     hear(1, S)

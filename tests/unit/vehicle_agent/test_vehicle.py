@@ -128,7 +128,7 @@ def test_a_route_may_begin_where_the_path_ends_that_it_still_drives(follower: Ve
 
 
 def test_a_closure_ahead_makes_it_ask_for_another_way(follower: Vehicle) -> None:
-    follower.route.cut(lambda tail, head: head != 14)
+    follower.route.cut(lambda cells: cells.index(13))
     follower.cut_route(2 * S)
     assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.CUT)
     assert follower.state is VehicleState.FOLLOWING
