@@ -25,6 +25,7 @@ from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import Scenario
+from swarm.runtime.garbage import collected_rarely
 from swarm.wire.authentication import Authenticator
 
 SIMULATED_ROLES = ("keeper", "planner", "targets", "agent")
@@ -216,11 +217,12 @@ def simulate(
     scenario = msgspec.structs.replace(scenario, seconds=seconds)
     simulation = Simulation(scenario, faults=faults, trace=trace)
     began_s = time.perf_counter()
-    while simulation.now_s < seconds:
-        simulation.run_until(min(simulation.now_s + 1.0, seconds))
-        if progress is not None:
-            progress(simulation.now_s)
-    simulation.finish()
+    with collected_rarely():
+        while simulation.now_s < seconds:
+            simulation.run_until(min(simulation.now_s + 1.0, seconds))
+            if progress is not None:
+                progress(simulation.now_s)
+        simulation.finish()
     simulation.log.flush()
     return SimulationResult(
         report=simulation.report(seconds),

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.world.referee import Collision, LethalEntry
 from launch_scripts.world.targets import Action, Captured, Publish, TargetWorld
+from launch_scripts.world.telling import Telling
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
@@ -39,6 +40,7 @@ class TargetsService:
         self._ask_due_ns = 0
         self._candidacy = Candidacy(setup, setup.scenario.standbys.targets, TICK_HZ, bus, post)
         self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation, leads=self._candidacy.leads)
+        self._telling = Telling(terrain.grid.resolution_m)
         self._planners = Roster()
         self.counters = self._member.counters
         for name in ("captures", "collisions", "lethal_entries", "poses"):
@@ -98,7 +100,7 @@ class TargetsService:
     def _perform(self, actions: list[Action], now_ns: int) -> None:
         for action in actions:
             match action:
-                case Publish(pose):
+                case Publish(pose) if self._telling.is_news(pose):
                     self.counters.count("poses")
                     self._bus.publish(self._topic(pose.target), pose, target=pose.target)
                 case Captured(target, vehicle, cell):

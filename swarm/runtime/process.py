@@ -3,7 +3,6 @@ inbox."""
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
 import queue
@@ -15,6 +14,7 @@ from typing import Protocol
 
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
+from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.stats import Counters
 
@@ -130,27 +130,9 @@ class Process:
         counters.count("ticks_dropped", 0)
         counters.counts.update(self._inbox.counts)
         self._service.start(self._clock.now_ns())
-        gc.freeze()  # terrain and kernels live to the end: a collection in the middle of a tick need not scan them
-        due_ns = events_until_ns = self._clock.now_ns()
         try:
-            while not self._stopping:
-                now_ns = self._clock.now_ns()
-                if now_ns >= due_ns and (now_ns >= events_until_ns or not len(self._inbox)):
-                    missed = (now_ns - due_ns) // self._tick_ns
-                    if missed:
-                        counters.count("ticks_dropped", missed)
-                    due_ns += (missed + 1) * self._tick_ns
-                    self._service.tick(now_ns)
-                    took_ns = self._clock.now_ns() - now_ns
-                    events_until_ns = now_ns + 2 * took_ns
-                    counters.observe("tick_ms", took_ns / 1e6)
-                    counters.gauge("inbox", float(len(self._inbox)))
-                    counters.counts.update(self._inbox.counts)
-                # Bounded, because a signal handler does not interrupt a wait for a lock.
-                wait_s = min((due_ns - self._clock.now_ns()) / NS_PER_S, 0.5)
-                event = self._inbox.take(wait_s)
-                if event is not None:
-                    self._service.handle(event, self._clock.now_ns())
+            with collected_rarely():
+                self._loop(counters)
         finally:
             # A second signal must not interrupt the end, not even that of the interpreter.
             for number in self._signals:
@@ -158,6 +140,27 @@ class Process:
             self._inbox.close()
             counters.counts.update(self._inbox.counts)
             self._service.stop(self._clock.now_ns())
+
+    def _loop(self, counters: Counters) -> None:
+        due_ns = events_until_ns = self._clock.now_ns()
+        while not self._stopping:
+            now_ns = self._clock.now_ns()
+            if now_ns >= due_ns and (now_ns >= events_until_ns or not len(self._inbox)):
+                missed = (now_ns - due_ns) // self._tick_ns
+                if missed:
+                    counters.count("ticks_dropped", missed)
+                due_ns += (missed + 1) * self._tick_ns
+                self._service.tick(now_ns)
+                took_ns = self._clock.now_ns() - now_ns
+                events_until_ns = now_ns + 2 * took_ns
+                counters.observe("tick_ms", took_ns / 1e6)
+                counters.gauge("inbox", float(len(self._inbox)))
+                counters.counts.update(self._inbox.counts)
+            # Bounded, because a signal handler does not interrupt a wait for a lock.
+            wait_s = min((due_ns - self._clock.now_ns()) / NS_PER_S, 0.5)
+            event = self._inbox.take(wait_s)
+            if event is not None:
+                self._service.handle(event, self._clock.now_ns())
 
 
 @contextmanager

@@ -217,12 +217,12 @@ PUSHED_ROUTE = Topic(
     access(put="planner", hear="agent:agent"),
 )  # fmt: skip
 POSE = Topic(
-    "pose", "target/{target}/pose", TargetPose, "where a target is", "every tick",
+    "pose", "target/{target}/pose", TargetPose, "where a target is", "per quarter of a cell, at least 2 Hz",
     access(put="targets tracker:target", hear="agent planner targets monitor"),
 )  # fmt: skip
 TRUE_POSE = Topic(
     "true-pose", "world/target/{target}/pose", TargetPose,
-    "where a target is that nobody tracks: for simulated sensors, not for planners", "every tick",
+    "where a target is that nobody tracks: for simulated sensors, not for planners", "as poses",
     access(put="targets", hear="agent targets"),
 )  # fmt: skip
 SIGHTED = Topic(
