@@ -3,6 +3,7 @@ inbox."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import queue
@@ -22,6 +23,10 @@ log = logging.getLogger(__name__)
 
 WORK_GRACE_S = 1.5
 """How long a closed worker waits for the job in hand; the launcher kills a process that takes 5 s to end."""
+
+
+_WORKER_NICE = 5
+"""By how much less urgent jobs of a worker are than their process."""
 
 
 class Service(Protocol):
@@ -73,6 +78,11 @@ class ThreadWorker:
         self._jobs.put(run)
 
     def _work(self) -> None:
+        # Where the processor is short, whoever has to answer or drive in time goes first.
+        thread = threading.get_native_id()
+        with contextlib.suppress(OSError):  # not every system gives threads a priority of their own
+            nice = os.getpriority(os.PRIO_PROCESS, thread) + _WORKER_NICE
+            os.setpriority(os.PRIO_PROCESS, thread, min(nice, 19))
         while (run := self._jobs.get()) is not None and not self._closed:
             try:
                 run()

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from zlib import crc32
 
 from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
 from swarm.wire.messages.traffic import Grant, Granted, Shut, Stamp, Stand, Standing, Table
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.plots import Plots
@@ -32,7 +34,12 @@ def _turn(stand: Stand) -> tuple[int, int, str]:
     """Who goes first: the older; of one age, another one in each step of it. By name, those of the last agent would
     always give way where many are of one age, as all are who began the run together."""
     step = stand.age_ms >> _AGE_BITS
-    return -step, crc32(f"{stand.vehicle}/{step}".encode()), stand.vehicle
+    return -step, _lot(stand.vehicle, step), stand.vehicle
+
+
+@lru_cache(maxsize=1 << 14)
+def _lot(vehicle: str, step: int) -> int:
+    return crc32(f"{vehicle}/{step}".encode())
 
 
 def first_life(after: int, chance: int) -> int:
@@ -86,6 +93,8 @@ class Warden:
         self._changed = False  # or anything else
         self._told: Table | None = None
         self._told_ns = 0
+        self._said_of: Table | None = None
+        self._said_ns = 0
 
     @property
     def _next_stamp(self) -> Stamp:
@@ -196,19 +205,22 @@ class Warden:
 
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
         """What a table says to each host that has spoken lately, where it is new or the last word is a beat old."""
-        held = {cell for grant in table.grants.values() for cell in grant.cells}
-        held.update(cell for shut in table.shut for cell in shut.cells)
+        if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
+            return
+        self._said_of, self._said_ns = table, now_ns
+        holders = {cell: vehicle for vehicle, grant in table.grants.items() for cell in grant.cells}
+        holders.update((cell, "") for shut in table.shut for cell in shut.cells)
+        by_host: dict[str, dict[str, list[int]]] = {name: {} for name in self._hosts}
+        for vehicle, grant in table.grants.items():
+            by_host.setdefault(agent_of(vehicle), {})[vehicle] = grant.cells
         for name, host in self._hosts.items():
             if now_ns - host.spoke_ns > SILENT_NS:
                 continue
             life, heard = table.hosts.get(name, (0, 0))
-            mine = [vehicle for vehicle in self._fleets.get(name, ()) if vehicle in table.grants]
-            grants = {vehicle: table.grants[vehicle].cells for vehicle in mine}
-            own = {cell for cells in grants.values() for cell in cells}
-            occupied = [
-                cell for stand in host.standing.vehicles for cell in stand.wants if cell in held and cell not in own
-            ]
-            pushed = {vehicle: table.pushed[vehicle] for vehicle in mine if vehicle in table.pushed}
+            grants = by_host[name]
+            wanted = {cell for stand in host.standing.vehicles for cell in stand.wants}
+            occupied = sorted(cell for cell in wanted if cell in holders and holders[cell] not in grants)
+            pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             leaves = not host.standing.vehicles
             says = (life, grants, pushed, occupied, heard if leaves else 0)
             if says == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
@@ -224,7 +236,7 @@ class Warden:
                 heard=heard,
                 grants=grants,
                 pushed=pushed,
-                occupied=list(dict.fromkeys(occupied)),
+                occupied=occupied,
             )
 
     def _plan(self, now_ns: int) -> None:
