@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numba
 from numba.core import caching, config, sigutils
@@ -31,7 +33,7 @@ def _stamp() -> tuple[str, bool]:
 
 _STAMP = _stamp()
 
-KERNELS = {}
+KERNELS: dict[str, Any] = {}
 """Name -> kernel, of all that Python calls, in the order in which modules were imported."""
 
 
@@ -49,7 +51,7 @@ class _FolderCache(caching.FunctionCache):
             return self._load_overload(sig, target_context)
 
 
-def _compiled(function, **options):
+def _compiled(function: Any, **options: bool) -> Any:
     compiled = numba.njit(nogil=True, no_cfunc_wrapper=True, _nrt=False, **options)(function)
     if config.DISABLE_JIT:
         return compiled
@@ -58,12 +60,12 @@ def _compiled(function, **options):
     return compiled
 
 
-def helper(function):
+def helper(function: Any) -> Any:
     """What only kernels call: compiled for the types that they call it with. Python cannot."""
     return _compiled(function, no_cpython_wrapper=True)
 
 
-def kernel(signature):
+def kernel(signature: str) -> Callable[[Any], Any]:
     """What Python calls: compiled for these types alone, without the GIL, and kept on disk.
 
     signature  as numba reads one, of the arguments; any other type is a TypeError
@@ -75,7 +77,7 @@ def kernel(signature):
     in. That halved the time to compile them all.
     """
 
-    def declare(function):
+    def declare(function: Any) -> Any:
         compiled = _compiled(function)
         if not config.DISABLE_JIT:
             compiled.declared = signature
@@ -86,7 +88,7 @@ def kernel(signature):
     return declare
 
 
-def _load(compiled):
+def _load(compiled: Any) -> Any:
     """The kernel's code, from disk or compiled."""
     argument_types, _ = sigutils.normalize_signature(compiled.declared)
     if not is_loaded(compiled):
@@ -95,18 +97,18 @@ def _load(compiled):
     return compiled.overloads[argument_types].entry_point
 
 
-def load(compiled, compiling=True):
-    """Make a kernel ready to be called. Returns whether it is; without `compiling` only what is found on disk is."""
+def load(compiled: Any, compiling: bool = True) -> bool:
+    """Make a kernel ready to be called. Returns whether it is; without `compiling`, only if it is on disk."""
     if not is_loaded(compiled) and (compiling or is_on_disk(compiled)):
         _load(compiled)
     return is_loaded(compiled)
 
 
-def is_loaded(compiled):
+def is_loaded(compiled: Any) -> bool:
     return config.DISABLE_JIT or bool(compiled.overloads)
 
 
-def is_on_disk(compiled):
+def is_on_disk(compiled: Any) -> bool:
     """Whether some process has compiled the kernel for this machine."""
     if not isinstance(compiled._cache, _FolderCache):
         return False
@@ -116,7 +118,7 @@ def is_on_disk(compiled):
     return name is not None and Path(cache._cache_file._data_path(name)).is_file()
 
 
-def cache_folder():
+def cache_folder() -> Path | None:
     """Where compiled code is kept; None where no folder can be written to."""
     caches = [each._cache for each in KERNELS.values() if not config.DISABLE_JIT]
     return next((Path(each.cache_path) for each in caches if isinstance(each, _FolderCache)), None)

@@ -33,6 +33,10 @@ class LowerBounds:
         self._heuristic = exact_cost
         self._lowest = self._grid.lowest_cell_cost
 
+    def forget(self) -> None:
+        """The map changed, and nothing is to be known of the optimum until `take`."""
+        self._heuristic = None
+
     def learn(self, changes: Changes) -> None:
         """The map changed: lower the heuristic where ways became cheaper. Dearer cells leave it consistent."""
         if changes.cells.size:
