@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import math
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from launch_scripts.launcher.options import (
     make_run_dir,
     new_run_id,
 )
+from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.terminal import Terminal
@@ -45,9 +45,6 @@ from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
-
-_WARM_ROLES = "launch_scripts.launcher.warm_roles"
-_WARM_KERNELS = "launch_scripts.launcher.warm_kernels"
 
 _TURN_S = 0.05
 _LISTEN_WITHIN_S = 20.0
@@ -172,11 +169,9 @@ class _Run:
         self._startup_s: float | None = None
 
     def run(self) -> int:
-        # One thread each: the processes share the cores already, and idle threads make a fork unsafe.
-        os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
         planners = "planner" in self._options.roles
         directed = self._scenario.cost.directional
-        self._warm_up = WarmUp(_WARM_KERNELS if planners else _WARM_ROLES, planners, directed)
+        self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, planners, directed)
         self._warm_up.begin()
         with self._stop_asked.interrupting():
             self._terrain, self._truth = self._prepared()

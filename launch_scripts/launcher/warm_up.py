@@ -5,18 +5,16 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import threading
 import time
-from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 
 from launch_scripts.launcher.child import wait_for_launcher
 from launch_scripts.launcher.local_swarm import without_main
+from launch_scripts.launcher.preload import start_forkserver
 
-_HELD_BACK = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
-_BACKGROUND = 10
+_BACKGROUND = 5
 """Niceness of what compiles kernels that no first route needs."""
 
 
@@ -29,16 +27,7 @@ class WarmUp:
     """
 
     def __init__(self, preload: str | None, planners: bool = False, directed: bool = False) -> None:
-        forkserver.set_forkserver_preload([] if preload is None else [preload])
-        # The tracker's start unblocks signals, so it comes first.
-        resource_tracker.ensure_running()
-        # What is blocked here stays blocked in the server and in all that it forks: a Ctrl-C, which reaches the
-        # whole process group, or a SIGTERM to all of it, is for the launcher alone to act upon.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
-        try:
-            forkserver.ensure_running()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        start_forkserver(preload)
         self._planners = planners
         self._directed = directed
         self._context = multiprocessing.get_context("forkserver")
