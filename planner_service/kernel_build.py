@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import math
 import os
 import subprocess
 import sys
@@ -157,7 +158,9 @@ class KernelLoader:
         self._kernels = (*first, *LATER)
         self._first = self._kernels if whole else first
         self._missing = self._kernels
-        self._asked_s = -1e9
+        self._asked_s = -math.inf
+        self.builders: list[subprocess.Popen[bytes]] = []
+        """Those that were started because nobody was compiling."""
         self._thread = threading.Thread(target=self._load_rest, name="load-kernels", daemon=True)
 
     @property
@@ -182,6 +185,11 @@ class KernelLoader:
         if self._missing:
             self._thread.start()
 
+    def wait(self) -> None:
+        """Wait until all may be called."""
+        if self._missing:
+            self._thread.join()
+
     def _load_rest(self) -> None:
         while self._missing:
             self._have_built()
@@ -193,8 +201,8 @@ class KernelLoader:
         now_s = time.monotonic()
         if now_s - self._asked_s > 20.0 and not is_building():
             self._asked_s = now_s
-            for _ in range(min(len(os.sched_getaffinity(0)), 8)):
-                subprocess.Popen([sys.executable, "-m", "planner_service.kernel_build"])
+            command = [sys.executable, "-m", "planner_service.kernel_build"]
+            self.builders = [subprocess.Popen(command) for _ in range(min(len(os.sched_getaffinity(0)), 8))]
 
 
 def main() -> None:

@@ -128,7 +128,7 @@ def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_th
     assert disk.started >= 1, "nobody was building"
     assert not loader.complete
     disk.coming = [name_of(kernel) for kernel in LATER]
-    loader._thread.join(20)
+    loader.wait()
     assert loader.complete
 
 
