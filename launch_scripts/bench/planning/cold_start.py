@@ -27,7 +27,7 @@ STAGES = {
 def run_start(
     size: int = 512, cold_runs: int = 1, runs: int = 7, kernels: bool = True, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Medians of seconds from the process's beginning. CPU time is that of all processes that compile, to their end.
+    """Medians of seconds from the process's beginning; CPU time is that of all that compile, to their end.
 
     Each cold run gets an empty cache folder (NUMBA_CACHE_DIR) of its own; the warm ones use what the last cold one
     left there. compiled: how many functions that is, of which `kernels` are called from Python.
