@@ -169,10 +169,17 @@ class _Run:
         self._startup_s: float | None = None
 
     def run(self) -> int:
+        """The whole run. The exit code is 0 only if all went well."""
         planners = "planner" in self._options.roles
         directed = self._scenario.cost.directional
         self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, planners, directed)
         self._warm_up.begin()
+        try:
+            return self._run()
+        finally:
+            self._warm_up.close()
+
+    def _run(self) -> int:
         with self._stop_asked.interrupting():
             self._terrain, self._truth = self._prepared()
             log.info("terrain is ready")
@@ -205,7 +212,6 @@ class _Run:
         finally:
             self._terminal.close()
             self._swarm.kill()
-            self._warm_up.close()
         code = 0
         try:
             self._report(watcher.recorder, seconds)

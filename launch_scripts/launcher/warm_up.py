@@ -40,6 +40,9 @@ class WarmUp:
         self._first: set[str] = set()
         self._left: set[str] = set()
         self._builders: list[ForkServerProcess] = []
+        self._lock = threading.Lock()
+        self._closed = False
+        """Set for good by `close`: no builder is started any more. The lock guards both."""
         self._began_s = time.monotonic()
         self._told = False
         self._thread = threading.Thread(target=self._run, name="warm-up", daemon=True)
@@ -73,9 +76,11 @@ class WarmUp:
         return f"all {len(self._all)} kernels are compiled"
 
     def close(self) -> None:
-        """End what still compiles."""
-        for builder in self._builders:
-            builder.kill()
+        """End what still compiles. They hear no other signal, and at the launcher's exit Python waits for them."""
+        with self._lock:
+            self._closed = True
+            for builder in self._builders:
+                builder.kill()
 
     def _run(self) -> None:
         try:
@@ -104,7 +109,10 @@ class WarmUp:
         pipes: list[Connection] = []
         for _ in range(min(len(os.sched_getaffinity(0)), 8)):
             compiled, tell = self._context.Pipe(duplex=False)
-            self._builders.append(self._start(_build, tell, self._directed))
+            with self._lock:
+                if self._closed:
+                    return
+                self._builders.append(self._start(_build, tell, self._directed))
             tell.close()
             pipes.append(compiled)
         while pipes:
