@@ -142,6 +142,11 @@ def _up(
     rank: int | None = None,
     run_id: str | None = None,
 ) -> None:
+    from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
+
+    # Beside the imports below and the terrain, which take as long.
+    start_forkserver(ROLES_AND_KERNELS if not only or "planner" in only else ROLES_ONLY)
+
     import msgspec
 
     from launch_scripts.launcher import options

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import closing
 
+from planner_service.kernel_build import KernelLoader
 from planner_service.service import PlannerService
-from planner_service.warm_up import warm_up
+from planner_service.target_tree import is_slow_to_grow
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -15,6 +17,8 @@ from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, end_with
 from swarm.runtime.role import RoleSetup
+
+log = logging.getLogger(__name__)
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
@@ -25,14 +29,15 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         ids = ", ".join(scenario.target_ids)
         raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = load_terrain(setup)
-    warm_up()
+    kernels = KernelLoader(directed=terrain.climb is not None, whole=is_slow_to_grow(terrain.grid))
+    kernels.load_first(log.info)
     clock = MonotonicClock()
     inbox = Inbox()
     with (
         open_bus(scenario.network, patient=True) as bus,
         closing(ThreadWorker("grow-tree", inbox, clock)) as worker,
     ):
-        service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
+        service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns, lambda: kernels.complete)
         process = Process(service, inbox, clock, scenario.planner.tick_hz)
         process.stop_on_signals()
         if stop_when is not None:

@@ -33,7 +33,8 @@ _GROW = "grow-tree"
 class PlannerService:
     """Serves routes and costs to the target that the process is named after.
 
-    stopwatch  the clock that growths on this thread are timed with; a simulation gives none, and a model is used
+    stopwatch     the clock that growths on this thread are timed with; a simulation gives none, and a model is used
+    all_kernels   whether all kernels may be called by now, not only those for whole trees
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class PlannerService:
         post: Post,
         worker: Worker,
         stopwatch: Callable[[], int] | None = None,
+        all_kernels: Callable[[], bool] = lambda: True,
     ) -> None:
         scenario = setup.scenario
         self._target = job_of(setup.id)
@@ -63,7 +65,7 @@ class PlannerService:
             self._target,
             setup.incarnation,
             scenario.planner,
-            TargetTree(terrain.grid, scenario.planner, terrain.climb),
+            TargetTree(terrain.grid, scenario.planner, terrain.climb, all_kernels),
             self._cost_map,
             self.counters,
             route_cells=scenario.vehicles.route_cells,

@@ -123,7 +123,8 @@ class AutoStage:
             self.stage = "exact"
 
 
-def row_of(strategy: Strategy, stage: Stage, *, directed: bool) -> StrategyRow:
-    """The row in force. Where uphill is not downhill only whole trees are grown."""
+def row_of(strategy: Strategy, stage: Stage, *, only_whole: bool) -> StrategyRow:
+    """The row in force. Where uphill is not downhill, or other kernels are not compiled yet, only whole trees are
+    grown."""
     row = STAGES[stage] if strategy == "auto" else STRATEGIES[strategy]
-    return replace(STAGES["exact"], renews_loose_bounds=row.renews_loose_bounds) if directed else row
+    return replace(STAGES["exact"], renews_loose_bounds=row.renews_loose_bounds) if only_whole else row

@@ -41,6 +41,12 @@ WIDE_SHARE = 16
 FINE_SHARE = 16
 """How far the fine windows of multi-resolution reach, as a share of the map's side."""
 
+
+def is_slow_to_grow(grid: GridSpec) -> bool:
+    """Whether a whole tree of this grid is nothing to be grown between two answers."""
+    return grid.cells * MODEL_NS_PER_CELL > INLINE_NS
+
+
 Kind = Literal["none", "full", "window", "repair", "coarse", "forced"]
 
 
@@ -67,17 +73,26 @@ class TargetTree:
     target_cell  where the tree leads; None before the first update, or while it stands on a lethal or outside cell
     map_version  of the last update; -1 before the first
     ready        whether routes can be given; if not, every route's status is NO_TARGET
+    all_kernels  whether kernels beside those for whole trees may be called by now. While it says no, windows,
+                 repairs and corridors give way to whole trees, so that nothing waits for a compilation
     last_gaps    float64, driven cost over optimum of what was offered to each followed vehicle, measured by the
                  last `adopt`; empty before
     """
 
-    def __init__(self, grid: GridSpec, config: PlannerConfig, climb: Climb | None = None) -> None:
+    def __init__(
+        self,
+        grid: GridSpec,
+        config: PlannerConfig,
+        climb: Climb | None = None,
+        all_kernels: Callable[[], bool] = lambda: True,
+    ) -> None:
         self.target_cell: int | None = None
         self.map_version = -1
         self.ready = False
         self.last_gaps: NDArray[np.float64] = np.empty(0, np.float64)
         self._grid = grid
         self._config = config
+        self._all_kernels = all_kernels
         self._side = max(grid.rows, grid.cols)
         self._new_cost_grid = partial(cost_grid_of, grid, config, climb)
         # The cell costs of the map as it was last told, and whether it was told at all.
@@ -105,7 +120,8 @@ class TargetTree:
     @property
     def strategy(self) -> StrategyRow:
         """The row in force now; under `auto` it changes with `observe_full_ns`."""
-        return row_of(self._config.strategy, self._auto.stage, directed=self._costs.directed)
+        only_whole = self._costs.directed or not self._all_kernels()
+        return row_of(self._config.strategy, self._auto.stage, only_whole=only_whole)
 
     # --- keeping up ---------------------------------------------------------------------------------------------
 
@@ -176,7 +192,7 @@ class TargetTree:
         tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
         self._note_full_growth(grown.target_cell)
         self._bounds.take(grown.cost.copy())
-        self._bounds.learn(since)
+        self._learn_bounds(since)
         self._stale = False
         if grown.corridors is not None:
             fresh = not since.cells.size or grown.corridors.learn(self._costs, since)
@@ -277,8 +293,14 @@ class TargetTree:
             self._corridors = None
         if changes.any_lower:
             self._tree.window_bound = None
-        self._bounds.learn(changes)
+        self._learn_bounds(changes)
         return changes
+
+    def _learn_bounds(self, changes: Changes) -> None:
+        if self._all_kernels():
+            self._bounds.learn(changes)
+        else:
+            self._bounds.forget()
 
     def _set_target(self, target_cell: int, changes: Changes | None) -> bool:
         """Whether the target stands where a tree can lead. If not, the tree is stale as soon as the map changes."""
@@ -309,6 +331,8 @@ class TargetTree:
             return Update("none")
         tree = self._tree
         if not tree.fine or not self._costs.cell_cost[self._costs.pad(tree.root)] < np.inf:
+            return None
+        if not self._all_kernels():
             return None
         visited = tree.repair(changes)
         if visited < 0 or not tree.fine:

@@ -106,7 +106,7 @@ def start(
     kernels: Annotated[bool, typer.Option(help="Measure all kernels of a planner too.")] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Seconds from the start of a fresh process to its first tree, with numba's cache cold and warm.
+    """Seconds from the start of a fresh process to its first tree and route, with numba's cache cold and warm.
 
     \b
     swarm bench start --no-kernels

@@ -8,12 +8,10 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import time
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -35,8 +33,6 @@ REFUSALS_ALLOWED = 5
 REFUSALS_WITHIN_S = 60.0
 FINALLY_REFUSED_WAIT_S = 60.0
 """Wait before the next start of an expendable process whose refusal is final."""
-
-_HELD_BACK = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 
 
 @dataclass(slots=True)
@@ -172,7 +168,7 @@ class LocalSwarm:
             name=spec.name,
             daemon=True,  # should the launcher itself fail, multiprocessing ends them
         )
-        with _without_main():
+        with without_main():
             process.start()
         tell.close()
         running.process, running.pipe = process, listen
@@ -251,49 +247,8 @@ class LocalSwarm:
         running.process = running.pipe = None
 
 
-class WarmUp:
-    """Starts the forkserver and waits, on a thread, until it has loaded everything."""
-
-    def __init__(self, preload: list[str]) -> None:
-        forkserver.set_forkserver_preload(preload)
-        # The tracker's start unblocks signals, so it comes first.
-        resource_tracker.ensure_running()
-        # What is blocked here stays blocked in the server and in all that it forks: a Ctrl-C, which reaches the
-        # whole process group, or a SIGTERM to all of it, is for the launcher alone to act upon.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
-        try:
-            forkserver.ensure_running()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._probe, name="warm-up", daemon=True)
-
-    def begin(self) -> None:
-        self._thread.start()
-
-    def done(self, timeout_s: float) -> bool:
-        """Whether the forkserver has loaded everything."""
-        self._thread.join(timeout_s)
-        if self._failure is not None:
-            raise self._failure
-        return not self._thread.is_alive()
-
-    def _probe(self) -> None:
-        try:
-            with _without_main():
-                probe = multiprocessing.get_context("forkserver").Process(target=_nothing, daemon=True)
-                probe.start()
-            probe.join()
-        except BaseException as error:
-            self._failure = error
-
-
-def _nothing() -> None:
-    """Does nothing; the probe's target."""
-
-
 @contextlib.contextmanager
-def _without_main() -> Iterator[None]:
+def without_main() -> Iterator[None]:
     """Keeps multiprocessing from running the launcher's own script in each child."""
     main = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")

@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import math
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from launch_scripts.launcher.lives import next_life
-from launch_scripts.launcher.local_swarm import Ending, LocalSwarm, WarmUp
+from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import log_to
 from launch_scripts.launcher.options import (
     as_process,
@@ -23,9 +22,11 @@ from launch_scripts.launcher.options import (
     make_run_dir,
     new_run_id,
 )
+from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.terminal import Terminal
+from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.disk_watch import DiskWatch
@@ -44,9 +45,6 @@ from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
-
-_WARM_ROLES = "launch_scripts.launcher.warm_roles"
-_WARM_KERNELS = "launch_scripts.launcher.warm_kernels"
 
 _TURN_S = 0.05
 _LISTEN_WITHIN_S = 20.0
@@ -171,16 +169,23 @@ class _Run:
         self._startup_s: float | None = None
 
     def run(self) -> int:
-        # One thread each: the processes share the cores already, and idle threads make a fork unsafe.
-        os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
-        warm_up = WarmUp([_WARM_KERNELS if "planner" in self._options.roles else _WARM_ROLES])
-        warm_up.begin()
+        """The whole run. The exit code is 0 only if all went well."""
+        planners = "planner" in self._options.roles
+        directed = self._scenario.cost.directional
+        self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, planners, directed)
+        self._warm_up.begin()
+        try:
+            return self._run()
+        finally:
+            self._warm_up.close()
+
+    def _run(self) -> int:
         with self._stop_asked.interrupting():
             self._terrain, self._truth = self._prepared()
             log.info("terrain is ready")
         if self._stop_asked:
             return 0
-        self._wait("loading kernels; the first start on a machine compiles them, about a minute", warm_up.done)
+        self._wait(lambda: self._warm_up.progress, self._warm_up.done, again_s=2.0)
         log.info("kernels are loaded")
         if self._stop_asked:
             return 0
@@ -189,7 +194,7 @@ class _Run:
             if not self._options.joins and "router" in self._options.roles:
                 self._swarm.start("router")
             within_s = math.inf if self._options.joins else _LISTEN_WITHIN_S
-            self._wait("waiting for the router to listen", self._router_listens, within_s)
+            self._wait(lambda: "waiting for the router to listen", self._router_listens, within_s)
             log.info("the router listens")
             if self._stop_asked:
                 return 0 if not self._swarm.stop() else 1
@@ -241,17 +246,23 @@ class _Run:
             run_dir=self._run_dir,
         )
 
-    def _wait(self, text: str, done: Callable[[float], bool], within_s: float = 600.0) -> None:
-        """Waits for `done(timeout_s)` or a signal, and says so if it takes long."""
+    def _wait(
+        self,
+        text: Callable[[], str],
+        done: Callable[[float], bool],
+        within_s: float = 600.0,
+        again_s: float = math.inf,
+    ) -> None:
+        """Waits for `done(timeout_s)` or a signal, and says so if it takes long: once, or every `again_s`."""
         began_s = time.monotonic()
-        said = False
+        say_s = _PATIENCE_S
         while not self._stop_asked and not done(_TURN_S):
             waited_s = time.monotonic() - began_s
             if waited_s > within_s:
-                raise BusError(f"gave up {text} after {within_s:g} s; see {self._run_dir}")
-            if not said and waited_s > _PATIENCE_S:
-                said = True
-                self._terminal.say(f"{text} ...")
+                raise BusError(f"gave up {text()} after {within_s:g} s; see {self._run_dir}")
+            if waited_s > say_s:
+                say_s += again_s
+                self._terminal.say(f"{text()} ...")
 
     def _router_listens(self, timeout_s: float) -> bool:
         self._raise_refusals(self._swarm.poll())
@@ -303,6 +314,8 @@ class _Run:
     def _tell(self, watcher: Watcher) -> None:
         if (sentence := self._disk.look(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
+        if (compiled := self._warm_up.news()) is not None:
+            self._terminal.say(compiled)
         for note in watcher.take_notes():
             if note.kind == "live_view":
                 self._terminal.say(f"live view: {note.text}", "bold")

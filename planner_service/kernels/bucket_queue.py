@@ -8,7 +8,13 @@ key is ever decreased. Octile steps make two keys per cell, straight and diagona
 Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)      padded cells that got their cost from the last bucket
     batch    uint32  (size + _AHEAD,) padded cells of the bucket that is being served
-    queue    tuple                    `_make_queue` says
+    queue    a queue of cells in buckets, in chunks of 2**_CHUNK_BITS cells; `make_scratch` says how large:
+        pool    uint32  the chunks
+        link    uint32  of each full chunk, the next one of its bucket
+        spare   uint32  a stack of chunks that were emptied
+        head    uint64  of each bucket, the position of its first cell: the start of a chunk
+        tail    uint64  of each bucket, the position behind its last cell, in a chunk with room for one
+        counts  uint64  how many are spare; how many were ever used
 
 What the loops look like was measured, and small changes cost much: cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
@@ -16,16 +22,18 @@ out of the chunks of their bucket into one row before they make their offers. So
 written out here, and share no function with the offers of other kernels.
 
 Indices are unsigned 64-bit: signed ones make numba test for negative ones, which blocks vectorisation. A uint64
-meets only uint64 here, because with an int64 it would silently become float64. Scratch is allocated for the worst
-case; of what is not written, the system keeps no page.
+meets only uint64 here, because with an int64 it would silently become float64.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from planner_service.kernels.compile import njit
-from planner_service.kernels.layout import INF, RULE_OCTILE, RULE_PAPER, SQRT2, TOO_FINE, WALL, step_offsets
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.layout import BUCKETS, GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, TOO_FINE, WALL
 from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
@@ -33,18 +41,20 @@ _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
 _CHUNK_BITS = 6
+_SHIFT = np.uint64(_CHUNK_BITS)
 _AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048."""
+_SCRATCH = "Tuple((u4[::1], u4[::1], Tuple((u4[::1], u4[::1], u4[::1], u8[::1], u8[::1], u8[::1]))))"
 
 
-@njit
+@helper
 def _open_costs(cell_cost, cost):
     """Before a growth: inf on passable cells, WALL on the others."""
     for i in range(cell_cost.size):
         cost[i] = INF if cell_cost[i] < INF else WALL
 
 
-@njit
+@helper
 def _close_costs(cost):
     """After a growth: inf on lethal cells too."""
     for i in range(cost.size):
@@ -52,32 +62,35 @@ def _close_costs(cost):
         cost[i] = c if c >= _ZERO32 else INF
 
 
-@njit
-def _make_queue(buckets, items):
-    """A queue of cells in `buckets`, for at most `items` at once, in chunks of 2**_CHUNK_BITS cells.
-
-    pool    uint32  the chunks
-    link    uint32  of each full chunk, the next one of its bucket
-    spare   uint32  a stack of chunks that were emptied
-    counts  uint64  how many are spare; how many were ever used
-    head    uint64  of each bucket, the position of its first cell: the start of a chunk
-    tail    uint64  of each bucket, the position behind its last cell, in a chunk with room for one
-    """
-    shift = _CHUNK_BITS
-    chunks = buckets + (items >> shift) + 1
-    pool = np.empty(chunks << shift, np.uint32)
-    link = np.empty(chunks, np.uint32)
-    spare = np.empty(chunks, np.uint32)
-    counts = np.array((0, buckets), np.uint64)
-    head = np.empty(buckets, np.uint64)
-    tail = np.empty(buckets, np.uint64)
-    for b in range(buckets):
-        head[b] = b << shift
-        tail[b] = b << shift
-    return pool, link, spare, counts, head, tail, np.uint64(shift)
+Scratch = tuple[NDArray[np.uint32], NDArray[np.uint32], tuple[NDArray[Any], ...]]
 
 
-@njit
+def make_scratch(size: int, rule: int, buckets: int) -> Scratch:
+    """(touched, batch, queue) for a growth over `size` padded cells, for the worst case: the system keeps no page
+    that was not written."""
+    kinds = 2 if rule == RULE_OCTILE else 1
+    buckets *= kinds
+    chunks = buckets + (kinds * size >> _CHUNK_BITS) + 1
+    # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
+    touched, batch = np.empty(size + 1, np.uint32), np.empty(size + _AHEAD, np.uint32)
+    pool = np.empty(chunks << _CHUNK_BITS, np.uint32)
+    link, spare = np.empty(chunks, np.uint32), np.empty(chunks, np.uint32)
+    head, tail = np.empty(buckets, np.uint64), np.empty(buckets, np.uint64)
+    return touched, batch, (pool, link, spare, head, tail, np.empty(2, np.uint64))
+
+
+@helper
+def _empty(queue, buckets):
+    """Let nothing wait in a queue of so many buckets."""
+    _, _, _, head, tail, counts = queue
+    for b in range(np.uint64(buckets)):
+        head[b] = b << _SHIFT
+        tail[b] = b << _SHIFT
+    counts[0] = _ZERO
+    counts[1] = np.uint64(buckets)
+
+
+@helper
 def _choose(cell_cost, cost, length, inverse, least, cells, count, buckets):
     """buckets := which one each cell's exit key falls into, `least` at least."""
     for i in range(count):
@@ -85,12 +98,12 @@ def _choose(cell_cost, cost, length, inverse, least, cells, count, buckets):
         buckets[i] = max(np.int32((cost[v] + cell_cost[v] * length) * inverse), least)
 
 
-@njit
+@helper
 def _put(queue, cells, count, buckets, mask, first):
     """Put cells into the queue, each into its bucket, modulo the length of the circular queue that begins at
     bucket `first`; `mask` is that length less one."""
-    pool, link, spare, counts, _, tail, shift = queue
-    low = (_ONE << shift) - _ONE
+    pool, link, spare, _, tail, counts = queue
+    low = (_ONE << _SHIFT) - _ONE
     for i in range(count):
         b = (np.uint64(buckets[i]) & mask) + first
         t = tail[b]
@@ -103,27 +116,27 @@ def _put(queue, cells, count, buckets, mask, first):
             else:
                 counts[0] -= _ONE
                 chunk = np.uint64(spare[counts[0]])
-            link[(t - _ONE) >> shift] = chunk
-            t = chunk << shift
+            link[(t - _ONE) >> _SHIFT] = chunk
+            t = chunk << _SHIFT
         tail[b] = t
 
 
-@njit
+@helper
 def _take(queue, b, batch):
     """Move all cells of a bucket to `batch`. Returns how many."""
-    pool, link, spare, counts, head, tail, shift = queue
-    size = _ONE << shift
+    pool, link, spare, head, tail, counts = queue
+    size = _ONE << _SHIFT
     position = head[b]
     end = tail[b]
     n = _ZERO
-    while position >> shift != end >> shift:
+    while position >> _SHIFT != end >> _SHIFT:
         for i in range(size):
             batch[n + i] = pool[position + i]
         n += size
-        chunk = position >> shift
+        chunk = position >> _SHIFT
         spare[counts[0]] = chunk
         counts[0] += _ONE
-        position = np.uint64(link[chunk]) << shift
+        position = np.uint64(link[chunk]) << _SHIFT
     for i in range(end - position):
         batch[n + i] = pool[position + i]
     head[b] = position
@@ -131,7 +144,7 @@ def _take(queue, b, batch):
     return n + (end - position)
 
 
-@njit
+@helper
 def _ask_for(cell_cost, cost, s, u):
     prefetch(cell_cost, u)
     prefetch(cost, u - s)
@@ -139,7 +152,7 @@ def _ask_for(cell_cost, cost, s, u):
     prefetch(cost, u + s)
 
 
-@njit
+@helper
 def _offer_straight(cell_cost, cost, s, batch, n, touched):
     """Offer their exit keys to four neighbours. Writes the cells that had no cost yet to `touched`; returns how
     many."""
@@ -156,7 +169,7 @@ def _offer_straight(cell_cost, cost, s, batch, n, touched):
     return count
 
 
-@njit
+@helper
 def _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
     """As `_offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
     for p in range(n):
@@ -187,7 +200,7 @@ def _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
     return count
 
 
-@njit
+@helper
 def _offer_around(cell_cost, cost, s, corners, batch, n, touched):
     """As `_offer_straight`, to eight neighbours, all a step of length 1 away."""
     count = _ZERO
@@ -222,25 +235,25 @@ def _offer_around(cell_cost, cost, s, corners, batch, n, touched):
     return count
 
 
-@njit
-def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, buckets):
+@kernel(f"({GRID}, f4[::1], i8, {BUCKETS}, {_SCRATCH})")
+def grow_by_buckets(grid, cost, root, buckets, scratch):
     """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
-    width    of a bucket, s: below the lowest cell cost, so that nothing in a bucket leads back into it
-    buckets  of the circular queue, a power of two; buckets * width exceeds the dearest step by two widths
+    buckets  width: below the lowest cell cost, s, so that nothing in a bucket leads back into it. count: of the
+             circular queue, a power of two; count * width exceeds the dearest step by two widths
+    scratch  as `make_scratch` returns it
     Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
 
-    With octile steps a cell waits twice, under its straight exit key in the first `buckets` and under its
+    With octile steps a cell waits twice, under its straight exit key in the first `count` buckets and under its
     diagonal one in as many behind them.
     """
-    kinds = 2 if rule == RULE_OCTILE else 1
-    queue = _make_queue(kinds * buckets, kinds * cell_cost.size)
-    head, tail = queue[4], queue[5]
-    # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
-    touched = np.empty(cell_cost.size + 1, np.uint32)
-    batch = np.empty(cell_cost.size + _AHEAD, np.uint32)
+    cell_cost, _, stride, rule, corners = grid
+    touched, batch, queue = scratch
+    width, circle = buckets
+    _empty(queue, 2 * circle if rule == RULE_OCTILE else circle)
+    head, tail = queue[3], queue[4]
     s = np.uint64(stride)
-    length = np.uint64(buckets)
+    length = np.uint64(circle)
     mask = length - _ONE
     second = length if rule == RULE_OCTILE else _ZERO
     inverse = _ONE32 / np.float32(width)
@@ -283,14 +296,14 @@ def grow_by_buckets(cell_cost, cost, stride, root, rule, corners, width, buckets
             count = _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
 
 
-@njit
-def breadth_first(cell_cost, cost, stride, root):
+@kernel(f"({GRID}, f4[::1], i8, u4[::1])")
+def breadth_first(grid, cost, root, queue):
     """Steps from every cell to the root over 8 neighbours, whatever they cost: what no growth can be faster than.
-    Returns how many cells have a way; `cost` is written whole, and WALL stays on lethal cells."""
-    offsets = step_offsets(stride)
+    Returns how many cells have a way; `cost` is written whole, and WALL stays on lethal cells. `queue` has room for
+    all cells."""
+    cell_cost, offsets, _, _, _ = grid
     for i in range(cell_cost.size):
         cost[i] = INF if cell_cost[i] < INF else WALL
-    queue = np.empty(cell_cost.size, np.uint32)
     cost[root] = np.float32(0.0)
     queue[0] = root
     first = 0

@@ -4,6 +4,7 @@ Arrays, beside those of `layout`:
     pace    float32  (rows, cols)  s/m; inf is lethal; NaN, zero and negative ones are errors, which are counted
     part    float32  ((row1 - row0 + 2) * width,)  cell costs or costs of a window as a padded grid of its own,
                      whose stride is width = col1 - col0 + 2
+    *_bits  int32    the same array as without it, its numbers read as integers
 
 Positive float32 numbers sort as their bits do, read as integers: the least of integers is found by vectors, the
 least of floats one by one, in 4 times the time.
@@ -13,14 +14,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.compile import njit
-from planner_service.kernels.layout import INF
+from planner_service.kernels.compile import kernel
+from planner_service.kernels.layout import BOX, INF
 
 _INF_BITS = np.int32(0x7F800000)
 _ONE = np.uint64(1)
 
 
-@njit
+@kernel("(f4[:, ::1], f8, f8, i8, f4[::1])")
 def pad_cell_costs(pace, resolution, extra, stride, cell_cost):
     """cell_cost := pace * resolution + extra, everywhere; resolution in m, extra in s. Returns how many cells have
     a pace that is NaN, zero or negative."""
@@ -36,7 +37,7 @@ def pad_cell_costs(pace, resolution, extra, stride, cell_cost):
     return bad
 
 
-@njit
+@kernel(f"(f4[:, ::1], f8, f8, {BOX}, i8, f4[::1], i8[::1], f4[::1])")
 def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before):
     """Update the cell costs of a window, and list what changed.
 
@@ -69,49 +70,43 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
     return count, bad, lowest, highest
 
 
-@njit
-def cell_cost_range(cell_cost):
-    """(lowest, highest finite) cell cost; (inf, 0) if all cells are lethal."""
-    bits = cell_cost.view(np.int32)
+@kernel("(i4[::1],)")
+def cell_cost_range(bits):
+    """(lowest, highest finite) cell cost, as bits; those of (inf, 0) if all cells are lethal."""
     lowest = _INF_BITS
     highest = np.int32(0)
     for i in range(bits.size):
         c = bits[i]
         lowest = min(lowest, c)
         highest = max(highest, c if c < _INF_BITS else np.int32(0))
-    found = np.array((lowest, highest), np.int32).view(np.float32)
-    return found[0], found[1]
+    return lowest, highest
 
 
-@njit
-def cut_window(cell_cost, stride, box, part):
+@kernel(f"(i4[::1], i8, {BOX}, i4[::1])")
+def cut_window(cell_cost_bits, stride, box, part_bits):
     """part := the cell costs of a window, behind a lethal border. Returns their range, as `cell_cost_range`
     does."""
     row0, col0, row1, col1 = box
     width = col1 - col0 + 2
     lowest = _INF_BITS
     highest = np.int32(0)
-    bits = cell_cost.view(np.int32)
-    taken = part.view(np.int32)
-    # By a loop: see `enlarged` in `layout`.
     for i in range(np.uint64(width)):
-        part[i] = INF
-        part[np.uint64(part.size) - _ONE - i] = INF
+        part_bits[i] = _INF_BITS
+        part_bits[np.uint64(part_bits.size) - _ONE - i] = _INF_BITS
     for row in range(row0, row1):
         a = np.uint64((row + 1) * stride + 1 + col0)
         b = np.uint64((row - row0 + 1) * width + 1)
-        part[b - _ONE] = INF
+        part_bits[b - _ONE] = _INF_BITS
         for col in range(np.uint64(col1 - col0)):
-            c = bits[a + col]
-            taken[b + col] = c
+            c = cell_cost_bits[a + col]
+            part_bits[b + col] = c
             lowest = min(lowest, c)
             highest = max(highest, c if c < _INF_BITS else np.int32(0))
-        part[b + np.uint64(col1 - col0)] = INF
-    found = np.array((lowest, highest), np.int32).view(np.float32)
-    return found[0], found[1]
+        part_bits[b + np.uint64(col1 - col0)] = _INF_BITS
+    return lowest, highest
 
 
-@njit
+@kernel(f"(f4[::1], {BOX}, f8, i8, f4[::1], i8)")
 def merge_window(part, box, offset, old_root, cost, stride):
     """Lower a tree's costs, which are stored less `offset` (s), to those of a window grown around a new root
     (`part`).
@@ -132,7 +127,7 @@ def merge_window(part, box, offset, old_root, cost, stride):
     cost[old_root] = part[(row - row0 + 1) * width + col - col0 + 1] - offset
 
 
-@njit
+@kernel(f"(f4[::1], {BOX}, i8, i8, i8[::1], f8[::1])")
 def find_rim(part, box, rows, stride, rim, rim_cost):
     """The cells of a window that have a way and from which a step leads out of it.
 

@@ -1,18 +1,24 @@
-"""`njit` of this folder: numba's, with a disk cache that watches all of the folder's sources.
+"""How this folder is compiled: each kernel once, for one signature, with a disk cache that watches all sources.
 
 numba's own cache (`numba.njit(cache=True)`) compares a function's file with what it was when compiled. It does
 not see that a helper or a constant of another file has changed, although both are compiled into the function. The
-stamp here is a hash of every source of this package, so that kernels can share helpers and constants.
+stamp here is a hash of every source of this package, so that kernels can share helpers and constants. It is part
+of the files' names: numba writes its index before the code that this names, so that under one name a process could
+find code of older sources meanwhile. That several processes compile one kernel at once does no harm: it has one
+signature, so that they write the same.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+from collections.abc import Callable
 from importlib import resources
+from pathlib import Path
+from typing import Any
 
 import numba
-from numba.core import caching, config
+from numba.core import caching, config, sigutils
 
 
 def _stamp() -> tuple[str, bool]:
@@ -27,26 +33,92 @@ def _stamp() -> tuple[str, bool]:
 
 _STAMP = _stamp()
 
+KERNELS: dict[str, Any] = {}
+"""Name -> kernel, of all that Python calls, in the order in which modules were imported."""
+
 
 class _FolderCache(caching.FunctionCache):
     """A function's cache on disk, found where numba would put it (NUMBA_CACHE_DIR, __pycache__ or the user's)."""
 
     def __init__(self, function):
         super().__init__(function)
-        self._cache_file = caching.IndexDataCacheFile(self.cache_path, self._impl.filename_base, _STAMP)
+        base = f"{self._impl.filename_base}.{_STAMP[0][:12]}"
+        self._cache_file = caching.IndexDataCacheFile(self.cache_path, base, _STAMP)
+
+    def load_overload(self, sig, target_context):
+        """As numba's, but without its registries, which only a compilation needs and which take 0.5 s to load."""
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
-def njit(function):
-    """Compile a function when it is first called, without the GIL, and keep the result on disk.
-
-    Only kernels call a function whose name begins with an underscore. It gets no entry from Python, nor does any
-    function get one from C: these take an eighth of the time to compile everything. Where no folder can be written
-    to, every process compiles for itself. With NUMBA_DISABLE_JIT the function stays as it is.
-    """
-    inside = function.__name__.startswith("_")
-    compiled = numba.njit(nogil=True, no_cfunc_wrapper=True, no_cpython_wrapper=inside)(function)
+def _compiled(function: Any, **options: bool) -> Any:
+    compiled = numba.njit(nogil=True, no_cfunc_wrapper=True, _nrt=False, **options)(function)
     if config.DISABLE_JIT:
         return compiled
     with contextlib.suppress(RuntimeError):  # which numba raises where it finds no place for a cache
         compiled._cache = _FolderCache(function)
     return compiled
+
+
+def helper(function: Any) -> Any:
+    """What only kernels call: compiled for the types that they call it with. Python cannot."""
+    return _compiled(function, no_cpython_wrapper=True)
+
+
+def kernel(signature: str) -> Callable[[Any], Any]:
+    """What Python calls: compiled for these types alone, without the GIL, and kept on disk.
+
+    signature  as numba reads one, of the arguments; any other type is a TypeError
+
+    It is compiled, or loaded, by `load`, or else by its first call. Where no folder can be written to, every
+    process compiles for itself. With NUMBA_DISABLE_JIT the function stays as it is.
+
+    Kernels and helpers allocate nothing, so that no references need to be counted: arrays to write to are handed
+    in. That halved the time to compile them all.
+    """
+
+    def declare(function: Any) -> Any:
+        compiled = _compiled(function)
+        if not config.DISABLE_JIT:
+            compiled.declared = signature
+            compiled._compile_for_args = lambda *_: _load(compiled)  # numba's name for the first call
+        KERNELS[function.__name__] = compiled
+        return compiled
+
+    return declare
+
+
+def _load(compiled: Any) -> Any:
+    """The kernel's code, from disk or compiled."""
+    argument_types, _ = sigutils.normalize_signature(compiled.declared)
+    if not is_loaded(compiled):
+        compiled.compile(argument_types)
+        compiled.disable_compile()
+    return compiled.overloads[argument_types].entry_point
+
+
+def load(compiled: Any, compiling: bool = True) -> bool:
+    """Make a kernel ready to be called. Returns whether it is; without `compiling`, only if it is on disk."""
+    if not is_loaded(compiled) and (compiling or is_on_disk(compiled)):
+        _load(compiled)
+    return is_loaded(compiled)
+
+
+def is_loaded(compiled: Any) -> bool:
+    return config.DISABLE_JIT or bool(compiled.overloads)
+
+
+def is_on_disk(compiled: Any) -> bool:
+    """Whether some process has compiled the kernel for this machine."""
+    if not isinstance(compiled._cache, _FolderCache):
+        return False
+    argument_types, _ = sigutils.normalize_signature(compiled.declared)
+    cache = compiled._cache
+    name = cache._cache_file._load_index().get(cache._index_key(argument_types, compiled.targetctx.codegen()))
+    return name is not None and Path(cache._cache_file._data_path(name)).is_file()
+
+
+def cache_folder() -> Path | None:
+    """Where compiled code is kept; None where no folder can be written to."""
+    caches = [each._cache for each in KERNELS.values() if not config.DISABLE_JIT]
+    return next((Path(each.cache_path) for each in caches if isinstance(each, _FolderCache)), None)

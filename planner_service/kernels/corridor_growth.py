@@ -11,26 +11,22 @@ Arrays, beside those of `layout`:
                            that
     stamp  uint8  (size,)  whether a cost has been recomputed: `now` or `now + 1` if it has, less if not; `now + 1`
                            on cells that were offered a cost by this growth
+    trail  uint32 (size,)  the cells of a way
+    heap   (keys, items)   float32, int64: a binary heap of costs (s) and padded cells
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from planner_service.kernels.compile import njit
-from planner_service.kernels.layout import (
-    INF,
-    NONE,
-    RULE_FOUR,
-    RULE_OCTILE,
-    SQRT2,
-    check_cells,
-    enlarged,
-    step_offsets,
-)
+from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.layout import BOX, GRID, INF, LABELS, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, check_cells
+
+Heap = tuple[NDArray[np.float32], NDArray[np.int64]]
 
 
-@njit
+@helper
 def _heap_pop(keys, items, size):
     """Restore a binary heap of `size` elements after its top was read: keys[size] takes its place and sinks."""
     key = keys[size]
@@ -51,7 +47,7 @@ def _heap_pop(keys, items, size):
     items[hole] = item
 
 
-@njit
+@helper
 def _heap_push(keys, items, size, key, item):
     hole = size
     while hole > 0:
@@ -65,13 +61,14 @@ def _heap_push(keys, items, size, key, item):
     items[hole] = item
 
 
-@njit
-def mark_levels(parent, stride, least, level):
+@kernel("(u1[::1], i8[::1], i8, u1[::1], u1[::1], u4[::1])")
+def mark_levels(parent, offsets, least, level, children, traffic):
     """Raise `level` to 1 where the paths of `least` cells pass in a tree given by its parents, to 2 where those of
-    4 * least do, and so on. What drains an area four times as large is twice as far from its like."""
-    offsets = step_offsets(stride)
-    children = np.zeros(parent.size, np.uint8)
-    traffic = np.ones(parent.size, np.uint32)
+    4 * least do, and so on. What drains an area four times as large is twice as far from its like. `children` and
+    `traffic` have room for all cells."""
+    for i in range(parent.size):
+        children[i] = 0
+        traffic[i] = 1
     for i in range(parent.size):
         if parent[i] != NONE:
             children[i + offsets[parent[i]]] += 1
@@ -93,30 +90,28 @@ def mark_levels(parent, stride, least, level):
             v = u
 
 
-@njit
+@helper
 def _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail):
-    """As `tighten`, for one padded cell. Returns (cells visited, the trail, which may have been enlarged)."""
+    """As `tighten`, for one padded cell. Returns cells visited."""
     many = 0
     while stamp[v] < now and parent[v] != NONE:
-        if many == trail.size:
-            trail = enlarged(trail, many, 2 * many)
         trail[many] = v
         many += 1
         v += offsets[parent[v]]
     if stamp[v] < now:  # no way leads from here
-        return 0, trail
+        return 0
     for j in range(many - 1, -1, -1):
-        v = trail[j]
+        v = np.int64(trail[j])
         k = parent[v]
         u = v + offsets[k]
         driven = cost[u] + (cell_cost[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else cell_cost[u])
         cost[v] = min(cost[v], driven)
         stamp[v] = now
-    return many, trail
+    return many
 
 
-@njit
-def tighten(cell_cost, stride, rule, labels, stamp, now, cells):
+@kernel(f"({GRID}, {LABELS}, u1[::1], i8, i8[::1], u4[::1])")
+def tighten(grid, labels, stamp, now, cells, trail):
     """Lower costs, which are upper bounds, to what is driven along the parents, less the tree's offset: of `cells`
     (int64, padded) and of all on their ways to the root.
 
@@ -124,38 +119,50 @@ def tighten(cell_cost, stride, rule, labels, stamp, now, cells):
     that become so are stamped `now`. Returns cells visited. Raises ValueError where one is no padded cell.
     """
     check_cells(cells, stamp.size)
+    cell_cost, offsets, _, rule, _ = grid
     cost, parent, root = labels
-    offsets = step_offsets(stride)
-    trail = np.empty(1024, np.int64)
     visited = 0
     stamp[root] = now
     for i in range(cells.size):
-        many, trail = _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, cells[i], trail)
-        visited += many
+        visited += _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, cells[i], trail)
     return visited
 
 
-@njit
-def grow_corridors(grid, labels, level, stamp, now, box, inner):
+def make_heap(box: tuple[int, int, int, int]) -> Heap:
+    """An empty heap, for a growth around a window."""
+    row0, col0, row1, col1 = box
+    room = 4096 + 4 * (row1 - row0 + col1 - col0)
+    return np.empty(room, np.float32), np.empty(room, np.int64)
+
+
+def larger_heap(heap: Heap) -> Heap:
+    """The same heap with twice the room."""
+    keys, items = heap
+    return np.concatenate((keys, np.empty_like(keys))), np.concatenate((items, np.empty_like(items)))
+
+
+@kernel(f"({GRID}, {LABELS}, u1[::1], u1[::1], i8, {BOX}, i8, Tuple((f4[::1], i8[::1])), i8, u4[::1])")
+def grow_corridors(grid, labels, level, stamp, now, box, inner, heap, waiting, trail):
     """Let the costs on the rim of a window around the root spread outward over the cells that carry the traffic.
 
     box    the window, whose costs are new
     inner  cells: level 1 or more takes part up to so far from the root, level 2 or more up to twice as far, level 3
            up to four times, ...
+    waiting  -1 to begin; to go on, how many wait in the heap
     A cell is tightened before it is offered anything: an old way from far off is often better than its cost says,
     and than the way through the corridors. Only what gets cheaper is rewritten, with its parent, so that costs stay
-    upper bounds and grow strictly along every way. Returns cells visited.
+    upper bounds and grow strictly along every way. Returns (cells visited, how many wait in the heap): where any
+    do, it has no room for more, and a larger one that begins as it does is to be handed in to go on.
     """
-    cell_cost, stride, rule, corners = grid
+    cell_cost, offsets, stride, rule, corners = grid
     cost, parent, root = labels
-    offsets = step_offsets(stride)
-    keys, items, size = _rim_heap(cost, stride, box)
+    keys, items = heap
+    size = _fill_from_rim(cost, stride, box, keys, items) if waiting < 0 else waiting
     root_row = root // stride
     root_col = root % stride
-    trail = np.empty(1024, np.int64)
     stamp[root] = now
     visited = 0
-    while size > 0:
+    while size > 0 and size + 16 <= keys.size:
         key = keys[0]
         u = items[0]
         size -= 1
@@ -163,8 +170,6 @@ def grow_corridors(grid, labels, level, stamp, now, box, inner):
         if key > cost[u]:
             continue
         visited += 1
-        if size + 16 > keys.size:
-            keys, items = enlarged(keys, size, 2 * keys.size), enlarged(items, size, 2 * keys.size)
         away = max(abs(u // stride - root_row), abs(u % stride - root_col))
         least = 1
         while away > inner:
@@ -181,24 +186,20 @@ def grow_corridors(grid, labels, level, stamp, now, box, inner):
             if k & 1 and not corners and shut:
                 continue
             if stamp[v] < now:
-                many, trail = _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail)
-                visited += many
+                visited += _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail)
             stamp[v] = now + 1
             if offer < cost[v]:
                 cost[v] = offer
                 parent[v] = (k + 4) & 7
             _heap_push(keys, items, size, cost[v], v)
             size += 1
-    return visited
+    return visited, size
 
 
-@njit
-def _rim_heap(cost, stride, box):
-    """A heap of the cells on the border of a window that have a way: keys (float32), items (int64), how many."""
+@helper
+def _fill_from_rim(cost, stride, box, keys, items):
+    """Begin a heap with the cells on the border of a window that have a way. Returns how many."""
     row0, col0, row1, col1 = box
-    capacity = 4096 + 4 * (row1 - row0 + col1 - col0)
-    keys = np.empty(capacity, np.float32)
-    items = np.empty(capacity, np.int64)
     size = np.int64(0)  # a literal would have `_heap_push` compiled twice
     for row in range(row0, row1):
         across = 1 if row == row0 or row == row1 - 1 else max(1, col1 - col0 - 1)
@@ -207,4 +208,4 @@ def _rim_heap(cost, stride, box):
             if cost[v] < INF:
                 _heap_push(keys, items, size, cost[v], v)
                 size += 1
-    return keys, items, size
+    return size

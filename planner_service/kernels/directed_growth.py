@@ -18,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.compile import njit
-from planner_service.kernels.layout import INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, step_offsets
+from planner_service.kernels.compile import kernel
+from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
 
 _NOBODY = np.int32(-1)
 _OUT = np.int32(-2)
@@ -35,8 +35,8 @@ scale    float32  (2,)          of straight and diagonal steps, entries of `fact
 """
 
 
-@njit
-def grow_directed(grid, labels, climbs, buckets):
+@kernel(f"({GRID}, {LABELS}, UniTuple(f4[::1], 3), {BUCKETS}, i4[:, ::1], i4[::1])")
+def grow_directed(grid, labels, climbs, buckets, links, first):
     """The tree of cheapest ways to a padded, passable root. Costs and parents are written whole; returns the
     largest cost.
 
@@ -47,17 +47,16 @@ def grow_directed(grid, labels, climbs, buckets):
     what its neighbours offer. So no cycle of parents can be: its cells would all have one cost, and each would have
     got it, for the last time, after its parent did.
     """
-    cell_cost, stride, rule, corners = grid
+    cell_cost, offsets, _, rule, corners = grid
     cost, parent, root = labels
     height, factors, scale = climbs
     width, count = buckets
-    offsets = step_offsets(stride)
-    links = np.empty((cell_cost.size, 2), np.int32)
     for i in range(cell_cost.size):
         cost[i] = INF
         parent[i] = NONE
         links[i, 0] = _OUT
-    first = np.full(count, _NOBODY, np.int32)
+    for i in range(count):
+        first[i] = _NOBODY
     mask = count - 1
     inverse = 1.0 / np.float64(width)
     half = np.float32(factors.size // 2)

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.compile import njit
+from planner_service.kernels.compile import helper
 
 RULE_FOUR = 0
 """4 neighbours."""
@@ -42,9 +42,10 @@ TOO_FINE = -1
 """Returned by a growth whose keys grew so large, in lowest cell costs, that float32 could not tell them apart."""
 
 
-PaddedGrid = tuple[NDArray[np.float32], int, int, bool]
-"""What a search runs on: (cell_cost, stride, rule, corners).
+PaddedGrid = tuple[NDArray[np.float32], NDArray[np.int64], int, int, bool]
+"""What a search runs on: (cell_cost, offsets, stride, rule, corners).
 
+offsets  int64 (8,), what each direction 0..7 (north, then clockwise) adds to a padded cell
 rule     RULE_FOUR, RULE_PAPER or RULE_OCTILE
 corners  whether a diagonal step may pass a lethal cell
 A plain tuple, as all that kernels are handed from Python: numba takes two microseconds to read a named one, and as
@@ -58,13 +59,19 @@ Buckets = tuple[float, int]
 """Size of a bucket queue: (width, count). Keys less than `width` (s, rounded to float32) apart share a bucket."""
 
 
-@njit
-def step_offsets(stride):
+GRID = "Tuple((f4[::1], i8[::1], i8, i8, b1))"
+LABELS = "Tuple((f4[::1], u1[::1], i8))"
+BUCKETS = "Tuple((f8, i8))"
+BOX = "UniTuple(i8, 4)"
+"""The same as numba writes these types, for signatures of kernels."""
+
+
+def step_offsets(stride: int) -> NDArray[np.int64]:
     """int64 (8,): what each direction 0..7 (north, then clockwise) adds to a padded cell."""
-    return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1))
+    return np.array((-stride, 1 - stride, 1, stride + 1, stride, stride - 1, -1, -stride - 1), np.int64)
 
 
-@njit
+@helper
 def diagonal_length(rule):
     """float32: length of a diagonal step in straight ones; inf where there is none."""
     if rule == RULE_FOUR:
@@ -72,17 +79,7 @@ def diagonal_length(rule):
     return SQRT2 if rule == RULE_OCTILE else np.float32(1.0)
 
 
-@njit
-def enlarged(array, count, size):
-    """Room for `size` elements, the first `count` copied. By a loop: assigning to a slice would bring along what
-    numba needs for the text of its error, which takes longer to compile than any kernel here."""
-    larger = np.empty(size, array.dtype)
-    for i in range(count):
-        larger[i] = array[i]
-    return larger
-
-
-@njit
+@helper
 def check_cells(cells, size):
     """Raises ValueError unless these are padded cells (int64): indices into arrays of so many. Called by kernels
     that are handed cells, because from Python it would take a microsecond."""

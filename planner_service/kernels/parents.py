@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.compile import njit
-from planner_service.kernels.layout import HUGE, INF, NONE, RULE_FOUR, diagonal_length
+from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.layout import BOX, GRID, HUGE, INF, NONE, RULE_FOUR, diagonal_length
 
 _ONE = np.uint64(1)
 
 
-@njit
+@helper
 def _parents_of_four(cell_cost, cost, s, first, last, parent):
     for i in range(first, last):
         best = cost[i - s] + cell_cost[i - s]
@@ -31,7 +31,7 @@ def _parents_of_four(cell_cost, cost, s, first, last, parent):
         parent[i] = code if max(cost[i], best) < INF else NONE
 
 
-@njit
+@helper
 def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
     """A diagonal counts where the dearer of its two corners costs at most `limit`. Free of branches: it
     vectorises."""
@@ -67,9 +67,10 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
         parent[i] = code if max(cost[i], best) < INF else NONE
 
 
-@njit
-def point_row_to_parents(cell_cost, cost, stride, rule, corners, first, last, parent):
+@helper
+def point_row_to_parents(grid, cost, first, last, parent):
     """As `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out."""
+    cell_cost, _, stride, rule, corners = grid
     s, begin, end = np.uint64(stride), np.uint64(first), np.uint64(last)
     if rule == RULE_FOUR:
         _parents_of_four(cell_cost, cost, s, begin, end, parent)
@@ -78,12 +79,13 @@ def point_row_to_parents(cell_cost, cost, stride, rule, corners, first, last, pa
         _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent)
 
 
-@njit
-def point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent):
+@kernel(f"({GRID}, f4[::1], i8, {BOX}, u1[::1])")
+def point_to_parents(grid, cost, root, box, parent):
     """Write the parents of the cells of a window: the neighbour with the smallest exit key; of equals the first of
     north, east, south, west, then of the diagonals clockwise."""
     row0, col0, row1, col1 = box
+    stride = grid[2]
     for row in range(row0, row1):
         start = (row + 1) * stride + 1
-        point_row_to_parents(cell_cost, cost, stride, rule, corners, start + col0, start + col1, parent)
+        point_row_to_parents(grid, cost, start + col0, start + col1, parent)
     parent[root] = NONE

@@ -13,7 +13,9 @@ Arrays, beside those of `layout`:
     before    float32  (n,)  s; their cell cost when the tree was right
     rows      (first, last)  int64 (rows + 2,)  of each padded row, the first and last padded cell that something
                              has changed about; last < first where nothing has
-    lowered   uint32         padded cells whose cost has fallen; as many as a count says
+    detached  int64   (size + 8,)    padded cells that lost their way
+    lowered   uint32  (2 * size,)    padded cells whose cost has fallen; as many as a count says
+    best      float32 (stride,)      least offers in a part of a row, s
     keys, items, behind  float32, uint32, int32  entries of the queue: cost when entered (s), padded cell, the next
                                                  entry of its bucket; _NOBODY ends a list
     heads     int32    (count + 1,)  first entry of each bucket, the overflow last; _NOBODY if empty
@@ -22,9 +24,10 @@ Arrays, beside those of `layout`:
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from planner_service.kernels.compile import njit
-from planner_service.kernels.layout import INF, NONE, diagonal_length, enlarged, step_offsets
+from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, diagonal_length
 from planner_service.kernels.parents import point_row_to_parents
 
 _NOBODY = np.int32(-1)
@@ -32,18 +35,36 @@ _ONE = np.uint64(1)
 _FINE = np.uint64(44)
 
 
-@njit
-def _no_rows(size, stride):
-    """`rows` of nothing, in arrays of `size` padded cells."""
+Rows = tuple[NDArray[np.int64], NDArray[np.int64]]
+Entries = tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.int32]]
+Scratch = tuple[Rows, Rows, NDArray[np.int64], NDArray[np.uint32], NDArray[np.float32], Entries, NDArray[np.int32]]
+_ROWS = "UniTuple(i8[::1], 2)"
+_SCRATCH = f"Tuple(({_ROWS}, {_ROWS}, i8[::1], u4[::1], f4[::1], Tuple((f4[::1], u4[::1], i4[::1])), i4[::1]))"
+
+
+def make_scratch(size: int, stride: int, buckets: int) -> Scratch:
+    """(rows, rows of what got cheaper, detached, lowered, best, (keys, items, behind), heads) for repairs of `size`
+    padded cells: for the worst case, as the system keeps no page that was not written."""
     count = size // stride
-    first, last = np.empty(count, np.int64), np.empty(count, np.int64)
-    for row in range(count):
+    first, last, cheaper_first, cheaper_last = (np.empty(count, np.int64) for _ in range(4))
+    many = 2 * size + 1024
+    entries = np.empty(many, np.float32), np.empty(many, np.uint32), np.empty(many, np.int32)
+    return (
+        *((first, last), (cheaper_first, cheaper_last), np.empty(size + 8, np.int64), np.empty(many, np.uint32)),
+        *(np.empty(stride, np.float32), entries, np.empty(buckets + 1, np.int32)),
+    )
+
+
+@helper
+def _clear(rows, size):
+    """`rows` := of nothing, in arrays of `size` padded cells."""
+    first, last = rows
+    for row in range(first.size):
         first[row] = size
         last[row] = -1
-    return first, last
 
 
-@njit
+@helper
 def _note(first, last, stride, cells, count):
     """Something has changed about the first `count` of these padded cells."""
     for i in range(count):
@@ -52,7 +73,7 @@ def _note(first, last, stride, cells, count):
         last[row] = max(last[row], cells[i])
 
 
-@njit
+@helper
 def _any_cheaper(cell_cost, changed, before):
     found = False
     for i in range(changed.size):
@@ -60,17 +81,20 @@ def _any_cheaper(cell_cost, changed, before):
     return found
 
 
-@njit
-def _cheaper_rows(cell_cost, stride, changed, before):
-    """`rows` of the cells that got cheaper."""
-    first, last = _no_rows(cell_cost.size, stride)
+@helper
+def _note_cheaper(rows, cell_cost, stride, changed, before):
+    """`rows` := of the cells that got cheaper."""
+    _clear(rows, cell_cost.size)
+    first, last = rows
     for i in range(changed.size):
-        if cell_cost[changed[i]] < before[i]:
-            _note(first, last, stride, changed[i : i + 1], np.int64(1))
-    return first, last
+        cell = changed[i]
+        if cell_cost[cell] < before[i]:
+            row = cell // stride
+            first[row] = min(first[row], cell)
+            last[row] = max(last[row], cell)
 
 
-@njit
+@helper
 def _near_rows(first, last):
     """The inner rows in which something has changed, the rows beside these, and all between: begin <= row < end."""
     begin, end = 0, first.size
@@ -81,7 +105,7 @@ def _near_rows(first, last):
     return max(begin - 1, 1), min(end + 1, first.size - 1)
 
 
-@njit
+@helper
 def _span(first, last, stride, row):
     """The cells of a row that something has changed about in it or in the rows beside it, and their neighbours:
     begin <= cell < end, empty if there are none."""
@@ -94,7 +118,7 @@ def _span(first, last, stride, row):
     return row * stride + max(begin - 1, 1), row * stride + min(end + 2, stride - 1)
 
 
-@njit
+@helper
 def _best_offers(cell_cost, cost, s, begin, end, diagonal, corners, best):
     """best[0 : end - begin] := the smallest exit key among the neighbours of each cell of a part of a row.
 
@@ -119,13 +143,12 @@ def _best_offers(cell_cost, cost, s, begin, end, diagonal, corners, best):
         best[i - begin] = least
 
 
-@njit
-def _sweep(grid, cost, rows, floor, lowered, count):
+@helper
+def _sweep(grid, cost, rows, floor, best, lowered, count):
     """Lower the cells of `rows`, and those next to them, to what they are offered, where they cost `floor` (s) or
-    more and are offered less. Returns lowered, to which it appends them, and how many there are."""
-    cell_cost, stride, rule, corners = grid
+    more and are offered less. Appends them to the `count` that are in `lowered`; returns how many there are."""
+    cell_cost, _, stride, rule, corners = grid
     first, last = rows
-    best = np.empty(stride, np.float32)
     diagonal = diagonal_length(rule)
     from_row, to_row = _near_rows(first, last)
     for row in range(from_row, to_row):
@@ -133,21 +156,18 @@ def _sweep(grid, cost, rows, floor, lowered, count):
         if end <= begin:
             continue
         _best_offers(cell_cost, cost, np.uint64(stride), np.uint64(begin), np.uint64(end), diagonal, corners, best)
-        if count + stride > lowered.size:
-            lowered = enlarged(lowered, count, 2 * lowered.size + stride)
         for i in range(begin, end):
             if best[i - begin] < cost[i] and cost[i] >= floor and cell_cost[i] < INF:
                 cost[i] = best[i - begin]
                 lowered[count] = i
                 count += 1
-    return lowered, count
+    return count
 
 
-@njit
-def _begin_anew(keys, behind, heads, inverse):
+@helper
+def _begin_anew(keys, behind, heads, overflow, inverse):
     """Spread the overflow over the buckets, the first of which begins with its lowest key. Returns that key, or inf
     if nothing waits."""
-    overflow = heads.size - 1
     top = np.float32(overflow)
     rest = heads[overflow]
     heads[overflow] = _NOBODY
@@ -165,29 +185,25 @@ def _begin_anew(keys, behind, heads, inverse):
     return base
 
 
-@njit
-def _spread(grid, cost, buckets, lowered, count, rows, limit):
+@helper
+def _spread(grid, cost, buckets, lowered, count, rows, limit, entries, heads):
     """Let costs that have fallen spread, until no cell is offered less than it costs.
 
     buckets  width: up to the lowest cell cost no cell is served twice; beyond, costs are right too
     lowered  `count` cells whose cost has fallen; taken over
-    Notes the cells that have fallen in `rows`. Returns (cells served, or -1 beyond `limit`; the largest cost
-    served).
+    Notes the cells that have fallen in `rows`. Returns (cells served, or -1 beyond `limit` or the queue's room; the
+    largest cost served).
     """
-    cell_cost, stride, rule, corners = grid
+    cell_cost, offsets, stride, rule, corners = grid
     first, last = rows
-    across = np.array((-stride, 1, stride, -1)).astype(np.uint64)
-    aslant = np.array((1 - stride, stride + 1, stride - 1, -stride - 1)).astype(np.uint64)
+    keys, items, behind = entries
     # cell // stride, by a multiplication: exact while the grid's size * stride is below 2**44.
     per_row = np.uint64((1 << 44) // stride + 1)
     width, overflow = buckets
     inverse = np.float32(1.0) / np.float32(width)
     top = np.float32(overflow)
-    heads = np.full(overflow + 1, _NOBODY, np.int32)
-    capacity = max(1024, 2 * count)
-    keys = np.empty(capacity, np.float32)
-    items = np.empty(capacity, np.uint32)
-    behind = np.empty(capacity, np.int32)
+    for b in range(overflow + 1):
+        heads[b] = _NOBODY
     used = 0
     spare = _NOBODY
     base = np.float32(0.0)
@@ -200,11 +216,8 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit):
     # All in one function: of a call's array arguments references are counted: repairs took a fifth more time where
     # entering a bucket's cells was a call, and treble the time where making offers is one.
     while True:
-        if used + np.int64(n) > capacity:
-            capacity = 2 * (used + np.int64(n))
-            keys = enlarged(keys, used, capacity)
-            items = enlarged(items, used, capacity)
-            behind = enlarged(behind, used, capacity)
+        if used + np.int64(n) > keys.size:
+            return -1, highest
         for i in range(n):
             v = lowered[i]
             row = np.int64(np.uint64(v) * per_row >> _FINE)
@@ -226,7 +239,7 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit):
         while current < overflow and heads[current] == _NOBODY:
             current += 1
         if current == overflow:
-            base = _begin_anew(keys, behind, heads, inverse)
+            base = _begin_anew(keys, behind, heads, overflow, inverse)
             if base == INF:
                 return served, highest
             current = 0
@@ -245,22 +258,28 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit):
             served += 1
             highest = max(highest, key)
             if n + np.uint64(8) > room:
-                lowered = enlarged(lowered, np.int64(n), np.int64(2 * room) + 64)
-                room = np.uint64(lowered.size)
+                return -1, highest
             straight = key + cell_cost[u]
             diagonal = key + cell_cost[u] * slant
             # Branches, unlike in a growth: few neighbours are offered less, so that these are foretold.
             for k in range(4):
-                v = u + across[k]
+                v = u + np.uint64(offsets[2 * k])
                 if straight < cost[v] and cell_cost[v] < INF:
                     cost[v] = straight
                     lowered[n] = v
                     n += _ONE
-                v = u + aslant[k]
+                v = u + np.uint64(offsets[2 * k + 1])
                 if (
                     diagonal < cost[v]
                     and cell_cost[v] < INF
-                    and (corners or max(cell_cost[u + across[k]], cell_cost[u + across[(k + 1) & 3]]) < INF)
+                    and (
+                        corners
+                        or max(
+                            cell_cost[u + np.uint64(offsets[2 * k])],
+                            cell_cost[u + np.uint64(offsets[(2 * k + 2) & 7])],
+                        )
+                        < INF
+                    )
                 ):
                     cost[v] = diagonal
                     lowered[n] = v
@@ -269,29 +288,13 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit):
             return -1, highest
 
 
-@njit
-def lower_costs(grid, cost, changed, before, buckets, limit):
-    """After cell costs fell, let costs fall: no cell costs more than what any neighbour offers, where so before.
-
-    Needs no parents, and no root but a cell that costs least. Returns cells served, or -1 beyond `limit`; then
-    `cost` is of no use any more.
-    """
-    cell_cost, stride, _, _ = grid
-    rows = _cheaper_rows(cell_cost, stride, changed, before)
-    lowered, count = _sweep(grid, cost, rows, np.float32(-INF), np.empty(1024, np.uint32), np.int64(0))
-    served, _ = _spread(grid, cost, buckets, lowered, count, rows, limit)
-    return served
-
-
-@njit
-def _detach(grid, cost, parent, changed, before, limit):
+@helper
+def _detach(grid, cost, parent, changed, before, limit, detached):
     """Take cost and parent from the cells whose way leads over a cell that got dearer.
 
-    Returns them (int64) and how many; more than `limit` if that is so, and then not all.
+    Writes them to `detached`. Returns how many; more than `limit` if that is so, and then not all.
     """
-    cell_cost, stride, _, corners = grid
-    offsets = step_offsets(stride)
-    detached = np.empty(64 + 16 * changed.size, np.int64)
+    cell_cost, offsets, _, _, corners = grid
     count = np.int64(0)  # a literal would have `_detach_behind` compiled twice
     for i in range(changed.size):
         x = changed[i]
@@ -317,15 +320,11 @@ def _detach(grid, cost, parent, changed, before, limit):
     return _detach_behind(cost, parent, offsets, detached, count, limit)
 
 
-@njit
+@helper
 def _detach_behind(cost, parent, offsets, detached, count, limit):
     """Detach all whose way leads over the `count` cells that are detached already."""
-    capacity = detached.size
     done = 0
     while done < count and count <= limit:
-        if count + 8 > capacity:
-            detached = enlarged(detached, count, 2 * capacity)
-            capacity *= 2
         u = np.uint64(detached[done])
         done += 1
         # A cell has one parent, so that none is found twice.
@@ -335,45 +334,52 @@ def _detach_behind(cost, parent, offsets, detached, count, limit):
             count += parent[v] == (k + 4) & 7
         parent[u] = NONE
         cost[u] = INF
-    return detached, count
+    return count
 
 
-@njit
-def repair(grid, labels, changed, before, buckets, most):
+@kernel(f"({GRID}, {LABELS}, i8[::1], f4[::1], {BUCKETS}, UniTuple(i8, 3), {_SCRATCH})")
+def repair(grid, labels, changed, before, buckets, most, scratch):
     """Bring a tree up to date after the costs of `changed` cells became what they are now.
 
     buckets  as `_spread` says
     most     (detached, with_cheaper, served): how many cells may lose their way, the same where some cells got
              cheaper, and how many may be served besides twice as many as lost theirs
+    scratch  as `make_scratch` returns it, for as many buckets
+    Without parents (none at all) costs only fall: none is more than what any neighbour offers, where so before.
+
     An exact tree is exact afterwards, equal to one grown from scratch. Returns (cells visited, the largest new
     cost, s); -1 cells where that is more than `most`: then the tree is of no use any more and must be grown.
     """
-    cell_cost, stride, rule, corners = grid
+    cell_cost, _, stride, _, _ = grid
     cost, parent, root = labels
+    rows, cheaper, detached, lowered, best, entries, heads = scratch
+    first, last = rows
     any_cheaper = _any_cheaper(cell_cost, changed, before)
     most_detached = most[1] if any_cheaper else most[0]
-    detached, many = _detach(grid, cost, parent, changed, before, most_detached)
+    many = np.int64(0)
+    if parent.size:
+        many = _detach(grid, cost, parent, changed, before, most_detached, detached)
     if many > most_detached:
         return -1, INF
-    rows = _no_rows(cell_cost.size, stride)
-    first, last = rows
-    lowered = np.empty(1024, np.uint32)
+    _clear(rows, cell_cost.size)
     count = np.int64(0)  # a literal would have `_sweep` compiled twice
     if many:
         _note(first, last, stride, detached, many)
-        lowered, count = _sweep(grid, cost, rows, INF, lowered, count)
+        count = _sweep(grid, cost, rows, INF, best, lowered, count)
     if any_cheaper:
-        cheaper = _cheaper_rows(cell_cost, stride, changed, before)
-        lowered, count = _sweep(grid, cost, cheaper, np.float32(-INF), lowered, count)
-    served, highest = _spread(grid, cost, buckets, lowered, count, rows, 2 * many + most[2])
+        _note_cheaper(cheaper, cell_cost, stride, changed, before)
+        count = _sweep(grid, cost, cheaper, np.float32(-INF), best, lowered, count)
+    served, highest = _spread(grid, cost, buckets, lowered, count, rows, 2 * many + most[2], entries, heads)
     if served < 0:
         return -1, INF
+    if not parent.size:
+        return served, highest
     # A cell beside one that changed may have a better neighbour now.
     _note(first, last, stride, changed, changed.size)
     from_row, to_row = _near_rows(first, last)
     for row in range(from_row, to_row):
         begin, end = _span(first, last, stride, row)
         if begin < end:
-            point_row_to_parents(cell_cost, cost, stride, rule, corners, begin, end, parent)
+            point_row_to_parents(grid, cost, begin, end, parent)
     parent[root] = NONE
     return served + many, highest

@@ -11,15 +11,22 @@ Routes follow parents, without any search. Arrays, beside those of `layout`; n i
     status      uint8    (n,)    OK, UNREACHABLE, OUTSIDE or LETHAL_START
     prices      float64  (4, n)  cost_s, lower_bound_s, length_m and remaining_s; inf, 0, 0, 0 where there is no
                                  route
+    trails      uint8    (4, room)  directions of the routes that were walked in each lane, one after the other
+    lanes       int64    (5, 4)     of each lane: its route, the first one that is not its own any more, where its
+                                    route begins in the trail, how long the trail is, the padded cell it has come to
+    sums        float64  (4,)       s; what each lane's route has cost so far
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from planner_service.kernels.compile import njit
+from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import (
+    GRID,
     INF,
+    LABELS,
     NONE,
     RULE_OCTILE,
     SQRT2,
@@ -31,23 +38,29 @@ from planner_service.kernels.layout import (
 OK, UNREACHABLE, OUTSIDE, LETHAL_START = range(4)
 """What became of a route that was asked for."""
 
+Moves = tuple[NDArray[np.uint64], NDArray[np.float64]]
+Lanes = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.uint8]]
+_WALKS = "Tuple((i8[::1], f8[::1], i8[::1], i8[::1]))"
+_WALK = "Tuple((i8[:, ::1], f8[::1], u1[:, ::1]))"
+
 _LANES = 4
 """Routes that are walked side by side. A step waits for the one before it, but not for another route's."""
+_ROUTE, _UNTIL, _BEGUN, _FILL, _CELL = range(5)
+"""Rows of `lanes`."""
 _STRETCH = 32
 """Steps between two looks at whether a lane's route has ended; a route that has stands still meanwhile."""
 
 
-@njit
-def relabel(grid, labels):
-    """Costs := what is really driven from each cell along its parents. They are written whole; parents are read."""
-    cell_cost, stride, rule, _ = grid
+@kernel(f"({GRID}, {LABELS}, u4[::1])")
+def relabel(grid, labels, trail):
+    """Costs := what is really driven from each cell along its parents. They are written whole; parents are read.
+    `trail` has room for all cells."""
+    cell_cost, offsets, _, rule, _ = grid
     cost, parent, root = labels
-    offsets = step_offsets(stride)
     unknown = np.float32(-1.0)
     for i in range(cost.size):
         cost[i] = unknown if parent[i] != NONE else INF
     cost[root] = np.float32(0.0)
-    trail = np.empty(cost.size, np.uint32)
     for i in range(cost.size):
         v = i
         many = 0
@@ -62,19 +75,29 @@ def relabel(grid, labels):
             cost[v] = cost[u] + (cell_cost[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else cell_cost[u])
 
 
-@njit
-def _walk_on(cell_cost, parent, offsets, lengths, cells, sums, trails, fill, steps):
+@helper
+def _walk_on(cell_cost, parent, moves, lanes, sums, trails, steps):
     """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
-    a, b, c, d = np.uint64(cells[0]), np.uint64(cells[1]), np.uint64(cells[2]), np.uint64(cells[3])
+    offsets, lengths = moves
+    a, b, c, d = (
+        np.uint64(lanes[_CELL, 0]),
+        np.uint64(lanes[_CELL, 1]),
+        np.uint64(lanes[_CELL, 2]),
+        np.uint64(lanes[_CELL, 3]),
+    )
     sum_a, sum_b, sum_c, sum_d = sums[0], sums[1], sums[2], sums[3]
-    trail_a, trail_b, trail_c, trail_d = trails[0], trails[1], trails[2], trails[3]
-    at_a, at_b, at_c, at_d = np.uint64(fill[0]), np.uint64(fill[1]), np.uint64(fill[2]), np.uint64(fill[3])
+    at_a, at_b, at_c, at_d = (
+        np.uint64(lanes[_FILL, 0]),
+        np.uint64(lanes[_FILL, 1]),
+        np.uint64(lanes[_FILL, 2]),
+        np.uint64(lanes[_FILL, 3]),
+    )
     for i in range(np.uint64(steps)):
         code_a, code_b, code_c, code_d = parent[a], parent[b], parent[c], parent[d]
-        trail_a[at_a + i] = code_a
-        trail_b[at_b + i] = code_b
-        trail_c[at_c + i] = code_c
-        trail_d[at_d + i] = code_d
+        trails[0, at_a + i] = code_a
+        trails[1, at_b + i] = code_b
+        trails[2, at_c + i] = code_c
+        trails[3, at_d + i] = code_d
         a += offsets[code_a]
         b += offsets[code_b]
         c += offsets[code_c]
@@ -83,112 +106,122 @@ def _walk_on(cell_cost, parent, offsets, lengths, cells, sums, trails, fill, ste
         sum_b += np.float64(cell_cost[b]) * lengths[code_b]
         sum_c += np.float64(cell_cost[c]) * lengths[code_c]
         sum_d += np.float64(cell_cost[d]) * lengths[code_d]
-    cells[0], cells[1], cells[2], cells[3] = np.int64(a), np.int64(b), np.int64(c), np.int64(d)
+    lanes[_CELL, 0], lanes[_CELL, 1], lanes[_CELL, 2], lanes[_CELL, 3] = (
+        np.int64(a),
+        np.int64(b),
+        np.int64(c),
+        np.int64(d),
+    )
     sums[0], sums[1], sums[2], sums[3] = sum_a, sum_b, sum_c, sum_d
 
 
-@njit
-def _moves(stride, rule):
+def moves_of(stride: int, rule: int) -> Moves:
     """Of each direction code, what it adds to a padded cell (uint64) and its length in straight steps (float64).
 
     Beyond the codes of directions, NONE: to stay, at no cost. Unsigned, as sums of a cell and a signed offset would
     be floating-point numbers; they wrap.
     """
-    offsets = np.zeros(256, np.uint64)
-    lengths = np.zeros(256, np.float64)
-    near = step_offsets(stride)
-    for k in range(8):
-        offsets[k] = np.uint64(near[k])
-        lengths[k] = SQRT2_EXACT if rule == RULE_OCTILE and k & 1 else 1.0
+    offsets, lengths = np.zeros(256, np.uint64), np.zeros(256, np.float64)
+    offsets[:8] = step_offsets(stride).astype(np.uint64)
+    lengths[:8] = 1.0
+    if rule == RULE_OCTILE:
+        lengths[1:8:2] = SQRT2_EXACT
     return offsets, lengths
 
 
-@njit
-def walk_routes(cell_cost, parent, stride, rule, root, starts, max_steps, limit):
-    """The routes from `starts` to a padded root, at most `max_steps` long where that is positive.
+def make_lanes() -> Lanes:
+    """(lanes, sums, trails), for routes of usual length; `longer` for others."""
+    return np.empty((5, _LANES), np.int64), np.empty(_LANES, np.float64), np.empty((_LANES, 1024), np.uint8)
 
-    limit  no route can be longer than so many steps
-    Raises ValueError where a start is no padded cell.
-    Returns (directions, ends, driven, diagonals, last).
+
+def longer(walk: Lanes) -> Lanes:
+    """The same lanes, their trails with twice the room."""
+    lanes, sums, trails = walk
+    room = trails.shape[1]
+    twice = np.empty((_LANES, 2 * room), np.uint8)
+    twice[:, :room] = trails
+    return lanes, sums, twice
+
+
+@kernel(f"(f4[::1], u1[::1], Tuple((u8[::1], f8[::1])), i8, i8[::1], UniTuple(i8, 2), {_WALKS}, {_WALK}, b1)")
+def walk_routes(cell_cost, parent, moves, root, starts, most, walks, walk, anew):
+    """The routes from `starts` to a padded root. `join_routes` is to follow.
+
+    moves  as `moves_of` returns them
+    most   (steps of a route, 0 for all of it; no route can be longer than so many)
+    walks  (ends, driven, diagonals, last), written: all but `diagonals`, and `ends` in the lane's trail
+    walk   as `make_lanes` returns them
+    anew   begin with the first routes; if not, go on
+    Raises ValueError where a start is no padded cell. Returns how many steps all routes have; -1 if the trails have
+    no room for the next ones: call it again with longer ones to go on.
     """
-    check_cells(starts, parent.size)
-    offsets, lengths = _moves(stride, rule)
+    ends, driven, _, last = walks
+    lanes, sums, trails = walk
     count = starts.size
-    ends = np.empty(count, np.int64)
-    driven = np.empty(count, np.float64)
-    last = np.empty(count, np.int64)
-    most = limit if max_steps <= 0 else min(limit, max_steps)
-
-    # Each lane has a share of the routes, and its trail holds them in order.
-    trails = np.empty((_LANES, 1024), np.uint8)
-    route = np.empty(_LANES, np.int64)
-    until = np.empty(_LANES, np.int64)
-    begun = np.zeros(_LANES, np.int64)
-    fill = np.zeros(_LANES, np.int64)
-    cells = np.full(_LANES, root, np.int64)
-    sums = np.zeros(_LANES, np.float64)
-    for j in range(_LANES):
-        route[j] = count * j // _LANES
-        until[j] = count * (j + 1) // _LANES
-        if route[j] < until[j]:
-            cells[j] = starts[route[j]]
+    limit = most[1]
+    longest = limit if most[0] <= 0 else min(limit, most[0])
+    if anew:
+        check_cells(starts, parent.size)
+        # Each lane has a share of the routes, and its trail holds them in order.
+        for j in range(_LANES):
+            first = count * j // _LANES
+            lanes[_ROUTE, j] = first
+            lanes[_UNTIL, j] = count * (j + 1) // _LANES
+            lanes[_BEGUN, j] = 0
+            lanes[_FILL, j] = 0
+            lanes[_CELL, j] = starts[first] if first < lanes[_UNTIL, j] else root
+            sums[j] = 0.0
     while True:
         steps = np.int64(0)  # a literal would have `_walk_on` compiled twice
+        room = trails.shape[1]
         for j in range(_LANES):
-            if route[j] < until[j]:
-                left = min(_STRETCH, most - (fill[j] - begun[j]))
+            room = min(room, trails.shape[1] - lanes[_FILL, j])
+            if lanes[_ROUTE, j] < lanes[_UNTIL, j]:
+                left = min(_STRETCH, longest - (lanes[_FILL, j] - lanes[_BEGUN, j]))
                 steps = left if steps == 0 else min(steps, left)
         if steps == 0:
             break
-        if max(max(fill[0], fill[1]), max(fill[2], fill[3])) + steps > trails.shape[1]:
-            trails = _longer_trails(trails)
-        _walk_on(cell_cost, parent, offsets, lengths, cells, sums, trails, fill, steps)
+        if steps > room:
+            return -1
+        _walk_on(cell_cost, parent, moves, lanes, sums, trails, steps)
         for j in range(_LANES):
-            r = route[j]
-            if r == until[j]:
+            r = lanes[_ROUTE, j]
+            if r == lanes[_UNTIL, j]:
                 continue
-            end = fill[j] + steps
-            while end > begun[j] and trails[j, end - 1] == NONE:
+            begun = lanes[_BEGUN, j]
+            end = lanes[_FILL, j] + steps
+            while end > begun and trails[j, end - 1] == NONE:
                 end -= 1
-            fill[j] = end
-            v = cells[j]
-            if parent[v] != NONE and end - begun[j] < most:
+            lanes[_FILL, j] = end
+            v = lanes[_CELL, j]
+            if parent[v] != NONE and end - begun < longest:
                 continue
-            broken = v != root and (parent[v] == NONE or end - begun[j] == limit)
+            broken = v != root and (parent[v] == NONE or end - begun == limit)
             ends[r] = -1 if broken else end
             driven[r] = sums[j]
             last[r] = v
-            route[j] = r + 1
-            begun[j] = end
+            r += 1
+            lanes[_ROUTE, j] = r
+            lanes[_BEGUN, j] = end
+            lanes[_CELL, j] = starts[r] if r < lanes[_UNTIL, j] else root
             sums[j] = 0.0
-            cells[j] = starts[r + 1] if r + 1 < until[j] else root
-    directions, diagonals = _joined(trails, fill, ends)
-    return directions, ends, driven, diagonals, last
+    return lanes[_FILL, 0] + lanes[_FILL, 1] + lanes[_FILL, 2] + lanes[_FILL, 3]
 
 
-@njit
-def _longer_trails(trails):
-    longer = np.empty((trails.shape[0], 2 * trails.shape[1]), np.uint8)
-    for j in range(trails.shape[0]):
-        for i in range(trails.shape[1]):  # by a loop: see `enlarged` in `layout`
-            longer[j, i] = trails[j, i]
-    return longer
-
-
-@njit
-def _joined(trails, fill, ends):
-    """The trails of all lanes in one row, and how many diagonal steps each route has. Ends of routes in their
-    lane's trail become their ends in that row."""
+@kernel(f"({_WALKS}, {_WALK}, u1[::1])")
+def join_routes(walks, walk, directions):
+    """Put the trails of all lanes into one row, `directions`. Ends of routes in their lane's trail become their
+    ends in that row; `diagonals` is written."""
+    ends, _, diagonals, _ = walks
+    lanes, _, trails = walk
     count = ends.size
-    directions = np.empty(fill.sum(), np.uint8)
     n = 0
     for j in range(_LANES):
-        for i in range(fill[j]):
+        for i in range(lanes[_FILL, j]):
             directions[n + i] = trails[j, i]
         for r in range(count * j // _LANES, count * (j + 1) // _LANES):
             ends[r] += n if ends[r] >= 0 else 0
-        n += fill[j]
-    diagonals = np.empty(count, np.int64)
+        n += lanes[_FILL, j]
     n = 0
     for r in range(count):
         odd = 0
@@ -196,10 +229,9 @@ def _joined(trails, fill, ends):
             odd += directions[i] & 1
         diagonals[r] = odd
         n = max(n, ends[r])
-    return directions, diagonals
 
 
-@njit
+@kernel("(f4[::1], f4[::1], i8, i8, i8[::1], i8[::1], u1[::1])")
 def find_starts(cell_cost, cost, stride, root, asked, starts, status):
     """Where routes from `asked` cells (int64, of the grid) start, padded, and whether there is one.
 
@@ -223,13 +255,13 @@ def find_starts(cell_cost, cost, stride, root, asked, starts, status):
             starts[i] = v
 
 
-@njit
+@kernel(f"(f4[::1], f8, i8, UniTuple(f8, 3), {_WALKS}, u1[::1], f8[::1], f8[:, ::1])")
 def price_routes(cost, offset, root, metres, walks, status, bound, prices):
     """What walked routes cost and how long they are.
 
     offset  s; what a tree's stored costs lack
     metres  (resolution, m; length of a diagonal in straight steps; price of length, s/m)
-    walks   (ends, driven, diagonals, last) as `walk_routes` returns them
+    walks   (ends, driven, diagonals, last) as `walk_routes` and `join_routes` wrote them
     bound   float64 (n,), s; proven lower bound on the cost of each
     prices  written whole
     Returns False if a route does not end where it should.

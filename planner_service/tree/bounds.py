@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import lower_bounds as kernels
-from planner_service.kernels.repair import lower_costs
+from planner_service.kernels.repair import repair
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from shared_map.arrays import Floats
@@ -33,6 +33,10 @@ class LowerBounds:
         self._heuristic = exact_cost
         self._lowest = self._grid.lowest_cell_cost
 
+    def forget(self) -> None:
+        """The map changed, and nothing is to be known of the optimum until `take`."""
+        self._heuristic = None
+
     def learn(self, changes: Changes) -> None:
         """The map changed: lower the heuristic where ways became cheaper. Dearer cells leave it consistent."""
         if changes.cells.size:
@@ -41,7 +45,11 @@ class LowerBounds:
             return
         grid = self._grid
         limit = grid.grid.cells // LOWER_SHARE + 1024
-        if lower_costs(grid.padded, self._heuristic, changes.cells, changes.before, grid.buckets, limit) < 0:
+        lowered, _ = repair(
+            *(grid.padded, (self._heuristic, _NO_PARENTS, 0), changes.cells, changes.before),
+            *(grid.buckets, (0, 0, limit), grid.repair_scratch),
+        )
+        if lowered < 0:
             self._heuristic = None
 
     def at(self, tree: CostToGoTree, starts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -68,3 +76,4 @@ class LowerBounds:
 
 
 _NONE: Floats = np.empty(0, np.float32)
+_NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)

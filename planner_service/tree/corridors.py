@@ -57,7 +57,8 @@ def find_corridors(cost_grid: CostGrid) -> CorridorGraph:
     level = np.zeros(cost_grid.size, np.uint8)
     cost = np.empty(cost_grid.size, np.float32)
     parent = np.full(cost_grid.size, NONE, np.uint8)
+    children, traffic = np.empty(cost_grid.size, np.uint8), np.empty(cost_grid.size, np.uint32)
     for root in passable[np.linspace(0, passable.size - 1, SAMPLES + 2).astype(np.int64)[1:-1]].tolist():
         cost_grid.grow(root, cost, parent)
-        corridor_growth.mark_levels(parent, cost_grid.stride, LEAST, level)
+        corridor_growth.mark_levels(parent, cost_grid.padded[1], LEAST, level, children, traffic)
     return CorridorGraph(level)

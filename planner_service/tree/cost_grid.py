@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import cell_costs as kernels
+from planner_service.kernels import repair, route_walk
 from planner_service.kernels.layout import (
     RULE_FOUR,
     RULE_OCTILE,
@@ -19,8 +21,8 @@ from planner_service.kernels.layout import (
     SQRT2_EXACT,
     Buckets,
     PaddedGrid,
+    step_offsets,
 )
-from planner_service.kernels.route_walk import walk_routes
 from planner_service.tree.growth import grow_tree
 from shared_map.arrays import Floats
 from swarm.config.scenario import PlannerConfig
@@ -62,8 +64,16 @@ def check_pace(grid: GridSpec, pace: NDArray[np.float32]) -> None:
         raise ValueError("pace must be C-contiguous")
 
 
+def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
+    """Two float32 numbers, given as integers of the same bits."""
+    lowest, highest = struct.unpack("=2f", struct.pack("=2i", *bits))
+    return lowest, highest
+
+
 _FEWEST, _MOST = 1 << 9, 1 << 14
 """Buckets of a repair."""
+_SMALL = 1 << 20
+"""Padded cells of a small map."""
 
 
 class Walks(NamedTuple):
@@ -105,8 +115,16 @@ class CostGrid:
         """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
         self.highest_cell_cost = 0.0
         """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
-        self.padded: PaddedGrid = (self.cell_cost, self.stride, self.rule, self.corners)
+        self.padded: PaddedGrid = (
+            *(self.cell_cost, step_offsets(self.stride)),
+            *(self.stride, self.rule, self.corners),
+        )
         """The same for kernels."""
+        self._moves = route_walk.moves_of(self.stride, self.rule)
+        self._lanes = route_walk.make_lanes()
+        """Scratch of `walk`, which makes it longer where routes are."""
+        self._repair_scratch: repair.Scratch | None = None
+        """Made by the first repair of a small map."""
 
     @property
     def buckets(self) -> Buckets:
@@ -114,6 +132,16 @@ class CostGrid:
         longest = self.highest_cell_cost * self.diagonal
         count = math.ceil(longest / self.lowest_cell_cost) + 2
         return self.lowest_cell_cost, min(max(count, _FEWEST), _MOST)
+
+    @property
+    def repair_scratch(self) -> repair.Scratch:
+        """Room for a repair. Kept where it is small: there, to get new pages takes longer than many a repair."""
+        if self._repair_scratch is not None:
+            return self._repair_scratch
+        scratch = repair.make_scratch(self.size, self.stride, _MOST)
+        if self.size <= _SMALL:
+            self._repair_scratch = scratch
+        return scratch
 
     def check_root(self, cell: int) -> None:
         """Raises OutsideGridError unless the cell is one of the grid, ValueError where it is lethal: no tree leads
@@ -145,8 +173,8 @@ class CostGrid:
         self._find_range()
 
     def _find_range(self) -> None:
-        lowest, highest = kernels.cell_cost_range(self.cell_cost)
-        self.lowest_cell_cost, self.highest_cell_cost = float(lowest), float(highest)
+        bits = kernels.cell_cost_range(self.cell_cost.view(np.int32))
+        self.lowest_cell_cost, self.highest_cell_cost = floats_of_bits(bits)
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
         """Take what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative."""
@@ -235,7 +263,18 @@ class CostGrid:
         """
         if not 0 <= root < self.size:
             raise OutsideGridError(f"padded root {root} must lie in 0..{self.size - 1}")
-        return Walks(*walk_routes(cell_cost, parent, self.stride, self.rule, root, starts, most, self.grid.cells))
+        count = starts.size
+        ends, driven = np.empty(count, np.int64), np.empty(count, np.float64)
+        walks = ends, driven, np.empty(count, np.int64), np.empty(count, np.int64)
+        longest = (most, self.grid.cells)
+        walk = route_walk.walk_routes
+        steps = walk(cell_cost, parent, self._moves, root, starts, longest, walks, self._lanes, True)
+        while steps < 0:
+            self._lanes = route_walk.longer(self._lanes)
+            steps = walk(cell_cost, parent, self._moves, root, starts, longest, walks, self._lanes, False)
+        directions = np.empty(steps, np.uint8)
+        route_walk.join_routes(walks, self._lanes, directions)
+        return Walks(directions, *walks)
 
     def passable(self, cell: int) -> bool:
         """Whether a cell of the grid can be entered. Raises OutsideGridError where it is none of the grid."""

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import corridor_growth, route_walk
 from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
-from planner_service.kernels.layout import NONE, Labels
+from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
 from planner_service.tree.corridors import INNER, CorridorGraph
-from planner_service.tree.cost_grid import Cells, Changes, CostGrid
+from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
 from planner_service.tree.growth import FINE, grow_tree
 from shared_map.arrays import Floats
 from swarm.errors import OutsideGridError
@@ -102,11 +102,16 @@ class CostToGoTree:
         box = self._box(window)
         self.exact = False
         inner = min(max(window.row1 - window.row0, window.col1 - window.col0), INNER)
-        found = corridor_growth.grow_corridors(
-            self.cost_grid.padded, labels, corridors.level, self._stamps_now(), self._now, box, inner
-        )
+        heap, waiting, visited = corridor_growth.make_heap(box), -1, 0
+        while waiting:
+            more, waiting = corridor_growth.grow_corridors(
+                *(self.cost_grid.padded, labels, corridors.level, self._stamps_now(), self._now),
+                *(box, inner, heap, waiting, self._trail),
+            )
+            visited += more
+            heap = corridor_growth.larger_heap(heap)
         self._ways_changed()
-        return int(found)
+        return visited
 
     def move(self, root: int, window: Window) -> int:
         """Lead to a new root, by growing only a window that holds it and the old root.
@@ -123,9 +128,10 @@ class CostToGoTree:
         width = col1 - col0 + 2
         start, old = self._in_window(root, window), self._in_window(self.root, window)
         part = np.empty((row1 - row0 + 2) * width, np.float32)
-        lowest, highest = cut_window(grid.cell_cost, grid.stride, box, part)
+        bits = cut_window(grid.cell_cost.view(np.int32), grid.stride, box, part.view(np.int32))
         cost = np.empty_like(part)
-        grow_tree((part, width, grid.rule, grid.corners), float(lowest), float(highest), start, cost, None)
+        padded: PaddedGrid = part, step_offsets(width), width, grid.rule, grid.corners
+        grow_tree(padded, *floats_of_bits(bits), start, cost, None)
         way = float(cost[old])
         if not way < math.inf:
             return 0
@@ -135,9 +141,7 @@ class CostToGoTree:
         # A neighbour of a cell that got cheaper may lead there now.
         around = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
         new_root = grid.pad(root)
-        point_to_parents(
-            grid.cell_cost, self.cost, grid.stride, grid.rule, grid.corners, new_root, around, self.parent
-        )
+        point_to_parents(grid.padded, self.cost, new_root, around, self.parent)
         self.exact = self.exact and root == self.root
         self.root = root
         self._ways_changed()
@@ -170,7 +174,10 @@ class CostToGoTree:
         if grid.directed:
             return -1
         most = _most_repaired(grid.grid.cells)
-        visited, highest = repair(grid.padded, self._labels, changes.cells, changes.before, grid.buckets, most)
+        visited, highest = repair(
+            *(grid.padded, self._labels, changes.cells, changes.before),
+            *(grid.buckets, most, grid.repair_scratch),
+        )
         self.reach = max(self.reach, float(highest))
         self._ways_changed()
         return int(visited)
@@ -184,7 +191,12 @@ class CostToGoTree:
         if not self.exact:
             grid = self.cost_grid
             stamps = self._stamps_now()
-            corridor_growth.tighten(grid.cell_cost, grid.stride, grid.rule, self._labels, stamps, self._now, cells)
+            corridor_growth.tighten(grid.padded, self._labels, stamps, self._now, cells, self._trail)
+
+    @property
+    def _trail(self) -> NDArray[np.uint32]:
+        """Scratch that holds the longest way."""
+        return np.empty(self.cost_grid.size, np.uint32)
 
     def _stamps_now(self) -> NDArray[np.uint8]:
         if self._stamps is None:
@@ -200,7 +212,7 @@ class CostToGoTree:
 
     def relabel(self) -> None:
         """Make every cost what is really driven along the parents, and the offset 0."""
-        route_walk.relabel(self.cost_grid.padded, self._labels)
+        route_walk.relabel(self.cost_grid.padded, self._labels, self._trail)
         self.offset = 0.0
 
     @property

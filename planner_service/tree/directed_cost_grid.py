@@ -44,7 +44,9 @@ class DirectedCostGrid(CostGrid):
         dearest = self.highest_cell_cost * self.diagonal * self._highest
         width = max(self.lowest_cell_cost * _WIDTH, dearest / (_BUCKETS - 4))
         count = 1 << math.ceil(math.log2(dearest / width + 3))
-        return float(grow_directed(self.padded, (cost, parent, root), self._climbs, (width, count)))
+        links, first = np.empty((self.size, 2), np.int32), np.empty(count, np.int32)
+        labels = (cost, parent, root)
+        return float(grow_directed(self.padded, labels, self._climbs, (width, count), links, first))
 
     def walk(
         self, parent: NDArray[np.uint8], root: int, starts: NDArray[np.int64], most: int, cell_cost: Floats

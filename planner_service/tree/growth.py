@@ -7,10 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.bucket_queue import grow_by_buckets
+from planner_service.kernels import bucket_queue, radix_heap
 from planner_service.kernels.layout import RULE_OCTILE, SQRT2_EXACT, TOO_FINE, PaddedGrid
 from planner_service.kernels.parents import point_to_parents
-from planner_service.kernels.radix_heap import grow_by_radix_heap
 from shared_map.arrays import Floats
 
 MAX_RATIO = 1 << 12
@@ -31,20 +30,22 @@ def grow_tree(
     lowest, highest  bounds of the finite cell costs, s
     cost, parent     padded, written whole; None where parents are not wanted
     """
-    cell_cost, stride, rule, corners = padded
+    cell_cost, _, stride, rule, _ = padded
     size = cell_cost.size
     box = (0, 0, size // stride - 2, stride - 2)
     longest = highest * (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
     if longest <= min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)) * lowest:
         width = np.float32(lowest * 0.98)
         count = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
-        last = grow_by_buckets(cell_cost, cost, stride, root, rule, corners, float(width), count)
+        scratch = bucket_queue.make_scratch(size, rule, count)
+        last = bucket_queue.grow_by_buckets(padded, cost, root, (float(width), count), scratch)
         if last != TOO_FINE:
             if parent is not None:
-                point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent)
+                point_to_parents(padded, cost, root, box, parent)
             return float((last + 1) * width)
     parents = np.empty(size, np.uint8) if parent is None else parent
-    reach = float(grow_by_radix_heap(padded, (cost, parents, root), lowest))
+    labels = (cost, parents, root)
+    reach = float(radix_heap.grow_by_radix_heap(padded, labels, lowest, radix_heap.make_scratch(size, rule)))
     if parent is not None and reach <= FINE * lowest:
-        point_to_parents(cell_cost, cost, stride, rule, corners, root, box, parent)
+        point_to_parents(padded, cost, root, box, parent)
     return reach

@@ -14,7 +14,7 @@ from support import slow_twins as naive
 from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
 from support.planner_strategies import RULES, random_pace
 
-from planner_service.kernels.radix_heap import grow_by_radix_heap
+from planner_service.kernels import radix_heap
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.growth import MAX_RATIO, grow_tree
 from swarm.config.scenario import PlannerConfig
@@ -60,7 +60,8 @@ def test_bucket_queue_and_radix_heap_give_the_same_costs_to_the_last_bit(rules: 
         longest = ground.highest_cell_cost * ground.diagonal
         assert longest <= MAX_RATIO * ground.lowest_cell_cost  # so that it is buckets that grow it
         grow_tree(ground.padded, ground.lowest_cell_cost, ground.highest_cell_cost, root, by_buckets, None)
-        grow_by_radix_heap(ground.padded, (by_heap, parent, root), ground.lowest_cell_cost)
+        scratch = radix_heap.make_scratch(ground.size, ground.rule)
+        radix_heap.grow_by_radix_heap(ground.padded, (by_heap, parent, root), ground.lowest_cell_cost, scratch)
         np.testing.assert_array_equal(by_heap, by_buckets)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from support import slow_twins as naive
@@ -17,11 +18,13 @@ from swarm.wire.routes import RouteStatus
 class Play:
     """A tree, the map it is told of, and the job that a worker may have of it."""
 
-    def __init__(self, pace: np.ndarray, config: PlannerConfig) -> None:
+    def __init__(
+        self, pace: np.ndarray, config: PlannerConfig, all_kernels: Callable[[], bool] = lambda: True
+    ) -> None:
         self.pace = pace
         self.config = config
         self.grid = GridSpec(*pace.shape, 1.0)
-        self.tree = TargetTree(self.grid, config)
+        self.tree = TargetTree(self.grid, config, None, all_kernels)
         self.version = 0
         self.target = int(np.flatnonzero(np.isfinite(pace))[0])
         self.grown: GrownTree | None = None

@@ -262,7 +262,7 @@ class _Racer:
         """Strategies that grow the whole tree now and then do so once now, one target after the other, or all would
         in the same frame ever after."""
         # The row of `auto` is that of the stage in which it has windows.
-        row = row_of(self._strategy, "rotate", directed=False)
+        row = row_of(self._strategy, "rotate", only_whole=False)
         if row.on_move is OnMove.WHOLE_TREE:
             return
         grows = row.grows_whole_trees

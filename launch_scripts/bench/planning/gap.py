@@ -13,7 +13,7 @@ from launch_scripts.bench.planning.chase import Plan, Tally, chase
 from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, label_of, number, percent, table
 from launch_scripts.world.walks import FLEEING, STANDING
-from planner_service.warm_up import warm_up
+from planner_service.kernel_build import load_all
 from swarm.config.scenario import PlannerConfig, Strategy, Walk
 
 WALKS: tuple[Walk, ...] = tuple(walk for walk in get_args(Walk) if walk not in STANDING)
@@ -37,7 +37,7 @@ def run_gap(
     speed  of vehicles in cells a frame; None: 1 after a target that flees, else 0
     """
     stage = Field(make_field(dem, 512, seed))
-    warm_up()
+    load_all()
     rows: list[dict[str, Any]] = []
     drawn: dict[Walk, dict[Strategy, Tally]] = {}
     for n, walk in enumerate(walks):

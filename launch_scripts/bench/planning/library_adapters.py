@@ -42,10 +42,8 @@ def breadth_first(pace: Pace, edge: Edge) -> Tool:
     from planner_service.kernels.bucket_queue import breadth_first as search
 
     cost_grid = _our_tree(pace, edge).cost_grid
-    cost = np.empty(cost_grid.size, np.float32)
-    return Tool(
-        lambda root: search(cost_grid.cell_cost, cost, cost_grid.stride, cost_grid.pad(root)), lambda *_: None
-    )
+    cost, queue = np.empty(cost_grid.size, np.float32), np.empty(cost_grid.size, np.uint32)
+    return Tool(lambda root: search(cost_grid.padded, cost, cost_grid.pad(root), queue), lambda *_: None)
 
 
 def _our_tree(pace: Pace, edge: Edge) -> Any:

@@ -16,7 +16,7 @@ from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.chase import Plan, chase
 from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, label_of, number, percent, table, times
-from planner_service.warm_up import warm_up
+from planner_service.kernel_build import load_all
 from swarm.config.scenario import PlannerConfig, Strategy
 
 PAPERS: Strategy = "variable_range+multi_resolution"
@@ -37,7 +37,7 @@ def run_paper(
 ) -> dict[str, Any]:
     """Table 1: full growths, the paper's combination, rotation. Table 2: all strategies at its last row."""
     stage = Field(make_field(field, size, seed))
-    warm_up()
+    load_all()
     table_1: list[dict[str, Any]] = []
     table_2: list[dict[str, Any]] = []
     for done, (targets, vehicles) in enumerate(TABLE_1):

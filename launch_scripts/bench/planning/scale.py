@@ -13,7 +13,7 @@ from launch_scripts.bench.machine import machine
 from launch_scripts.bench.planning.chase import Plan, chase
 from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, narrow_label_of, number, percent, table
-from planner_service.warm_up import warm_up
+from planner_service.kernel_build import load_all
 from swarm.config.scenario import PlannerConfig, Strategy
 
 Point = tuple[int, int, int]
@@ -50,7 +50,7 @@ def run_scale(
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Measures a row per point and strategy, with at most `seconds` of CPU time each."""
-    warm_up()
+    load_all()
     rows: list[dict[str, Any]] = []
     entrants = {name: PlannerConfig(strategy=name) for name in strategies}
     stage: Field | None = None

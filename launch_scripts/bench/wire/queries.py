@@ -44,10 +44,10 @@ _SESSIONS = 10
 
 def planner_peer(network: NetworkConfig, pipe: Connection) -> None:
     """A planner on level terrain of 512 x 512 cells, and a raw queryable which answers with given bytes."""
+    from planner_service.kernel_build import load_all
     from planner_service.service import PlannerService
-    from planner_service.warm_up import warm_up
 
-    warm_up()
+    load_all()
     clock, inbox = MonotonicClock(), Inbox()
     terrain = terrain_of_pace(np.random.default_rng(1).uniform(0.1, 1.0, (_SIDE, _SIDE)).astype(np.float32))
     scenario = Scenario(network=network, targets=(TargetConfig(name=_TARGET),))

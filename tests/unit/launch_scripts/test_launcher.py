@@ -15,8 +15,9 @@ import pytest
 from support.processes import eventually, session_of
 
 from launch_scripts.launcher.child import ExitReason
-from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm, WarmUp
+from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm
 from launch_scripts.launcher.up import UpOptions, _StopAsked, run_swarm
+from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.process_table import ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
 from swarm.errors import ConfigError
@@ -27,7 +28,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
 @pytest.fixture(scope="module", autouse=True)
 def _forkserver() -> None:
-    warm_up = WarmUp([])
+    warm_up = WarmUp(None)
     warm_up.begin()
     eventually(lambda: warm_up.done(0.05), 20)
 
@@ -293,7 +294,8 @@ def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Pat
 _LAUNCHER = """
 import signal, sys, time
 from pathlib import Path
-from launch_scripts.launcher.local_swarm import LocalSwarm, WarmUp
+from launch_scripts.launcher.local_swarm import LocalSwarm
+from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.runtime.role import RoleSetup
@@ -301,7 +303,7 @@ from swarm.runtime.role import RoleSetup
 asked = []
 signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
 folder = Path(sys.argv[1])
-warm_up = WarmUp([])
+warm_up = WarmUp(None)
 warm_up.begin()
 while not warm_up.done(0.05): pass
 specs = [ProcessSpec("planner", "t0", "support.dummy_roles:quiet"), ProcessSpec("agent", "a0", sys.argv[2])]

@@ -13,21 +13,21 @@ import pytest
 from planner_service.kernels import compile as kernel_compile
 
 _HELPER = """
-from kernels.compile import njit
+from kernels.compile import helper
 
 FACTOR = 3
 
 
-@njit
+@helper
 def scaled(x):
     return x * FACTOR
 """
 _KERNEL = """
-from kernels.compile import njit
+from kernels.compile import kernel
 from kernels.helper import scaled
 
 
-@njit
+@kernel("(i8,)")
 def f(x):
     return scaled(x)
 """

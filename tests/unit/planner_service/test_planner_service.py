@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from support.planner_swarm import COLS, GRID, RES, ROWS, Swarm, driven_s, flat, optimum_s, rough
 
 from launch_scripts.world.service import TargetsService
+from planner_service.kernel_build import load_all
 from planner_service.planner import MOST_ROUTES, Planner
 from planner_service.target_tree import TargetTree
-from planner_service.warm_up import warm_up
 from shared_map.cost_map import CostMap
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
@@ -42,7 +42,7 @@ STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
-    warm_up()
+    load_all()
 
 
 def test_before_any_pose_a_route_is_no_target() -> None:

@@ -54,7 +54,7 @@ def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(
 def test_where_uphill_is_not_downhill_every_strategy_grows_whole_trees(
     strategy: Strategy, stage: table.Stage
 ) -> None:
-    row = row_of(strategy, stage, directed=True)
+    row = row_of(strategy, stage, only_whole=True)
     assert row.on_move is OnMove.WHOLE_TREE
     assert not row.thins_far_cells
-    assert row.renews_loose_bounds == row_of(strategy, stage, directed=False).renews_loose_bounds
+    assert row.renews_loose_bounds == row_of(strategy, stage, only_whole=False).renews_loose_bounds

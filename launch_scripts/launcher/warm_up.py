@@ -1,0 +1,164 @@
+"""What a run's processes share is loaded once, by a forkserver, and kernels that no process has compiled yet are
+compiled beside it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+import time
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerProcess
+
+from launch_scripts.launcher.child import wait_for_launcher
+from launch_scripts.launcher.local_swarm import without_main
+from launch_scripts.launcher.preload import start_forkserver
+
+_BACKGROUND = 5
+"""Niceness of what compiles kernels that no first route needs."""
+
+
+class WarmUp:
+    """Starts the forkserver, waits on a thread until it has loaded everything, and compiles the kernels that are
+    missing.
+
+    preload  module that the forkserver imports
+    planners whether planners are to run; directed: on a terrain where uphill is not downhill
+    """
+
+    def __init__(self, preload: str | None, planners: bool = False, directed: bool = False) -> None:
+        start_forkserver(preload)
+        self._planners = planners
+        self._directed = directed
+        self._context = multiprocessing.get_context("forkserver")
+        self._failure: BaseException | None = None
+        self._loaded = threading.Event()
+        self._ready = threading.Event()
+        self._all: set[str] = set()
+        """Names of the kernels that were missing; `_first` and `_left`: of those for a first route, and of all,
+        that still are."""
+        self._first: set[str] = set()
+        self._left: set[str] = set()
+        self._builders: list[ForkServerProcess] = []
+        self._lock = threading.Lock()
+        self._closed = False
+        """Set for good by `close`: no builder is started any more. The lock guards both."""
+        self._began_s = time.monotonic()
+        self._told = False
+        self._thread = threading.Thread(target=self._run, name="warm-up", daemon=True)
+
+    def begin(self) -> None:
+        self._thread.start()
+
+    def done(self, timeout_s: float) -> bool:
+        """Whether processes may be started: all is loaded, and what a first route needs is compiled."""
+        done = self._ready.wait(timeout_s)
+        if self._failure is not None:
+            raise self._failure
+        return done
+
+    @property
+    def progress(self) -> str:
+        """How far it is, in a sentence."""
+        took_s = time.monotonic() - self._began_s
+        if not self._all:
+            return f"loading kernels, {took_s:.0f} s"
+        return (
+            f"compiling kernels, once: {len(self._all) - len(self._left)} of {len(self._all)}, "
+            f"{len(self._first)} to go before the first route, {took_s:.0f} s"
+        )
+
+    def news(self) -> str | None:
+        """A sentence once the last kernel is compiled, if any had to be."""
+        if self._told or not self._all or self._left:
+            return None
+        self._told = True
+        return f"all {len(self._all)} kernels are compiled"
+
+    def close(self) -> None:
+        """End what still compiles. They hear no other signal, and at the launcher's exit Python waits for them."""
+        with self._lock:
+            self._closed = True
+            for builder in self._builders:
+                builder.kill()
+
+    def _run(self) -> None:
+        try:
+            self._probe()
+            self._ready_if_first()
+            self._compile()
+        except BaseException as error:
+            self._failure = error
+        self._ready.set()
+
+    def _probe(self) -> None:
+        """The forkserver answers once it has loaded everything; its child tells what is missing."""
+        found, tell = self._context.Pipe(duplex=False)
+        self._start(_find_missing if self._planners else _find_nothing, tell, self._directed).join()
+        tell.close()
+        first, later = found.recv()
+        self._first, self._left, self._all = set(first), {*first, *later}, {*first, *later}
+
+    def _ready_if_first(self) -> None:
+        if not self._first:
+            self._ready.set()
+
+    def _compile(self) -> None:
+        if not self._left:
+            return
+        pipes: list[Connection] = []
+        for _ in range(min(len(os.sched_getaffinity(0)), 8)):
+            compiled, tell = self._context.Pipe(duplex=False)
+            with self._lock:
+                if self._closed:
+                    return
+                self._builders.append(self._start(_build, tell, self._directed))
+            tell.close()
+            pipes.append(compiled)
+        while pipes:
+            for pipe in wait(pipes):
+                assert isinstance(pipe, Connection)
+                try:
+                    name = pipe.recv()
+                except EOFError:  # it has ended; should it have failed, planners see to it themselves
+                    pipes.remove(pipe)
+                    continue
+                self._first.discard(name)
+                self._left.discard(name)
+                self._ready_if_first()
+
+    def _start(self, target: object, *arguments: object) -> ForkServerProcess:
+        with without_main():
+            process = self._context.Process(target=target, args=arguments, daemon=True)  # type: ignore[arg-type]
+            process.start()
+        return process
+
+
+def _find_nothing(tell: Connection, _: bool) -> None:
+    tell.send(((), ()))
+
+
+def _find_missing(tell: Connection, directed: bool) -> None:
+    """Tell the names of kernels that are not compiled: of those for a first route, and of the others."""
+    from planner_service.kernel_build import LATER, can_build, first_kernels, missing, name_of
+
+    if not can_build():
+        tell.send(((), ()))
+        return
+    first, later = missing(first_kernels(directed)), missing(LATER)
+    tell.send((list(map(name_of, first)), list(map(name_of, later))))
+
+
+def _build(tell: Connection, directed: bool) -> None:
+    """Compile what is missing, together with the other builders."""
+    from planner_service.kernel_build import LATER, build, first_kernels, name_of
+
+    threading.Thread(target=_end_with_launcher, daemon=True).start()
+    for kernels, niceness in ((first_kernels(directed), 0), (LATER, _BACKGROUND)):
+        os.nice(niceness)
+        build(kernels, lambda kernel: tell.send(name_of(kernel)))
+
+
+def _end_with_launcher() -> None:
+    wait_for_launcher()
+    os._exit(0)

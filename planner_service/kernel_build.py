@@ -1,0 +1,215 @@
+"""Compiling kernels: what a first route needs before the rest, by several processes, into numba's cache on disk.
+
+    python -m planner_service.kernel_build
+
+is one builder. Any number of them, started by whomever, share the work: each claims a kernel by a lock on a file
+beside numba's, compiles it and writes it there, where planners find it. A builder that dies leaves its claim.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from planner_service.kernels import (
+    bucket_queue,
+    cell_costs,
+    corridor_growth,
+    directed_growth,
+    lower_bounds,
+    parents,
+    radix_heap,
+    repair,
+    route_walk,
+)
+from planner_service.kernels.compile import cache_folder, is_loaded, is_on_disk, load
+
+Kernel = Any
+"""What `kernels.compile.kernel` makes; numba has no types."""
+
+FIRST: tuple[Kernel, ...] = (
+    route_walk.walk_routes,
+    bucket_queue.grow_by_buckets,
+    parents.point_to_parents,
+    radix_heap.grow_by_radix_heap,
+    route_walk.join_routes,
+    cell_costs.pad_cell_costs,
+    route_walk.price_routes,
+    cell_costs.changed_cells,
+    route_walk.find_starts,
+    lower_bounds.bound_by_exact_cost,
+    cell_costs.cell_cost_range,
+)
+"""Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
+takes longest comes first, so that builders end together."""
+
+LATER: tuple[Kernel, ...] = (
+    repair.repair,
+    corridor_growth.grow_corridors,
+    lower_bounds.bound_by_heuristic,
+    cell_costs.cut_window,
+    cell_costs.merge_window,
+    cell_costs.find_rim,
+    corridor_growth.tighten,
+    corridor_growth.mark_levels,
+    route_walk.relabel,
+)
+"""For windows, repairs and corridors, which save growing whole trees."""
+
+DIRECTED: tuple[Kernel, ...] = (directed_growth.grow_directed,)
+"""To grow trees where uphill is not downhill."""
+
+_POLL_S = 0.1
+_BUILDERS = "builders.lock"
+"""Each builder holds this lock shared, so that others see that one is at work."""
+
+
+def first_kernels(directed: bool) -> tuple[Kernel, ...]:
+    """What a planner's first route takes. directed: its terrain is one where uphill is not downhill."""
+    return (*DIRECTED, *FIRST) if directed else FIRST
+
+
+def name_of(kernel: Kernel) -> str:
+    name: str = kernel.__name__
+    return name
+
+
+def missing(kernels: Iterable[Kernel]) -> list[Kernel]:
+    """Those that this process cannot call yet without compiling."""
+    return [kernel for kernel in kernels if not load(kernel, compiling=False)]
+
+
+def can_build() -> bool:
+    """Whether what a builder compiles can be found by others."""
+    return cache_folder() is not None
+
+
+def load_what_is_there() -> None:
+    """Make ready what is on disk; or all, compiled here, where nothing can be kept."""
+    if can_build():
+        missing((*FIRST, *LATER, *DIRECTED))
+    else:
+        load_all()
+
+
+def load_all() -> None:
+    """Make all kernels ready in this process, compiling them here where they are not on disk."""
+    for kernel in (*FIRST, *LATER, *DIRECTED):
+        load(kernel)
+
+
+def build(kernels: Iterable[Kernel], tell: Callable[[Kernel], None] = lambda _: None) -> None:
+    """Compile what no other builder has compiled or is compiling; then wait for these. Tells each."""
+    folder = cache_folder()
+    assert folder is not None
+    waiting = list(kernels)
+    with _locked(folder / _BUILDERS, fcntl.LOCK_SH, remove=False):
+        for how in (fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_EX):
+            for kernel in list(waiting):
+                with _locked(folder / f"{name_of(kernel)}.lock", how) as mine:
+                    if mine and not is_on_disk(kernel):
+                        load(kernel)
+                if is_on_disk(kernel):
+                    waiting.remove(kernel)
+                    tell(kernel)
+
+
+@contextlib.contextmanager
+def _locked(path: Path, how: int, remove: bool = True) -> Iterator[bool]:
+    """Whether the lock was got. A file that is removed leaves two processes with a lock each, at worst."""
+    with path.open("wb") as file:
+        try:
+            fcntl.flock(file, how)
+        except BlockingIOError:
+            yield False
+            return
+        yield True
+        if remove:
+            path.unlink(missing_ok=True)
+
+
+def is_building() -> bool:
+    """Whether a builder is at work."""
+    folder = cache_folder()
+    assert folder is not None
+    with _locked(folder / _BUILDERS, fcntl.LOCK_EX | fcntl.LOCK_NB, remove=False) as alone:
+        return not alone
+
+
+class KernelLoader:
+    """The kernels of one planner, which are compiled elsewhere.
+
+    directed  its terrain is one where uphill is not downhill
+    whole     the first route waits for all kernels: where growing a whole tree takes long, none should be grown
+              only because another kernel is not there yet
+    """
+
+    def __init__(self, directed: bool, whole: bool) -> None:
+        first = first_kernels(directed)
+        self._kernels = (*first, *LATER)
+        self._first = self._kernels if whole else first
+        self._missing = self._kernels
+        self._asked_s = -math.inf
+        self.builders: list[subprocess.Popen[bytes]] = []
+        """Those that were started because nobody was compiling."""
+        self._thread = threading.Thread(target=self._load_rest, name="load-kernels", daemon=True)
+
+    @property
+    def complete(self) -> bool:
+        """Whether all may be called. Once true, it stays so."""
+        return not self._missing
+
+    def load_first(self, tell: Callable[[str], None] = lambda _: None) -> None:
+        """Wait until a first route can be planned; what comes after it is loaded as it is there. `tell` is handed a
+        sentence now and then."""
+        if not can_build():
+            load_all()
+        began_s = told_s = time.monotonic()
+        while waiting := missing(self._first):
+            self._have_built()
+            now_s = time.monotonic()
+            if now_s - told_s > 2.0:
+                told_s = now_s
+                tell(f"compiling kernels: {len(waiting)} of {len(self._first)} left, {now_s - began_s:.0f} s")
+            time.sleep(_POLL_S)
+        self._missing = tuple(missing(self._kernels))
+        if self._missing:
+            self._thread.start()
+
+    def wait(self) -> None:
+        """Wait until all may be called."""
+        if self._missing:
+            self._thread.join()
+
+    def _load_rest(self) -> None:
+        while self._missing:
+            self._have_built()
+            time.sleep(2 * _POLL_S)
+            self._missing = tuple(missing(self._missing))
+
+    def _have_built(self) -> None:
+        """See to it that somebody compiles what is missing."""
+        now_s = time.monotonic()
+        if now_s - self._asked_s > 20.0 and not is_building():
+            self._asked_s = now_s
+            command = [sys.executable, "-m", "planner_service.kernel_build"]
+            self.builders = [subprocess.Popen(command) for _ in range(min(len(os.sched_getaffinity(0)), 8))]
+
+
+def main() -> None:
+    """Compile all kernels, those of a first route before the others."""
+    os.nice(5)
+    build([kernel for kernel in (*FIRST, *LATER, *DIRECTED) if not is_loaded(kernel)])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,150 @@
+"""Builders share the work, planners find what they compiled, and no kernel is forgotten."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from planner_service import kernel_build
+from planner_service.kernel_build import DIRECTED, FIRST, LATER, KernelLoader, name_of
+from planner_service.kernels.compile import KERNELS
+
+
+def test_every_kernel_of_a_planner_is_built() -> None:
+    built = [name_of(kernel) for kernel in (*FIRST, *LATER, *DIRECTED)]
+    assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first"})
+
+
+_KERNELS = "\n\n\n".join(f'@kernel("(i8,)")\ndef k{n}(x):\n    return x + {n}' for n in range(6))
+_SCRIPT = f"""
+import os, sys, time
+from planner_service.kernel_build import build, is_building
+from planner_service.kernels import compile
+from planner_service.kernels.compile import is_loaded, kernel, load
+{_KERNELS}
+all = [k0, k1, k2, k3, k4, k5]
+assert compile.cache_folder() is not None
+"""
+_SEVERAL = (
+    _SCRIPT
+    + """
+assert not is_building()
+children = []
+for n in range(3):
+    if not (pid := os.fork()):
+        told = []
+        build(all, told.append)
+        assert sorted(each.__name__ for each in told) == [f"k{n}" for n in range(6)], told
+        assert not any(load(each, compiling=False) is False for each in all)
+        compiled = sum(sum(each.stats.cache_misses.values()) for each in all)
+        print(f" {compiled} ", end="", flush=True)  # in one piece
+        os._exit(0)
+    children.append(pid)
+for pid in children:
+    assert os.waitpid(pid, 0)[1] == 0
+assert not any(map(is_loaded, all)) and all[5](1) == 6
+assert sum(all[5].stats.cache_hits.values()) == 1
+"""
+)
+_KILLED = (
+    _SCRIPT
+    + """
+import signal
+slow = compile.load
+import planner_service.kernel_build as kb
+if not (pid := os.fork()):
+    kb.load = lambda each: time.sleep(60)
+    build(all)
+while not is_building():
+    time.sleep(0.01)
+os.kill(pid, signal.SIGKILL)
+os.waitpid(pid, 0)
+assert not is_building()
+build(all)
+print(sum(map(is_loaded, all)))
+"""
+)
+
+
+def run(tmp_path: Path, script: str) -> list[str]:
+    file = tmp_path / "several.py"
+    file.write_text(textwrap.dedent(script))
+    here = Path(kernel_build.__file__).parents[1]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(here)}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", str(file)], env=environment, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.split()
+
+
+def test_three_builders_compile_each_kernel_once_and_all_of_them_see_each(tmp_path: Path) -> None:
+    misses = run(tmp_path, _SEVERAL)
+    assert len(misses) == 3
+    assert sum(map(int, misses)) == 6
+
+
+def test_what_a_killed_builder_had_claimed_is_compiled_by_another(tmp_path: Path) -> None:
+    assert run(tmp_path, _KILLED) == ["6"]
+
+
+class Disk:
+    """Stands for what is compiled: names that can be loaded."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.there: set[str] = set()
+        self.started = 0
+        self.building = False
+        monkeypatch.setattr(kernel_build, "load", lambda each, compiling=True: name_of(each) in self.there)
+        monkeypatch.setattr(kernel_build, "is_building", lambda: self.building)
+        monkeypatch.setattr(kernel_build, "can_build", lambda: True)
+        monkeypatch.setattr(kernel_build.subprocess, "Popen", self.start)
+        monkeypatch.setattr(kernel_build.time, "sleep", self.sleep)
+        self.coming: list[str] = []
+
+    def start(self, command: list[str]) -> None:
+        assert command[1:] == ["-m", "planner_service.kernel_build"]
+        self.started += 1
+        self.building = True
+
+    def sleep(self, _: float) -> None:
+        if self.coming:
+            self.there.add(self.coming.pop(0))
+
+
+def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    disk = Disk(monkeypatch)
+    disk.coming = [name_of(kernel) for kernel in FIRST]
+    loader = KernelLoader(directed=False, whole=False)
+    loader.load_first()
+    assert not disk.coming
+    assert disk.started >= 1, "nobody was building"
+    assert not loader.complete
+    disk.coming = [name_of(kernel) for kernel in LATER]
+    loader.wait()
+    assert loader.complete
+
+
+def test_nobody_starts_builders_where_some_are_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(monkeypatch)
+    disk.building = True
+    disk.coming = [name_of(kernel) for kernel in (*FIRST, *LATER)]
+    loader = KernelLoader(directed=False, whole=True)
+    loader.load_first()
+    assert loader.complete
+    assert not disk.started
+
+
+def test_a_directed_terrain_waits_for_the_kernel_that_grows_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = Disk(monkeypatch)
+    disk.coming = [*map(name_of, FIRST), *map(name_of, LATER), *map(name_of, DIRECTED)]
+    loader = KernelLoader(directed=True, whole=False)
+    loader.load_first()
+    assert not disk.coming
