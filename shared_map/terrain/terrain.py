@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.arrays import Bytes, Floats, open_array, save_array
 from shared_map.terrain.hidden import true_ground
 from shared_map.terrain.layers import (
     TerrainClass,
@@ -266,9 +266,7 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _META).unlink(missing_ok=True)
         for name, array in arrays.items():
-            path = folder / f"{name}.npy"
-            path.unlink(missing_ok=True)  # a process that has the old one mapped keeps it
-            np.save(path, np.ascontiguousarray(array), allow_pickle=False)
+            save_array(folder / f"{name}.npy", array)  # a process that has the old one mapped keeps it
         partial = folder / f"{_META}.part"
         partial.write_text(json.dumps(meta, indent=1), encoding="utf-8")
         partial.rename(folder / _META)
@@ -336,7 +334,7 @@ def _read_meta(folder: Path) -> dict[str, Any] | None:
 def _read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any]) -> NDArray[Any]:
     path = folder / f"{name}.npy"
     try:
-        array: NDArray[Any] = np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+        array = open_array(path)
     except (OSError, ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
         raise TerrainError(f"prepared terrain {path} is unreadable ({error}); delete the folder") from error
     if array.shape != tuple(shape) or array.dtype != dtype:
