@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import closing
 
+from planner_service.prepared_costs import prepared_costs
 from planner_service.service import PlannerService
 from planner_service.warm_up import warm_up
 from shared_map.terrain.terrain import load_terrain
@@ -26,13 +27,14 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = load_terrain(setup)
     warm_up()
+    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner)
     clock = MonotonicClock()
     inbox = Inbox()
     with (
         open_bus(scenario.network, patient=True) as bus,
         closing(ThreadWorker("grow-tree", inbox, clock)) as worker,
     ):
-        service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
+        service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns, prepared)
         process = Process(service, inbox, clock, scenario.planner.tick_hz)
         process.stop_on_signals()
         if stop_when is not None:

@@ -57,7 +57,7 @@ def _live(tree: TargetTree, pace: NDArray[np.float32]) -> None:
         pace[3:5, 3:5] = change
         tree.update(pace, middle + 3, [Window(3, 3, 5, 5)], version)
     tree.force([0, 1])
-    grown = tree.full_job(pace.copy(), middle + 3, 5)()
+    grown = tree.full_job(middle + 3)()
     tree.update(pace, middle + 4, [], 6)
     tree.adopt(grown, pace, middle + 5, [], 6, np.array([0, 1]))
     tree.routes([0, 1, -1], 0)

@@ -119,7 +119,7 @@ class _Parts:
         here, _ = ndimage.label(np.isfinite(self.truth[near]))
         # Pairs (part of the whole, part near the block): a part that occurs twice is in pieces here.
         pairs = np.unique(np.stack((self._labels[near][beside], here[beside])), axis=1)
-        return len(np.unique(pairs[0])) < pairs.shape[1]
+        return bool(len(np.unique(pairs[0])) < pairs.shape[1])
 
 
 _NEAR = 12
@@ -129,8 +129,8 @@ _NEAR = 12
 def _close_roads(
     parts: _Parts, road: Bools, count: int, rng: np.random.Generator, whole: int, flooded_share: float
 ) -> None:
-    """Make stretches of road and the cells beside them lethal. Up to 20 places are tried for each; none fits if each
-    would cut the largest passable part to too few cells."""
+    """Make stretches of road and the cells beside them lethal. Up to 20 places are tried for each; none fits if
+    each would cut the largest passable part to too few cells."""
     truth, least = parts.truth, whole * (CONNECTED_SHARE - flooded_share)
     cols = truth.shape[1]
     roads = np.flatnonzero(road) if count else np.empty(0, np.intp)
@@ -183,7 +183,7 @@ def _flood(truth: Floats, height: Floats, share: float, rng: np.random.Generator
     low = np.flatnonzero(passable.reshape(-1) & (height <= np.quantile(height[passable], 0.2)).reshape(-1))
     start = int(low[rng.integers(len(low))])
     # Of a memoryview single values are read in half the time that an array takes.
-    flat, open_ = memoryview(height.reshape(-1)), memoryview(passable.reshape(-1))
+    flat, open_ = height.reshape(-1).data, passable.reshape(-1).data
     shore: list[tuple[float, int]] = [(flat[start], start)]
     seen = {start}
     wet: list[int] = []

@@ -9,6 +9,7 @@ from support import slow_twins as naive
 from support.planner_strategies import Job, Marks, Move
 
 from planner_service.target_tree import GrownTree, TargetTree
+from planner_service.tree.corridors import CorridorSearch
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import RouteStatus
@@ -25,6 +26,7 @@ class Play:
         self.version = 0
         self.target = int(np.flatnonzero(np.isfinite(pace))[0])
         self.grown: GrownTree | None = None
+        self.search: CorridorSearch | None = None
         self.since: list[Window] = []
         self.rules = {
             "neighbours": config.neighbours,
@@ -46,14 +48,19 @@ class Play:
             self.version += 1
             self.tree.update(self.pace, self.target, [window], self.version)
         elif event.what == "begin":
-            job = self.tree.full_job(self.pace.copy(), self.target, self.version)
+            job = self.tree.full_job(self.target)
             self.grown = job()
+            if self.tree.wants_corridors:
+                self.search = self.tree.corridor_job()
             self.since = []
         elif event.what == "end" and self.grown is not None:
             self.tree.adopt(
                 self.grown, self.pace, self.target, self.since, self.version, np.arange(self.grid.cells)
             )
             self.grown = None
+            if self.search is not None:
+                self.tree.take_corridors(self.search.run())
+                self.search = None
         elif event.what == "force":
             self.tree.force([0, self.grid.cells - 1])
 

@@ -64,9 +64,7 @@ class Lattice(Protocol):
         ...
 
 
-def fractal_noise(
-    rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False
-) -> Noise:
+def fractal_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Noise:
     """Smooth noise of many scales.
 
     Parameters
@@ -87,9 +85,7 @@ def fractal_noise(
     return _octaves(_ValueLattice.drawn, 0.5, rng, rows, cols, coarsest, ridged)
 
 
-def mountain_noise(
-    rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False
-) -> Noise:
+def mountain_noise(rng: np.random.Generator, rows: int, cols: int, coarsest: float, ridged: bool = False) -> Noise:
     """As `fractal_noise`, of gradient noise (Perlin 1985): rounder, without the grain of the lattice, twice the
     work.
 
@@ -197,9 +193,7 @@ class _GradientLattice:
         return field
 
 
-def _blend(
-    begin: int, end: int, scale: float, offset: float
-) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
+def _blend(begin: int, end: int, scale: float, offset: float) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
     """Lattice point before each cell, weights of it and of the next, and how far along the cell lies."""
     at = np.arange(begin, end) / scale + offset
     low = at.astype(np.intp)

@@ -130,9 +130,9 @@ def _cut(elevation_m: Floats, level: Floats, resolution_m: float) -> Floats:
         above, below = max(row0 - reach, 0), min(row1 + reach, rows)
         if dry[above:below].all():
             return
-        nearest = ndimage.distance_transform_edt(
-            dry[above:below], return_distances=False, return_indices=True
-        )[:, row0 - above : row1 - above]
+        nearest = ndimage.distance_transform_edt(dry[above:below], return_distances=False, return_indices=True)[
+            :, row0 - above : row1 - above
+        ]
         south = nearest[0] - np.arange(row0 - above, row1 - above, dtype=np.int32)[:, None]
         east = nearest[1] - np.arange(cols, dtype=np.int32)
         away = np.sqrt((south * south + east * east).astype(np.float64)).astype(np.float32)

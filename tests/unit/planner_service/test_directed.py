@@ -232,7 +232,7 @@ def test_a_tree_grown_by_a_worker_is_the_same():
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
     tree.update(pace, 820, [], 0)
     before = tree.cost_to_go_at(np.arange(1600))
-    tree.adopt(tree.full_job(pace.copy(), 820, 0)(), pace, 820, [], 0, np.arange(0, 1600, 50))
+    tree.adopt(tree.full_job(820)(), pace, 820, [], 0, np.arange(0, 1600, 50))
     np.testing.assert_array_equal(tree.cost_to_go_at(np.arange(1600)), before)
     np.testing.assert_allclose(tree.last_gaps, 1.0, rtol=1e-5)
 
