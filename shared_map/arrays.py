@@ -63,3 +63,20 @@ def _map(file: Any, dtype: Any, shape: tuple[int, ...], offset: int, mode: Liter
     mapped = _Mapped(file, dtype, mode, offset, shape)
     mapped.file = file
     return mapped
+
+
+class CellsOf:
+    """The cells of a mask, numbered in rows, without an array of them: that would take eight bytes a cell."""
+
+    def __init__(self, mask: Bools) -> None:
+        self.mask = mask
+        self._ends = np.cumsum(np.count_nonzero(mask, axis=1))  # how many there are up to the end of each row
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    def cell(self, number: int) -> int:
+        """The flat index of a cell; `number` is 0 to len - 1."""
+        row = int(np.searchsorted(self._ends, number, "right"))
+        before = int(self._ends[row - 1]) if row else 0
+        return row * self.mask.shape[1] + int(np.flatnonzero(self.mask[row])[number - before])

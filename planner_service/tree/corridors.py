@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from planner_service.kernels import corridor_growth
 from planner_service.kernels.layout import NONE
 from planner_service.tree.cost_grid import Changes, CostGrid
+from shared_map.arrays import CellsOf
 
 LEAST = 64
 """The ways of so many cells make a cell part of a corridor."""
@@ -124,17 +125,11 @@ def find_corridors(cost_grid: CostGrid) -> CorridorGraph:
 
 def _roots(cost_grid: CostGrid) -> list[int]:
     """Padded, passable cells, evenly spread by their number."""
-    rows = cost_grid.cell_cost.reshape(-1, cost_grid.stride) < np.inf
-    before = np.cumsum(np.count_nonzero(rows, axis=1))
-    if not before[-1]:
+    passable = CellsOf(cost_grid.cell_cost.reshape(-1, cost_grid.stride) < np.inf)
+    if not len(passable):
         return []
-    numbers = np.linspace(0, before[-1] - 1, SAMPLES + 2).astype(np.int64)[1:-1].tolist()
-    roots = []
-    for number in numbers:
-        row = int(np.searchsorted(before, number, "right"))
-        col = int(np.flatnonzero(rows[row])[number - (int(before[row - 1]) if row else 0)])
-        roots.append(row * cost_grid.stride + col)
-    return roots
+    numbers = np.linspace(0, len(passable) - 1, SAMPLES + 2).astype(np.int64)[1:-1]
+    return [passable.cell(number) for number in numbers.tolist()]
 
 
 _NO_LEVEL: NDArray[np.uint8] = np.empty(0, np.uint8)

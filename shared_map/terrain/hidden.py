@@ -10,7 +10,7 @@ import heapq
 
 import numpy as np
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.arrays import Bools, Bytes, CellsOf, Floats
 from shared_map.terrain.layers import LETHAL, TerrainClass
 from shared_map.terrain.row_bands import bands
 from shared_map.terrain.synthetic.noise import fractal_noise
@@ -152,14 +152,11 @@ def _rubble(truth: Floats, count: int, rng: np.random.Generator) -> None:
         return
     rows, cols = truth.shape
     ragged = fractal_noise(rng, rows, cols, 8.0)
-    passable = np.isfinite(truth)
-    before = np.cumsum(np.count_nonzero(passable, axis=1))  # passable cells up to the end of each row
+    passable = CellsOf(np.isfinite(truth))
     most = max(2.0, min(10.0, min(rows, cols) / 8))
     rubble = np.zeros(truth.shape, np.bool_)
     for _ in range(count):
-        chosen = int(rng.integers(before[-1]))
-        row = int(np.searchsorted(before, chosen, "right"))
-        col = int(np.flatnonzero(passable[row])[chosen - (before[row - 1] if row else 0)])
+        row, col = divmod(passable.cell(int(rng.integers(len(passable)))), cols)
         radius = float(rng.uniform(0.4, 1.0)) * most
         reach = int(radius * 1.5) + 1
         row0, col0 = max(row - reach, 0), max(col - reach, 0)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bytes, Floats, open_array, save_array
 from shared_map.terrain.hidden import true_ground
+from shared_map.terrain.kept import fetch_kept, keep, kept_key
 from shared_map.terrain.layers import (
     TerrainClass,
     class_factors,
@@ -361,8 +362,16 @@ def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
 
 
 def prepare(folder: Path, scenario: Scenario) -> tuple[Terrain, Floats]:
-    """Build terrain and truth of a scenario and leave them in a folder for the other processes."""
-    terrain = build_terrain(scenario)
-    truth = build_truth(scenario, terrain)
-    save_prepared(folder, terrain, truth, scenario_key(scenario))
-    return terrain, truth
+    """Build terrain and truth of a scenario, unless they are kept from an earlier run, and leave them in a folder
+    for the other processes. What is returned is mapped, as theirs."""
+    key, kept = scenario_key(scenario), kept_key(scenario)
+    if kept is None or not fetch_kept(kept, folder):
+        terrain = build_terrain(scenario)
+        save_prepared(folder, terrain, build_truth(scenario, terrain), key)
+        del terrain  # its memory, before the same is mapped
+        if kept is not None:
+            keep(kept, [folder / _META, *folder.glob("*.npy")])
+    mapped, truth = load_prepared(folder, key), load_prepared_truth(folder, key)
+    if mapped is None or truth is None:
+        raise TerrainError(f"the prepared terrain in {folder} has gone: it is another run's; start again")
+    return mapped, truth
