@@ -79,4 +79,4 @@ class CellsOf:
         """The flat index of a cell; `number` is 0 to len - 1."""
         row = int(np.searchsorted(self._ends, number, "right"))
         before = int(self._ends[row - 1]) if row else 0
-        return row * self.mask.shape[1] + int(np.flatnonzero(self.mask[row])[number - before])
+        return row * int(self.mask.shape[1]) + int(np.flatnonzero(self.mask[row])[number - before])

@@ -90,9 +90,8 @@ class TargetWorld:
         # A target keeps to cells where a vehicle fits, by the truth and by the prior map: others are out of reach.
         halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
         pace: Floats = inflate(truth_s_per_m, halves) if halves else private_copy(truth_s_per_m)
-        pace[terrain.lethal & np.isfinite(pace)] = (
-            np.inf
-        )  # few cells, so that most of the truth's pages stay shared
+        # Few cells, so that most pages of the truth stay shared.
+        pace[terrain.lethal & np.isfinite(pace)] = np.inf
         self._terrain = TrueTerrain(terrain.grid, pace)
         self._referee = Referee(np.isfinite(truth_s_per_m))
         self._own_incarnation = self._incarnation = incarnation

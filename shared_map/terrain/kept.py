@@ -1,8 +1,8 @@
 """Made-up terrains of earlier runs, kept in the user's cache folder: making one again gives the same bits, slowly.
 
 A terrain is kept under the digest of all that it is made from: the scenario's part in it, and the code. Its files
-are linked into a run's folder where the file system allows, so that they lie on the disk once. Every file is checked
-against its digest before it is used again.
+are linked into a run's folder where the file system allows, so that they lie on the disk once. Every file is
+checked against its digest before it is used again.
 """
 
 from __future__ import annotations

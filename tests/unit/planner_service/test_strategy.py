@@ -17,7 +17,8 @@ GRID = GridSpec(96, 96, 1.0)
 
 
 def kinds_of_moves(config: PlannerConfig, moves: int) -> list[str]:
-    """What each of so many moves of one cell to the east grew, and whether a full growth (!) or corridors (~) were asked for."""
+    """What each of so many moves of one cell to the east grew; "!" if a full growth, "~" if corridors were asked
+    for."""
     pace = np.ones((GRID.rows, GRID.cols), np.float32)
     tree = TargetTree(GRID, config)
     tree.update(pace, GRID.cell(48, 20), [], 0)
