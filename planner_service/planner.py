@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
+from planner_service.actions import Action, FindCorridors, GrowTree, Refusal
 from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
-from planner_service.target_tree import MODEL_NS_PER_CELL, TargetTree, Update
+from planner_service.target_tree import MODEL_NS_PER_CELL, TargetTree
 from planner_service.tree.corridors import CorridorSearch, CorridorShelf
+from planner_service.update import Update
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
@@ -42,32 +43,6 @@ _MEDIAN_OF = 5
 """Growths whose median time `auto` goes by: on a busy machine single ones take many times as long."""
 
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
-
-
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """A request that is not answered, and why."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GrowTree:
-    """Run `job` on a worker and bring what it returns to `Planner.adopt`."""
-
-    job: Callable[[], GrownTree]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FindCorridors:
-    """Take the steps of `search` on a worker, one now and then, until it has found them; bring it to
-    `Planner.adopt_corridors`."""
-
-    search: CorridorSearch
-
-
-Action = GrowTree | FindCorridors | PushedRoute | PlannerStatus
-"""What a planner wants done: a growth run, corridors found, a message published."""
 
 
 class Planner:

@@ -6,8 +6,9 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
+from planner_service.actions import Action, FindCorridors, GrowTree, Refusal
 from planner_service.full_growth import GrownTree
-from planner_service.planner import Action, FindCorridors, GrowTree, Planner, Refusal
+from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
 from planner_service.target_tree import TargetTree
 from planner_service.tree.corridors import CorridorSearch

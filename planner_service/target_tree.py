@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,19 +17,19 @@ from numpy.typing import NDArray
 from planner_service.full_growth import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.strategy import AutoStage, FullGrowth, OnMove, StrategyRow, WidestWindow, row_of
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.corridors import CorridorGraph, CorridorSearch, CorridorShelf
+from planner_service.tree.corridors import CorridorGraph, CorridorSearch, CorridorShelf, CorridorUpkeep
 from planner_service.tree.cost_grid import Changes
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.directed_cost_grid import cost_grid_of
 from planner_service.tree.route_reading import read_routes
 from planner_service.tree.windows import AHEAD, WindowSchedule, block_half
+from planner_service.update import Update
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import NO_TARGET, RouteBatch
 
-EMPTY = Window(0, 0, 0, 0)
 MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
 INLINE_NS = 100_000_000
@@ -40,25 +39,6 @@ WIDE_SHARE = 16
 """A block window over one cell in so many gives way to the corridors, where there are any."""
 FINE_SHARE = 16
 """How far the fine windows of multi-resolution reach, as a share of the map's side."""
-
-Kind = Literal["none", "full", "window", "repair", "coarse", "forced"]
-
-
-@dataclass(frozen=True, slots=True)
-class Update:
-    """What one call changed.
-
-    kind        the dearest thing that was done: nothing, the exact tree, a window, a repair after map changes, a
-                window and the corridors beyond it, a window that was forced
-    window      the cells that may have a new cost or parent; empty if none
-    cells       how many cells the kernels visited
-    wants_full  please run `full_job` on a worker, and `adopt` what it returns
-    """
-
-    kind: Kind
-    window: Window = EMPTY
-    cells: int = 0
-    wants_full: bool = False
 
 
 class TargetTree:
@@ -97,9 +77,8 @@ class TargetTree:
         self._job_out = False
         # A full growth was left to the worker: until it is adopted, moves are not followed.
         self._left_to_worker = False
-        # The corridors of strategies that thin far cells; None until a worker found them, and again once stale.
-        self._corridors: CorridorGraph | None = None
-        self._searching = self._found_before = False
+        # The corridors of strategies that thin far cells.
+        self._corridors = CorridorUpkeep()
         # What a full growth takes, ns: the model's figure until `observe_full_ns` tells a measured one.
         self._full_ns = self.measured_model_ns()
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
@@ -167,24 +146,15 @@ class TargetTree:
     @property
     def wants_corridors(self) -> bool:
         """Please run `corridor_job` on a worker, and `take_corridors` once it has found them."""
-        thins = self.strategy.thins_far_cells and self._corridors is None
-        return thins and not self._searching and self._loaded
+        return self.strategy.thins_far_cells and self._loaded and self._corridors.wanted
 
     def corridor_job(self, shelf: CorridorShelf | None = None) -> CorridorSearch:
-        """The search for corridors. With a shelf they are those of the map before any mark, which all planners of a
-        machine have in common; where these have become stale, and without, of the map as it was told last."""
-        self._searching = True
-        shared = None if self._found_before else self._costs.shared
-        self._found_before = True
-        return CorridorSearch(self._costs.snapshot()) if shared is None else CorridorSearch(shared, shelf)
+        """See `CorridorUpkeep.search`."""
+        return self._corridors.search(self._costs, shelf)
 
     def take_corridors(self, search: CorridorSearch) -> None:
-        """Go by the corridors that were found, and let all cells around later changes take part."""
-        assert search.level is not None
-        self._searching = False
-        found = CorridorGraph(search.level)
-        since = self._costs.changes_since(search.cost_grid.cell_cost)
-        self._corridors = found if not since.cells.size or found.learn(self._costs, since) else None
+        """Go by the corridors that were found."""
+        self._corridors.take(self._costs, search)
 
     def adopt(
         self,
@@ -309,8 +279,7 @@ class TargetTree:
             self._loaded = True
             return None
         changes = self._costs.apply(pace, dirty)
-        if changes.cells.size and self._corridors is not None and not self._corridors.learn(self._costs, changes):
-            self._corridors = None
+        self._corridors.learn(self._costs, changes)
         if changes.any_lower:
             self._tree.window_bound = None
         self._bounds.learn(changes)
@@ -398,7 +367,7 @@ class TargetTree:
         """How far to every side of the target the tree is grown now, and over which corridors beyond; None for not
         at all."""
         row, old = self.strategy, self._tree.root
-        corridors = self._corridors if row.thins_far_cells else None
+        corridors = self._corridors.graph if row.thins_far_cells else None
         least = 2 * self._grid.distance_cells(old, target_cell)
         if row.on_move is OnMove.BLOCK_WINDOW:
             half = block_half(self._grid, old, target_cell, self._config.k_min)

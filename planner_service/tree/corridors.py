@@ -116,6 +116,42 @@ class CorridorSearch:
         return self
 
 
+class CorridorUpkeep:
+    """The corridors of one tree, from search to search.
+
+    graph   None until found, and again once too much has changed
+    wanted  whether to begin a search
+    """
+
+    def __init__(self) -> None:
+        self.graph: CorridorGraph | None = None
+        self._searching = self._found_before = False
+
+    @property
+    def wanted(self) -> bool:
+        return self.graph is None and not self._searching
+
+    def search(self, cost_grid: CostGrid, shelf: CorridorShelf | None) -> CorridorSearch:
+        """The first search is on the map as it was before any mark, if that is shared, so that all planners of a
+        machine can take the same. Later ones, of corridors that have become stale, are on the map as it is."""
+        self._searching = True
+        shared = None if self._found_before else cost_grid.shared
+        self._found_before = True
+        return CorridorSearch(cost_grid.snapshot()) if shared is None else CorridorSearch(shared, shelf)
+
+    def take(self, cost_grid: CostGrid, search: CorridorSearch) -> None:
+        """Go by what was found, and let all cells around later changes take part."""
+        assert search.level is not None
+        self._searching = False
+        self.graph = CorridorGraph(search.level)
+        self.learn(cost_grid, cost_grid.changes_since(search.cost_grid.cell_cost))
+
+    def learn(self, cost_grid: CostGrid, changes: Changes) -> None:
+        """The map has changed."""
+        if self.graph is not None and changes.cells.size and not self.graph.learn(cost_grid, changes):
+            self.graph = None
+
+
 def find_corridors(cost_grid: CostGrid) -> CorridorGraph:
     """The corridors of a map, at once."""
     level = CorridorSearch(cost_grid).run().level

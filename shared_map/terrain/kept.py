@@ -53,6 +53,8 @@ def kept_key(scenario: Scenario) -> str | None:
 def fetch_kept(key: str, into: Path) -> bool:
     """Put the files of a kept terrain into a folder. False if there is none; a damaged one is dropped, and said."""
     folder = kept_root() / key
+    if not folder.is_dir():
+        return False
     try:
         sums = json.loads((folder / _SUMS).read_text(encoding="utf-8"))
         names = [name for name in sums if name == Path(name).name]
@@ -64,8 +66,6 @@ def fetch_kept(key: str, into: Path) -> bool:
         for name in names:
             _link(folder / name, into / name)
         os.utime(folder)
-    except FileNotFoundError:
-        return False
     except (OSError, ValueError, AttributeError, TypeError) as error:
         log.warning("the kept terrain %s is damaged (%s): making it anew", folder, error)
         shutil.rmtree(folder, ignore_errors=True)

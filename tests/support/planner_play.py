@@ -8,7 +8,8 @@ import numpy as np
 from support import slow_twins as naive
 from support.planner_strategies import Job, Marks, Move
 
-from planner_service.target_tree import GrownTree, TargetTree
+from planner_service.full_growth import GrownTree
+from planner_service.target_tree import TargetTree
 from planner_service.tree.corridors import CorridorSearch
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
