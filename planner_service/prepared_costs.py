@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from planner_service.tree import corridors
 from planner_service.tree.directed_cost_grid import cost_grid_of
+from shared_map import arrays
 from shared_map.arrays import Floats, open_array, private_copy, save_array
 from shared_map.source_digest import source_digest
 from shared_map.terrain.terrain import Terrain
@@ -88,7 +89,8 @@ def prepared_costs(folder: Path | None, terrain: Terrain, config: PlannerConfig)
 
 
 def _digest(text: str) -> str:
-    code = source_digest(Path(corridors.__file__).parent, Path(corridors.__file__).parent.parent / "kernels")
+    here = Path(__file__).parent
+    code = source_digest(here / "tree", here / "kernels", Path(arrays.__file__).parent)
     return hashlib.blake2b(f"{code} {text}".encode(), digest_size=8).hexdigest()
 
 
