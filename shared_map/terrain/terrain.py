@@ -16,8 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bytes, Floats, open_array, save_array
+from shared_map.arrays import Bools, Bytes, Floats, open_array, save_array
 from shared_map.terrain.hidden import true_ground
+from shared_map.terrain.homes import homes_of
 from shared_map.terrain.kept import fetch_kept, keep, kept_key
 from shared_map.terrain.layers import (
     TerrainClass,
@@ -248,6 +249,7 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
         "pace": terrain.pace_s_per_m,
         "classes": terrain.classes,
         "truth": truth,
+        "homes": homes_of(terrain.pace_s_per_m, truth),
     }
     if terrain.ground_s_per_m is not terrain.pace_s_per_m:
         arrays["ground"] = terrain.ground_s_per_m
@@ -279,8 +281,8 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
     """The terrain that `save_prepared` left, mapped read-only; None if there is none, or one of another key.
 
     Raises TerrainError if it is damaged."""
-    meta = _read_meta(folder)
-    if meta is None or (key and meta.get("key") != key):
+    meta = _read_meta(folder, key)
+    if meta is None:
         return None
     try:
         grid = GridSpec(**meta["grid"])
@@ -311,14 +313,14 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
 
 def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
     """The truth beside a prepared terrain; None if there is none."""
-    meta = _read_meta(folder)
-    if meta is None or (key and meta.get("key") != key):
+    meta = _read_meta(folder, key)
+    if meta is None:
         return None
     grid = GridSpec(**meta["grid"])
     return _read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
 
 
-def _read_meta(folder: Path) -> dict[str, Any] | None:
+def _read_meta(folder: Path, key: str) -> dict[str, Any] | None:
     try:
         if not (folder / _META).exists():
             return None
@@ -327,7 +329,7 @@ def _read_meta(folder: Path) -> dict[str, Any] | None:
         raise TerrainError(
             f"prepared terrain {folder / _META} is unreadable ({error}); delete the folder"
         ) from error
-    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT or (key and meta.get("key") != key):
         return None
     return meta
 
@@ -359,6 +361,14 @@ def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
         if truth is not None:
             return truth
     return build_truth(setup.scenario, terrain)
+
+
+def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
+    """`homes_of` the terrain and truth of a run, as `load_terrain`; the caller must not write to it."""
+    meta = None if setup.run_dir is None else _read_meta(setup.run_dir, scenario_key(setup.scenario))
+    if setup.run_dir is not None and meta is not None and "homes" in meta["arrays"]:
+        return _read_array(setup.run_dir, "homes", (terrain.grid.rows, terrain.grid.cols), np.bool_)
+    return homes_of(terrain.pace_s_per_m, truth)
 
 
 def prepare(folder: Path, scenario: Scenario) -> tuple[Terrain, Floats]:
