@@ -8,6 +8,7 @@ from contextlib import closing
 from planner_service.prepared_costs import prepared_costs
 from planner_service.service import PlannerService
 from planner_service.warm_up import warm_up
+from shared_map.terrain.kept import kept_key
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -27,7 +28,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = load_terrain(setup)
     warm_up()
-    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner)
+    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, kept_key(scenario))
     clock = MonotonicClock()
     inbox = Inbox()
     with (

@@ -22,6 +22,7 @@ from planner_service.tree.directed_cost_grid import cost_grid_of
 from shared_map import arrays
 from shared_map.arrays import Floats, open_array, private_copy, save_array
 from shared_map.source_digest import source_digest
+from shared_map.terrain.kept import keep_beside
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig
 
@@ -32,14 +33,16 @@ class PreparedCosts:
     """Cell costs before any mark, and a `CorridorShelf` beside them.
 
     cell_cost  float32, padded, s: what a `CostGrid` loads; mapped read-only
+    kept       of the terrain, if it is kept from run to run; its corridors are then, too
     """
 
-    def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig) -> None:
+    def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig, kept: str | None = None) -> None:
         cost_grid = cost_grid_of(terrain.grid, config, terrain.climb)
         of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.terms}"
         of_ways = f"{of_costs} {cost_grid.rule} {cost_grid.corners} {corridors.LEAST} {corridors.SAMPLES}"
         self._size = cost_grid.size
         self._folder = folder
+        self._kept = kept
         self._corridors = folder / f"corridors-{_digest(of_ways)}.npy"
         self._claimed: IO[bytes] | None = None
         path = folder / f"cell-costs-{_digest(of_costs)}.npy"
@@ -70,6 +73,8 @@ class PreparedCosts:
     def leave(self, level: NDArray[np.uint8]) -> None:
         try:
             save_array(self._corridors, level)
+            if self._kept is not None:
+                keep_beside(self._kept, self._corridors)
         except OSError as error:
             log.warning("cannot share corridors in %s: %s", self._folder, error.strerror or error)
         if self._claimed is not None:
@@ -77,12 +82,14 @@ class PreparedCosts:
             self._claimed = None
 
 
-def prepared_costs(folder: Path | None, terrain: Terrain, config: PlannerConfig) -> PreparedCosts | None:
+def prepared_costs(
+    folder: Path | None, terrain: Terrain, config: PlannerConfig, kept: str | None = None
+) -> PreparedCosts | None:
     """None where there is no folder or it cannot be written: then a planner computes its own."""
     if folder is None:
         return None
     try:
-        return PreparedCosts(folder, terrain, config)
+        return PreparedCosts(folder, terrain, config, kept)
     except OSError as error:
         log.warning("cannot share cell costs in %s: %s", folder, error.strerror or error)
         return None

@@ -7,13 +7,15 @@ checked against its digest before it is used again.
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import json
 import logging
 import os
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
@@ -92,6 +94,30 @@ def keep(key: str, files: Iterable[Path]) -> None:
         log.info("the terrain is not kept in %s: %s", root, error.strerror or error)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def keep_beside(key: str, file: Path) -> None:
+    """Keep one more file of a kept terrain, which follows from it and took long to find."""
+    folder = kept_root() / key
+    try:
+        with _locked(folder):
+            sums = json.loads((folder / _SUMS).read_text(encoding="utf-8")) | {file.name: _sum(file)}
+            _link(file, folder / file.name)
+            partial = folder / f"{_SUMS}.part"
+            partial.write_text(json.dumps(sums, indent=1), encoding="utf-8")
+            partial.replace(folder / _SUMS)
+    except (OSError, ValueError, TypeError) as error:
+        log.info("%s is not kept in %s: %s", file.name, folder, error)
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    itself = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(itself, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(itself)
 
 
 def _evict(root: Path) -> None:

@@ -15,6 +15,7 @@ from planner_service.target_tree import TargetTree
 from planner_service.tree import corridors
 from planner_service.tree.corridors import CorridorSearch, find_corridors
 from planner_service.tree.cost_grid import CostGrid
+from shared_map.terrain.kept import fetch_kept, keep
 from shared_map.terrain.terrain import Terrain, load_prepared, save_prepared, terrain_of_pace
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window
@@ -81,6 +82,26 @@ def test_one_planner_finds_the_corridors_and_all_others_take_them(
         np.testing.assert_array_equal(search.level, expected)
     searches[1].level[:] = 255  # a planner lets cells around its marks take part
     np.testing.assert_array_equal(shelves[2].load(), expected)
+
+
+def test_corridors_are_kept_with_the_terrain_for_the_next_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    terrain = mapped(tmp_path / "one")
+    keep("key", (tmp_path / "one").glob("*.npy"))
+    level = np.arange(92 * 82, dtype=np.uint8)
+    PreparedCosts(tmp_path / "one", terrain, CONFIG, "key").leave(level)
+    assert fetch_kept("key", tmp_path / "two")
+    found = PreparedCosts(tmp_path / "two", mapped(tmp_path / "two"), CONFIG, "key").load()
+    np.testing.assert_array_equal(found, level)
+    PreparedCosts(tmp_path / "one", terrain, CONFIG, "missing").leave(level)  # not kept, and nothing is wrong
+    with caplog.at_level(logging.WARNING):
+        (corridors,) = (tmp_path / "cache" / "terrain-swarm" / "terrain" / "key").glob("corridors*")
+        corridors.unlink()
+        corridors.write_bytes(b"damaged")
+        assert not fetch_kept("key", tmp_path / "three")
+    assert "is damaged" in caplog.text
 
 
 def test_where_the_finder_ends_another_goes_on(tmp_path: Path) -> None:
