@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from pathlib import Path
 from typing import Any, Literal
@@ -57,6 +58,13 @@ def private_copy(array: NDArray[Any]) -> NDArray[Any]:
     if not isinstance(mapped, _Mapped) or mapped.shape != array.shape or mapped.dtype != array.dtype:
         return np.array(array)
     return np.asarray(_map(mapped.file, mapped.dtype, mapped.shape, mapped.offset, "c"))
+
+
+def give_back_memory() -> None:
+    """Return to the system what the allocator keeps of freed arrays; it keeps much where threads made them."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
+    if trim is not None:
+        trim(0)
 
 
 def _map(file: Any, dtype: Any, shape: tuple[int, ...], offset: int, mode: Literal["r", "c"]) -> _Mapped:

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes, Floats, open_array, save_array
+from shared_map.arrays import Bools, Bytes, Floats, give_back_memory, open_array, save_array
 from shared_map.terrain.hidden import true_ground
 from shared_map.terrain.homes import homes_of
 from shared_map.terrain.kept import fetch_kept, keep, kept_key
@@ -378,7 +378,8 @@ def prepare(folder: Path, scenario: Scenario) -> tuple[Terrain, Floats]:
     if kept is None or not fetch_kept(kept, folder):
         terrain = build_terrain(scenario)
         save_prepared(folder, terrain, build_truth(scenario, terrain), key)
-        del terrain  # its memory, before the same is mapped
+        del terrain
+        give_back_memory()
         if kept is not None:
             keep(kept, [folder / _META, *folder.glob("*.npy")])
     mapped, truth = load_prepared(folder, key), load_prepared_truth(folder, key)
