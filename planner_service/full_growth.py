@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.layout import NONE
-from planner_service.tree.corridors import CorridorGraph, find_corridors
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.arrays import Floats
 
@@ -20,22 +19,22 @@ class GrownTree:
 
     target_cell  the root, wherever the target was
     map_version  of the snapshot
-    cost         float32, s, cost-to-go of each cell
+    cost         float32, s, cost-to-go of each cell; of no meaning where nothing was grown
+    heuristic    a copy of it
     parent       uint8, direction of the next cell
     cell_cost    float32, s, the cell costs of the snapshot
     reach        s; no cost exceeds it. Negative where nothing was grown, as no tree can lead there
     offered      parents of the tree that was served when the snapshot was taken; None where none led there
-    corridors    the corridors of the snapshot; None unless they were wanted
     """
 
     target_cell: int
     map_version: int
     cost: Floats
+    heuristic: Floats
     parent: NDArray[np.uint8]
     cell_cost: Floats
     reach: float
     offered: NDArray[np.uint8] | None
-    corridors: CorridorGraph | None = None
 
 
 def can_be_root(cost_grid: CostGrid, cell: int) -> bool:
@@ -44,29 +43,21 @@ def can_be_root(cost_grid: CostGrid, cell: int) -> bool:
 
 
 def growth_job(
-    empty: Callable[[], CostGrid],
-    pace_snapshot: Floats,
+    cost_grid: CostGrid,
     target_cell: int,
     map_version: int,
     offered: NDArray[np.uint8] | None,
-    wants_corridors: bool,
 ) -> Callable[[], GrownTree]:
-    """A pure full growth that releases the interpreter lock. `pace_snapshot` must not change before it ends.
-
-    empty  makes a cost grid without costs, of the map's shape and rules
-    """
+    """A pure full growth that releases the interpreter lock. `cost_grid` is a snapshot."""
 
     def job() -> GrownTree:
-        cost_grid = empty()
-        cost_grid.load(pace_snapshot)
-        cost = np.full(cost_grid.size, np.inf, np.float32)
+        cost = np.empty(cost_grid.size, np.float32)
         parent = np.full(cost_grid.size, NONE, np.uint8)
         reach = -1.0
-        corridors = None
         if can_be_root(cost_grid, target_cell):
             reach = cost_grid.grow(cost_grid.pad(target_cell), cost, parent)
-            corridors = find_corridors(cost_grid) if wants_corridors else None
-        return GrownTree(target_cell, map_version, cost, parent, cost_grid.cell_cost, reach, offered, corridors)
+        heuristic = cost.copy() if reach >= 0 else cost
+        return GrownTree(target_cell, map_version, cost, heuristic, parent, cost_grid.cell_cost, reach, offered)
 
     return job
 

@@ -7,8 +7,10 @@ from collections.abc import Callable
 from contextlib import closing
 
 from planner_service.kernel_build import KernelLoader
+from planner_service.prepared_costs import prepared_costs
 from planner_service.service import PlannerService
 from planner_service.target_tree import is_slow_to_grow
+from shared_map.terrain.kept import kept_key
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
@@ -31,13 +33,16 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     terrain = load_terrain(setup)
     kernels = KernelLoader(directed=terrain.climb is not None, whole=is_slow_to_grow(terrain.grid))
     kernels.load_first(log.info)
+    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, kept_key(scenario))
     clock = MonotonicClock()
     inbox = Inbox()
     with (
         open_bus(scenario.network, patient=True) as bus,
         closing(ThreadWorker("grow-tree", inbox, clock)) as worker,
     ):
-        service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns, lambda: kernels.complete)
+        service = PlannerService(
+            setup, terrain, bus, inbox.post, worker, clock.now_ns, lambda: kernels.complete, prepared
+        )
         process = Process(service, inbox, clock, scenario.planner.tick_hz)
         process.stop_on_signals()
         if stop_when is not None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
+from planner_service.actions import Action, FindCorridors, GrowTree, Refusal
 from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
-from planner_service.target_tree import MODEL_NS_PER_CELL, TargetTree, Update
+from planner_service.target_tree import MODEL_NS_PER_CELL, TargetTree
+from planner_service.tree.corridors import CorridorSearch, CorridorShelf
+from planner_service.update import Update
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
@@ -43,24 +45,6 @@ _MEDIAN_OF = 5
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
 
 
-@dataclass(frozen=True, slots=True)
-class Refusal:
-    """A request that is not answered, and why."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GrowTree:
-    """Run `job` on a worker and bring what it returns to `Planner.adopt`."""
-
-    job: Callable[[], GrownTree]
-
-
-Action = GrowTree | PushedRoute | PlannerStatus
-"""What a planner wants done: a growth run, a message published."""
-
-
 class Planner:
     """Keeps the tree of one target, and answers from it.
 
@@ -70,6 +54,7 @@ class Planner:
 
     stopwatch       times growths on this thread; without one they take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
+    shelf           where the planners of a machine leave corridors for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
     """
 
@@ -85,6 +70,7 @@ class Planner:
         route_cells: int = 0,
         stopwatch: Callable[[], int] | None = None,
         newest_mark_ns: Callable[[], int | None] = lambda: None,
+        shelf: CorridorShelf | None = None,
         leads: bool = True,
     ) -> None:
         self.target = target
@@ -97,6 +83,7 @@ class Planner:
         self._cost_map = cost_map
         self._stopwatch = stopwatch
         self._newest_mark_ns = newest_mark_ns
+        self._shelf = shelf
         self._push_ns = int(config.push_s * NS_PER_S)
         self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
         # The newest pose heard, and which poses of the tracker are news; the tick takes it in.
@@ -156,6 +143,8 @@ class Planner:
     def tick(self, now_ns: int) -> list[Action]:
         """Bring the tree up to date, push newer routes, tell how we are doing."""
         actions = self._keep_up(now_ns)
+        if self.tree.ready and self.tree.wants_corridors:
+            actions.append(FindCorridors(self.tree.corridor_job(self._shelf)))
         self.followers.drop_silent(now_ns)
         if self.leads:
             actions.extend(self._pushes(now_ns))
@@ -180,7 +169,7 @@ class Planner:
         )
         self._told = news
         self._wants_full = False  # all that happened until now is in what `adopt` says
-        self._record_growth(took_ns, usual=grown.corridors is None)
+        self._record_growth(took_ns)
         if grown.map_version == news[1] and grown.target_cell == news[0]:
             self._exact_ns = now_ns
         else:
@@ -189,6 +178,15 @@ class Planner:
         self._gaps.adopted(self.tree, self.followers, self._cost_map.pace_s_per_m, now_ns)
         self._changed(update, dirty, now_ns)
         return [self._grow(now_ns)] if self._wants_full else []
+
+    def adopt_corridors(self, search: CorridorSearch) -> None:
+        """Go by what the worker found."""
+        self.tree.take_corridors(search)
+
+    @property
+    def must_wait(self) -> bool:
+        """Whether there is nothing to answer from now, and will be once the growth under way is adopted."""
+        return not self.tree.ready and self._growing_since_ns is not None
 
     # --- the tree -----------------------------------------------------------------------------------------------
 
@@ -225,8 +223,7 @@ class Planner:
         self._growing_since_ns = now_ns
         self._dirty_since_snapshot = []
         self._wants_full = False
-        snapshot = self._cost_map.snapshot()
-        return GrowTree(self.tree.full_job(snapshot.pace_s_per_m, self._told[0], snapshot.version))
+        return GrowTree(self.tree.full_job(self._told[0]))
 
     def _changed(self, update: Update, dirty: Sequence[Window], now_ns: int) -> None:
         """The tree is another than before."""
@@ -254,11 +251,11 @@ class Planner:
             self.counters.count("window_growths")
             self.counters.observe("window_ms", took_ns / 1e6)
 
-    def _record_growth(self, took_ns: int, usual: bool = True) -> None:
+    def _record_growth(self, took_ns: int) -> None:
         self.counters.count("growths")
         self._growth_ms = took_ns / 1e6
         self.counters.observe("growth_ms", self._growth_ms)
-        if self._stopwatch is not None and usual:
+        if self._stopwatch is not None:
             self._took_ns.append(took_ns)
             self.tree.observe_full_ns(sorted(self._took_ns)[len(self._took_ns) // 2])
 

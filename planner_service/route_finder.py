@@ -107,5 +107,7 @@ class RouteFinder:
         tree, pace = self._tree, self._pace
         update = tree.update(pace, self._target, dirty, self._version)
         if update.wants_full:
-            grown = tree.full_job(pace, self._target, self._version)()
+            grown = tree.full_job(self._target)()
             tree.adopt(grown, pace, self._target, [], self._version, [])
+        if tree.wants_corridors:
+            tree.take_corridors(tree.corridor_job().run())

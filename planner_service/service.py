@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable
 
+from planner_service.actions import Action, FindCorridors, GrowTree, Refusal
 from planner_service.full_growth import GrownTree
-from planner_service.planner import Action, GrowTree, Planner, Refusal
+from planner_service.planner import Planner
+from planner_service.prepared_costs import PreparedCosts
 from planner_service.target_tree import TargetTree
+from planner_service.tree.corridors import CorridorSearch
 from shared_map.cost_map import CostMap
 from shared_map.replication.filter import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
@@ -15,6 +19,7 @@ from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings, pose_of
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
+from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
@@ -27,7 +32,9 @@ from swarm.wire.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, S
 
 log = logging.getLogger(__name__)
 
-_GROW = "grow-tree"
+_GROW, _SEARCH = "grow-tree", "find-corridors"
+_HOLD_NS, _MOST_HELD = NS_PER_S, 256
+"""A query waits so long at most for a tree to answer from, and of more the oldest are answered at once."""
 
 
 class PlannerService:
@@ -46,6 +53,7 @@ class PlannerService:
         worker: Worker,
         stopwatch: Callable[[], int] | None = None,
         all_kernels: Callable[[], bool] = lambda: True,
+        prepared: PreparedCosts | None = None,
     ) -> None:
         scenario = setup.scenario
         self._target = job_of(setup.id)
@@ -61,19 +69,28 @@ class PlannerService:
         self._sightings = Sightings(filter)
         self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role)
+        tree = TargetTree(terrain.grid, scenario.planner, terrain.climb, all_kernels, has_worker=True)
+        if prepared is not None:
+            tree.share(prepared.cell_cost)
         self._planner = Planner(
             self._target,
             setup.incarnation,
             scenario.planner,
-            TargetTree(terrain.grid, scenario.planner, terrain.climb, all_kernels),
+            tree,
             self._cost_map,
             self.counters,
             route_cells=scenario.vehicles.route_cells,
             stopwatch=stopwatch,
             newest_mark_ns=self._replica.take_newest_stamp_ns,
+            shelf=prepared,
             leads=False,
         )
         self._served = False
+        self._held: deque[tuple[int, Asked]] = deque()
+        """Queries that came while there was nothing to answer from, and when; the oldest first."""
+        self._search: CorridorSearch | None = None
+        """What the worker is looking for, a step at a time; `_searching` while it has a step."""
+        self._searching = False
         self.counters.count("marks_merged", 0)
 
     def start(self, now_ns: int) -> None:
@@ -99,15 +116,17 @@ class PlannerService:
                         self._planner.set_pose(pose_of(seen))
             case Heard(message=Fleet() as fleet):
                 self._planner.hear_fleet(fleet, now_ns)
-            case Asked(request=RouteRequest() | CostRequest() as request):
-                reply = self._planner.answer(request, now_ns)
-                if isinstance(reply, Refusal):
-                    event.refuse(reply.reason)
-                else:
-                    event.answer(reply, target=self._target)
-                event.end()
+            case Asked(request=RouteRequest() | CostRequest()):
+                self._held.append((now_ns, event))
+                self._answer(now_ns)
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag == _GROW:
                 self._perform(self._planner.adopt(grown, took_ns, now_ns))
+                self._answer(now_ns)
+            case WorkDone(tag=tag, result=CorridorSearch() as search) if tag == _SEARCH:
+                self._searching = False
+                if search.level is not None:
+                    self._search = None
+                    self._planner.adopt_corridors(search)
             case _:
                 pass
 
@@ -119,12 +138,32 @@ class PlannerService:
         self._sightings.expire(now_ns)
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)
         self._perform(self._planner.tick(now_ns))
+        self._answer(now_ns)
+        if self._search is not None and not self._searching:
+            self._searching = True
+            self._worker.submit(_SEARCH, self._search.step, self._post, self._planner.tree.measured_model_ns())
         for name in ("marks_merged", "sets_foreign"):
             self.counters.counts[name] = self._replica.counts[name]
         if self._planner.tree.ready and not self._served:
             self._served = True
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
         self._member.tick(now_ns)
+
+    def _answer(self, now_ns: int) -> None:
+        """Answer what was asked. Where there will be something to answer from soon, wait for that, but not long."""
+        while self._held:
+            asked_ns, event = self._held[0]
+            waits = self._planner.must_wait and len(self._held) <= _MOST_HELD
+            if waits and now_ns - asked_ns < _HOLD_NS:
+                return
+            self._held.popleft()
+            assert isinstance(event.request, RouteRequest | CostRequest)
+            reply = self._planner.answer(event.request, now_ns)
+            if isinstance(reply, Refusal):
+                event.refuse(reply.reason)
+            else:
+                event.answer(reply, target=self._target)
+            event.end()
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()
@@ -149,6 +188,8 @@ class PlannerService:
             match action:
                 case GrowTree(job):
                     self._worker.submit(_GROW, job, self._post, self._planner.tree.measured_model_ns())
+                case FindCorridors(search):
+                    self._search = search
                 case PushedRoute(vehicle=vehicle) as pushed:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
                 case PlannerStatus() as status:

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,23 +17,24 @@ from numpy.typing import NDArray
 from planner_service.full_growth import GrownTree, can_be_root, growth_job, offered_gaps
 from planner_service.strategy import AutoStage, FullGrowth, OnMove, StrategyRow, WidestWindow, row_of
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.corridors import CorridorGraph
-from planner_service.tree.cost_grid import Changes, check_pace
+from planner_service.tree.corridors import CorridorGraph, CorridorSearch, CorridorShelf, CorridorUpkeep
+from planner_service.tree.cost_grid import Changes
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.directed_cost_grid import cost_grid_of
 from planner_service.tree.route_reading import read_routes
 from planner_service.tree.windows import AHEAD, WindowSchedule, block_half
+from planner_service.update import Update
 from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import NO_TARGET, RouteBatch
 
-EMPTY = Window(0, 0, 0, 0)
 MODEL_NS_PER_CELL = 15
 """What a full growth costs per cell, for choices that must come out alike on every machine."""
 INLINE_NS = 100_000_000
-"""A forced range is grown at once where a full growth takes less."""
+"""What takes longer is no work for the thread that answers: a forced range is grown at once where a full growth
+takes less, and where there is a worker, so is any other."""
 WIDE_SHARE = 16
 """A block window over one cell in so many gives way to the corridors, where there are any."""
 FINE_SHARE = 16
@@ -47,26 +46,6 @@ def is_slow_to_grow(grid: GridSpec) -> bool:
     return grid.cells * MODEL_NS_PER_CELL > INLINE_NS
 
 
-Kind = Literal["none", "full", "window", "repair", "coarse", "forced"]
-
-
-@dataclass(frozen=True, slots=True)
-class Update:
-    """What one call changed.
-
-    kind        the dearest thing that was done: nothing, the exact tree, a window, a repair after map changes, a
-                window and the corridors beyond it, a window that was forced
-    window      the cells that may have a new cost or parent; empty if none
-    cells       how many cells the kernels visited
-    wants_full  please run `full_job` on a worker, and `adopt` what it returns
-    """
-
-    kind: Kind
-    window: Window = EMPTY
-    cells: int = 0
-    wants_full: bool = False
-
-
 class TargetTree:
     """The tree of one target under one strategy.
 
@@ -75,6 +54,8 @@ class TargetTree:
     ready        whether routes can be given; if not, every route's status is NO_TARGET
     all_kernels  whether kernels beside those for whole trees may be called by now. While it says no, windows,
                  repairs and corridors give way to whole trees, so that nothing waits for a compilation
+    has_worker   whether a growth that takes longer than `INLINE_NS` is left to `full_job`. Until that is adopted
+                 the tree leads where it led, and says so by `target_cell`; where it is of no use, `ready` is false
     last_gaps    float64, driven cost over optimum of what was offered to each followed vehicle, measured by the
                  last `adopt`; empty before
     """
@@ -85,6 +66,8 @@ class TargetTree:
         config: PlannerConfig,
         climb: Climb | None = None,
         all_kernels: Callable[[], bool] = lambda: True,
+        *,
+        has_worker: bool = False,
     ) -> None:
         self.target_cell: int | None = None
         self.map_version = -1
@@ -94,9 +77,9 @@ class TargetTree:
         self._config = config
         self._all_kernels = all_kernels
         self._side = max(grid.rows, grid.cols)
-        self._new_cost_grid = partial(cost_grid_of, grid, config, climb)
+        self._has_worker = has_worker
         # The cell costs of the map as it was last told, and whether it was told at all.
-        self._costs = self._new_cost_grid()
+        self._costs = cost_grid_of(grid, config, climb)
         self._loaded = False
         self._tree = CostToGoTree(self._costs)
         # The tree is of no use and must be grown: before the first, and when the map changed without a target.
@@ -106,8 +89,10 @@ class TargetTree:
         self._full_root = 0
         # A worker has a `full_job` that was not adopted yet: no second one is asked for.
         self._job_out = False
-        # The corridors of strategies that thin far cells; None until a worker found them, and again once stale.
-        self._corridors: CorridorGraph | None = None
+        # A full growth was left to the worker: until it is adopted, moves are not followed.
+        self._left_to_worker = False
+        # The corridors of strategies that thin far cells.
+        self._corridors = CorridorUpkeep()
         # What a full growth takes, ns: the model's figure until `observe_full_ns` tells a measured one.
         self._full_ns = self.measured_model_ns()
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
@@ -122,6 +107,12 @@ class TargetTree:
         """The row in force now; under `auto` it changes with `observe_full_ns`."""
         only_whole = self._costs.directed or not self._all_kernels()
         return row_of(self._config.strategy, self._auto.stage, only_whole=only_whole)
+
+    def share(self, cell_cost: Floats) -> None:
+        """Begin with the cell costs of the map as it is before any mark, which other processes share; `update` is
+        told all changes since. Before the first `update`."""
+        self._costs.share(cell_cost)
+        self._loaded = True
 
     # --- keeping up ---------------------------------------------------------------------------------------------
 
@@ -143,26 +134,42 @@ class TargetTree:
         if self._stale:
             return self._grow_full(target_cell)
         self._moves += moved
-        if self.strategy.on_move is OnMove.WHOLE_TREE and (moved or not self._tree.exact):
+        whole = self.strategy.on_move is OnMove.WHOLE_TREE and (moved or not self._tree.exact)
+        if whole and self._is_quick(self._grid.cells):
             return self._grow_full(target_cell)
         repaired = self._repair(changes)
         if repaired is None:
             return self._grow_full(target_cell)
         done = repaired
-        if moved:
+        if whole:
+            done = self._leave_to_worker()
+        elif moved:
             done = self._move(target_cell)
-            if repaired.kind != "none" and done.kind != "full":
-                done = Update("window", done.window.union(repaired.window), done.cells + repaired.cells)
-        return Update(done.kind, done.window, done.cells, self._is_full_due(done))
+        if repaired.kind != "none" and done.kind == "none":
+            done = Update(repaired.kind, repaired.window, repaired.cells, done.wants_full)
+        elif repaired.kind != "none" and done.kind != "full" and moved:
+            done = Update("window", done.window.union(repaired.window), done.cells + repaired.cells)
+        return Update(done.kind, done.window, done.cells, done.wants_full or self._is_full_due(done))
 
-    def full_job(self, pace_snapshot: Floats, target_cell: int, map_version: int) -> Callable[[], GrownTree]:
-        """A full growth for a worker: see `growth_job`. `pace_snapshot` must not change before it ends."""
-        check_pace(self._grid, pace_snapshot)
+    def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
+        """A full growth for a worker, on the map as it was told last: see `growth_job`."""
         leads_there = self.ready and not self._stale and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
-        wants_corridors = self.strategy.thins_far_cells and self._corridors is None
-        return growth_job(self._new_cost_grid, pace_snapshot, target_cell, map_version, offered, wants_corridors)
+        return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered)
+
+    @property
+    def wants_corridors(self) -> bool:
+        """Please run `corridor_job` on a worker, and `take_corridors` once it has found them."""
+        return self.strategy.thins_far_cells and self._loaded and self._corridors.wanted
+
+    def corridor_job(self, shelf: CorridorShelf | None = None) -> CorridorSearch:
+        """See `CorridorUpkeep.search`."""
+        return self._corridors.search(self._costs, shelf)
+
+    def take_corridors(self, search: CorridorSearch) -> None:
+        """Go by the corridors that were found."""
+        self._corridors.take(self._costs, search)
 
     def adopt(
         self,
@@ -177,7 +184,7 @@ class TargetTree:
 
         dirty  covers every cell that changed since the snapshot of `grown` was taken
         """
-        self._job_out = False
+        self._job_out = self._left_to_worker = False
         first = not self._loaded
         changes = self._learn(pace, dirty)
         self.map_version = map_version
@@ -186,29 +193,27 @@ class TargetTree:
         if not self._set_target(target_cell, changes):
             return Update("none")
         since = self._costs.difference(grown.cell_cost, [self._grid.window] if first else dirty)
-        if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
-            return self._grow_full(target_cell)
         tree = self._tree
+        if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
+            repaired = None if self._stale else self._repair(changes)
+            if repaired is None or self._is_quick(self._grid.cells):
+                return self._grow_full(target_cell)
+            return self._leave_to_worker() if target_cell != tree.root else repaired
         tree.take(grown.target_cell, grown.cost, grown.parent, grown.reach)
         self._note_full_growth(grown.target_cell)
-        self._bounds.take(grown.cost.copy())
+        self._bounds.take(grown.heuristic)
         self._learn_bounds(since)
         self._stale = False
-        if grown.corridors is not None:
-            fresh = not since.cells.size or grown.corridors.learn(self._costs, since)
-            self._corridors = grown.corridors if fresh else None
         moved = target_cell != tree.root
-        if moved and self.strategy.on_move is OnMove.WHOLE_TREE:
-            return self._grow_full(target_cell)
-        if not tree.fine and (since.cells.size or moved):
+        whole = moved and (self.strategy.on_move is OnMove.WHOLE_TREE or not tree.fine)
+        if whole and self._is_quick(self._grid.cells):
             return self._grow_full(target_cell)
         repaired = self._repair(since)
         if repaired is None:
             return self._grow_full(target_cell)
         cells = self._grid.cells + repaired.cells
-        if moved:
-            cells += self._move(target_cell).cells
-        return Update("full", self._grid.window, cells)
+        then = self._leave_to_worker() if whole else self._move(target_cell) if moved else repaired
+        return Update("full", self._grid.window, cells + then.cells * moved, then.wants_full)
 
     def force(self, cells: Any) -> Update:
         """Force the range to cover these cells (section 3.3.2): what they get afterwards is the best there is.
@@ -289,8 +294,7 @@ class TargetTree:
             self._loaded = True
             return None
         changes = self._costs.apply(pace, dirty)
-        if changes.cells.size and self._corridors is not None and not self._corridors.learn(self._costs, changes):
-            self._corridors = None
+        self._corridors.learn(self._costs, changes)
         if changes.any_lower:
             self._tree.window_bound = None
         self._learn_bounds(changes)
@@ -310,7 +314,22 @@ class TargetTree:
             self._stale = True
         return self.ready
 
+    def _is_quick(self, cells: int) -> bool:
+        """Whether so many cells may be grown on the thread that answers."""
+        return not self._has_worker or cells * self._full_ns <= INLINE_NS * self._grid.cells
+
+    def _leave_to_worker(self) -> Update:
+        """Ask for a full growth, and lead to the old root until it is adopted."""
+        self.target_cell = self._tree.root
+        self._left_to_worker = True
+        return Update("none", wants_full=not self._job_out)
+
     def _grow_full(self, target_cell: int) -> Update:
+        """Grow the whole tree: here or, where that would take too long, on the worker. The one that there is serves
+        no more."""
+        if not self._is_quick(self._grid.cells):
+            self._stale, self.ready, self.target_cell = True, False, None
+            return Update("none", wants_full=not self._job_out)
         self._tree.grow(target_cell)
         self._stale = False
         self._note_full_growth(target_cell)
@@ -345,6 +364,8 @@ class TargetTree:
     def _move(self, target_cell: int) -> Update:
         """Grow a window around the target's new cell, a wider one where that fails, at last the whole tree."""
         tree = self._tree
+        if self._left_to_worker or not (tree.fine or self._is_quick(self._grid.cells)):
+            return self._leave_to_worker()
         if not tree.fine:
             return self._grow_full(target_cell)
         if not tree.precise:
@@ -352,7 +373,7 @@ class TargetTree:
         half, corridors = self._window_reach(target_cell)
         window = self._grid.around(target_cell, half)
         cells = 0
-        while window.cells * 2 < self._grid.cells:
+        while window.cells * 2 < self._grid.cells and self._is_quick(window.cells):
             connected = tree.move(target_cell, window)
             cells += window.cells
             if connected and corridors is not None:
@@ -363,13 +384,13 @@ class TargetTree:
                 return Update("window", window, cells)
             half *= 2
             window = self._grid.around(target_cell, half)
-        return self._grow_full(target_cell)
+        return self._grow_full(target_cell) if self._is_quick(self._grid.cells) else self._leave_to_worker()
 
     def _window_reach(self, target_cell: int) -> tuple[int, CorridorGraph | None]:
         """How far to every side of the target the tree is grown now, and over which corridors beyond; None for not
         at all."""
         row, old = self.strategy, self._tree.root
-        corridors = self._corridors if row.thins_far_cells else None
+        corridors = self._corridors.graph if row.thins_far_cells else None
         least = 2 * self._grid.distance_cells(old, target_cell)
         if row.on_move is OnMove.BLOCK_WINDOW:
             half = block_half(self._grid, old, target_cell, self._config.k_min)
@@ -386,8 +407,6 @@ class TargetTree:
         if done.kind == "full" or self._job_out:
             return False
         row = self.strategy
-        if row.thins_far_cells and self._corridors is None:
-            return True
         if row.full_growth is FullGrowth.EVERY_FEW_MOVES:
             # On a small map a full growth is due as soon as windows have cost half as much.
             twice = 2 * (2 * self._narrowest) ** 2

@@ -1,6 +1,11 @@
-"""Short names of array types for signatures; docstrings there give shapes and units."""
+"""Short names of array types for signatures; arrays in files which all processes of a machine share."""
 
 from __future__ import annotations
+
+import ctypes
+import os
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,3 +13,78 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
+
+
+class _Mapped(np.memmap[Any, Any]):
+    """A mapped file that stays open, so that it can be mapped again after its name has gone to another."""
+
+    file: Any = None
+
+    def __array_finalize__(self, obj: Any) -> None:
+        super().__array_finalize__(obj)
+        self.file = getattr(obj, "file", None)
+
+
+def open_array(path: Path) -> NDArray[Any]:
+    """The array of a .npy file, mapped read-only: its pages are in memory once, however many processes read them.
+
+    Raises OSError or ValueError where the file is not there or damaged; never runs code of it.
+    """
+    file = path.open("rb")
+    major, _ = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    shape, in_columns, dtype = read(file)
+    if dtype.hasobject or in_columns:
+        raise ValueError(f"array of {dtype}" if dtype.hasobject else "array in columns")
+    return np.asarray(_map(file, dtype, shape, file.tell(), "r"))
+
+
+def save_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an array where `open_array` reads it, at once: other processes see all of it or nothing. Raises
+    OSError."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with partial.open("wb") as file:
+            np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def private_copy(array: NDArray[Any]) -> NDArray[Any]:
+    """A copy that may be written to. Of an array from `open_array` only the pages that are written to (4 KiB each)
+    are copied, and when they are; the file stays as it is."""
+    mapped = array.base
+    if not isinstance(mapped, _Mapped) or mapped.shape != array.shape or mapped.dtype != array.dtype:
+        return np.array(array)
+    return np.asarray(_map(mapped.file, mapped.dtype, mapped.shape, mapped.offset, "c"))
+
+
+def give_back_memory() -> None:
+    """Return to the system what the allocator keeps of freed arrays; it keeps much where threads made them."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's
+    if trim is not None:
+        trim(0)
+
+
+def _map(file: Any, dtype: Any, shape: tuple[int, ...], offset: int, mode: Literal["r", "c"]) -> _Mapped:
+    mapped = _Mapped(file, dtype, mode, offset, shape)
+    mapped.file = file
+    return mapped
+
+
+class CellsOf:
+    """The cells of a mask, numbered in rows, without an array of them: that would take eight bytes a cell."""
+
+    def __init__(self, mask: Bools) -> None:
+        self.mask = mask
+        self._ends = np.cumsum(np.count_nonzero(mask, axis=1))  # how many there are up to the end of each row
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    def cell(self, number: int) -> int:
+        """The flat index of a cell; `number` is 0 to len - 1."""
+        row = int(np.searchsorted(self._ends, number, "right"))
+        before = int(self._ends[row - 1]) if row else 0
+        return row * int(self.mask.shape[1]) + int(np.flatnonzero(self.mask[row])[number - before])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
+from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError
@@ -51,11 +51,11 @@ class CostMap:
         self.terrain = terrain
         self.grid = terrain.grid
         self.version = 0
-        self.pace_s_per_m: Floats = np.array(terrain.pace_s_per_m, np.float32)
+        self.pace_s_per_m: Floats = private_copy(terrain.pace_s_per_m)
         self._halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
         self.ground_s_per_m: Floats = self.pace_s_per_m
         if self._halves:
-            self.ground_s_per_m = np.array(terrain.ground_s_per_m, np.float32)
+            self.ground_s_per_m = private_copy(terrain.ground_s_per_m)
         self._prior = np.asarray(terrain.ground_s_per_m).reshape(-1)
         self._dirty: list[Window] = []
 

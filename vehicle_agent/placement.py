@@ -7,6 +7,8 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.arrays import CellsOf, private_copy
+from shared_map.terrain.homes import homes_of
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ConfigError
@@ -17,31 +19,35 @@ _STREAM = 77
 
 
 def spawn_cells(
-    scenario: Scenario, grid: GridSpec, prior: NDArray[np.float32], truth: NDArray[np.float32]
+    scenario: Scenario,
+    grid: GridSpec,
+    prior: NDArray[np.float32],
+    truth: NDArray[np.float32],
+    homes: NDArray[np.bool_] | None = None,
 ) -> dict[str, dict[str, int]]:
     """agent -> vehicle -> cell, of the whole run. All cells differ and lie in the largest connected passable part,
     except those that the scenario names.
 
     prior, truth  float32 (rows, cols), s/m; inf is lethal
+    homes         bool (rows, cols), `homes_of` these two, if that is known; not changed
 
     Raises ConfigError for a cell outside the terrain, lethal or given twice, and if there are too few passable
     cells.
     """
-    passable = np.isfinite(prior) & np.isfinite(truth)
-    homes = _largest_part(passable).reshape(-1)
-    explicit = {group.name: _explicit_cells(group, grid, passable) for group in scenario.groups}
+    free = (homes_of(prior, truth) if homes is None else private_copy(homes)).reshape(-1)
+    explicit = {group.name: _explicit_cells(group, grid, prior, truth) for group in scenario.groups}
     taken: dict[int, str] = {}
     for name, cells in explicit.items():
         for cell in cells:
             if cell in taken:
                 raise ConfigError(f"groups: {name}: cell {list(grid.row_col(cell))} is given twice")
             taken[cell] = name
-    homes[list(taken)] = False
+    free[list(taken)] = False
     placed: dict[str, list[int]] = {}
     for group in scenario.groups:
         chosen = explicit[group.name]
-        chosen += _choose(group, group.vehicles - len(chosen), grid, homes, scenario.seed)
-        homes[chosen] = False
+        chosen += _choose(group, group.vehicles - len(chosen), grid, free, scenario.seed)
+        free[chosen] = False
         placed[group.name] = chosen
     return {
         plan.id: dict(zip(plan.vehicle_ids, placed[plan.group.name][plan.first :], strict=False))
@@ -60,18 +66,9 @@ def _along_a_curve(grid: GridSpec, cells: NDArray[np.int64]) -> NDArray[np.int64
     return place
 
 
-def _largest_part(passable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    # Imported here: it takes a tenth of a second, and nothing else in a vehicle needs it.
-    from scipy import ndimage
-
-    labels, count = ndimage.label(passable)
-    if count == 0:
-        return passable.copy()
-    part: NDArray[np.bool_] = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
-    return part
-
-
-def _explicit_cells(group: GroupConfig, grid: GridSpec, passable: NDArray[np.bool_]) -> list[int]:
+def _explicit_cells(
+    group: GroupConfig, grid: GridSpec, prior: NDArray[np.float32], truth: NDArray[np.float32]
+) -> list[int]:
     if len(group.cells) > group.vehicles:
         raise ConfigError(f"groups: {group.name}: {len(group.cells)} cells for {group.vehicles} vehicles")
     cells = []
@@ -79,24 +76,26 @@ def _explicit_cells(group: GroupConfig, grid: GridSpec, passable: NDArray[np.boo
         if not grid.inside(row, col):
             shape = f"{grid.rows} x {grid.cols}"
             raise ConfigError(f"groups: {group.name}: cell [{row}, {col}] is outside the terrain of {shape} cells")
-        if not passable[row, col]:
+        if not (np.isfinite(prior[row, col]) and np.isfinite(truth[row, col])):
             raise ConfigError(f"groups: {group.name}: cell [{row}, {col}] is lethal; choose a passable cell")
         cells.append(grid.cell(row, col))
     return cells
 
 
 def _choose(group: GroupConfig, count: int, grid: GridSpec, homes: NDArray[np.bool_], seed: int) -> list[int]:
-    free = np.flatnonzero(homes)
-    if len(free) < count:
+    places = CellsOf(homes.reshape(grid.rows, grid.cols))
+    if len(places) < count:
         raise ConfigError(
-            f"groups: {group.name}: {group.vehicles} vehicles, but only {len(free)} connected passable cells left"
+            f"groups: {group.name}: {group.vehicles} vehicles, but only {len(places)} connected passable cells left"
         )
     rng = np.random.default_rng([seed, _STREAM, zlib.crc32(group.name.encode())])
     if count == 0:
         return []
     if group.start == "spread":
-        chosen = rng.choice(free, count, replace=False)
+        numbers = rng.choice(len(places), count, replace=False)
+        chosen = np.array([places.cell(number) for number in numbers.tolist()], np.int64)
         return [int(cell) for cell in chosen[np.argsort(_along_a_curve(grid, chosen), kind="stable")]]
+    free = np.flatnonzero(homes)
     centre = int(rng.choice(free))
     south = np.abs(free // grid.cols - centre // grid.cols)
     east = np.abs(free % grid.cols - centre % grid.cols)

@@ -13,7 +13,7 @@ from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
-from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
@@ -70,7 +70,7 @@ class AgentService:
         scenario = setup.scenario
         plan = _plan_of(setup)
         grid = terrain.grid
-        spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth)
+        spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth, load_homes(setup, terrain, truth))
         self._member = Member(setup.info(grid, terrain.digest), bus, post)
         self.counters = self._member.counters
         for name in ("reroute_requests", "routes_received", "marks", "blocked_ticks"):

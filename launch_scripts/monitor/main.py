@@ -24,8 +24,8 @@ _FRAME_HZ = 10.0
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Records and shows the run until SIGTERM, SIGINT or the end of the launcher."""
     config = setup.scenario.monitor
-    terrain = load_terrain(setup)
-    mesh = TerrainMesh(terrain)
+    mesh = TerrainMesh(load_terrain(setup))
+    terrain = load_terrain(setup)  # mapped anew: of what the mesh has read most is not read again
     path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
     inbox = Inbox()
     with contextlib.ExitStack() as stack:

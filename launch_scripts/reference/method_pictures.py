@@ -59,8 +59,10 @@ class Chase:
         cell = self.grid.cell(*target)
         done = self.tree.update(self.pace, cell, [], self.version)
         if done.wants_full:
-            grown = self.tree.full_job(self.pace, cell, self.version)()
+            grown = self.tree.full_job(cell)()
             done = self.tree.adopt(grown, self.pace, cell, [], self.version, [])
+        if self.tree.wants_corridors:
+            self.tree.take_corridors(self.tree.corridor_job().run())
         self.widths.append(done.window.row1 - done.window.row0)
         return done
 

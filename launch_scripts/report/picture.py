@@ -33,12 +33,15 @@ from launch_scripts.report.palette import (
 from launch_scripts.report.plot_style import STYLE
 from launch_scripts.report.plots import draw_plots, duration, halo
 from launch_scripts.report.recorder import Recorder
+from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
 from swarm.wire.statements import MarkKind
 
 WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
 
 _SHOWN_LABELS = 30
+_SEEN_CELLS = 1 << 22
+"""Cells of the ground that are drawn at most: more than the picture has pixels."""
 
 
 def save_picture(
@@ -126,10 +129,11 @@ def _draw_map(axes: Axes, recorder: Recorder, terrain: Terrain, truth: NDArray[n
     grid = terrain.grid
     width_km, height_km = grid.cols * grid.resolution_m / 1000, grid.rows * grid.resolution_m / 1000
     extent = (0.0, width_km, height_km, 0.0)
-    axes.imshow(_ground(terrain), extent=extent, interpolation="bilinear")
+    seen = level_of(terrain, _SEEN_CELLS)
+    axes.imshow(_ground(seen), extent=extent, interpolation="bilinear")
     if truth is not None:
-        _draw_unknown(axes, terrain, truth)
-    _draw_marks(axes, recorder, terrain)
+        _draw_unknown(axes, terrain, truth, seen)
+    _draw_marks(axes, recorder, seen)
     _draw_tracks(axes, recorder)
     axes.set(xlim=(0, width_km), ylim=(height_km, 0))
     axes.set_aspect("equal", anchor="NW")
@@ -140,23 +144,24 @@ def _draw_map(axes: Axes, recorder: Recorder, terrain: Terrain, truth: NDArray[n
     _draw_legend(axes, truth is not None)
 
 
-def _ground(terrain: Terrain) -> NDArray[np.float32]:
+def _ground(seen: Level) -> NDArray[np.float32]:
     """The photo with hillshade, paled so that tracks stand out."""
-    shade = hillshade(terrain.elevation_m, terrain.grid.resolution_m)
-    photo = terrain.photo.astype(np.float32) / 255
+    shade = hillshade(seen.elevation_m, seen.grid.resolution_m)
+    photo = seen.photo.astype(np.float32) / 255
     grey = photo.mean(axis=2, keepdims=True)
     paled = 0.55 * (0.65 * photo + 0.35 * grey) + 0.45
     lit: NDArray[np.float32] = np.clip(paled * (0.62 + 0.55 * shade[..., None]), 0, 1).astype(np.float32)
     return lit
 
 
-def _draw_unknown(axes: Axes, terrain: Terrain, truth: NDArray[np.float32]) -> None:
+def _draw_unknown(axes: Axes, terrain: Terrain, truth: NDArray[np.float32], seen: Level) -> None:
     """Outlines hidden obstacles of the truth; marks fill in those that were found."""
     hidden = (truth != terrain.ground_s_per_m) & ~(np.isinf(truth) & np.isinf(terrain.pace_s_per_m))
     if not hidden.any():
         return
+    hidden = any_in_blocks(hidden, seen.side)
     rows, cols = hidden.shape
-    resolution_km = terrain.grid.resolution_m / 1000
+    resolution_km = seen.grid.resolution_m / 1000
     x = (np.arange(cols) + 0.5) * resolution_km
     y = (np.arange(rows) + 0.5) * resolution_km
     axes.contour(x, y, hidden.astype(np.float32), levels=[0.5], colors="white", linewidths=1.9, zorder=1)
@@ -165,15 +170,17 @@ def _draw_unknown(axes: Axes, terrain: Terrain, truth: NDArray[np.float32]) -> N
     )
 
 
-def _draw_marks(axes: Axes, recorder: Recorder, terrain: Terrain) -> None:
+def _draw_marks(axes: Axes, recorder: Recorder, seen: Level) -> None:
     marked = recorder.marked()
     if not len(marked.cells):
         return
-    grid = terrain.grid
+    grid = seen.grid
     overlay = np.zeros((grid.rows, grid.cols, 4), np.float32)
     lethal = marked.kinds == MarkKind.LETHAL
-    overlay.reshape(-1, 4)[marked.cells[~lethal]] = to_rgba(MARKED_SLOW, 0.85)
-    overlay.reshape(-1, 4)[marked.cells[lethal]] = to_rgba(MARKED_LETHAL, 0.95)
+    rows, cols = np.divmod(marked.cells, recorder.grid.cols)
+    cells = rows // seen.side * grid.cols + cols // seen.side
+    overlay.reshape(-1, 4)[cells[~lethal]] = to_rgba(MARKED_SLOW, 0.85)
+    overlay.reshape(-1, 4)[cells[lethal]] = to_rgba(MARKED_LETHAL, 0.95)
     extent = (0, grid.cols * grid.resolution_m / 1000, grid.rows * grid.resolution_m / 1000, 0)
     axes.imshow(overlay, extent=extent, interpolation="nearest", zorder=2)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.world.referee import Collision, LethalEntry, Referee
 from launch_scripts.world.walks import Budget, TrueTerrain, Walker, far_place, slowness_of
+from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
@@ -88,8 +89,10 @@ class TargetWorld:
         self._grid = terrain.grid
         # A target keeps to cells where a vehicle fits, by the truth and by the prior map: others are out of reach.
         halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
-        pace = np.where(terrain.lethal, np.float32(np.inf), inflate(truth_s_per_m, halves))
-        self._terrain = TrueTerrain(terrain.grid, pace.astype(np.float32))
+        pace: Floats = inflate(truth_s_per_m, halves) if halves else private_copy(truth_s_per_m)
+        # Few cells, so that most pages of the truth stay shared.
+        pace[terrain.lethal & np.isfinite(pace)] = np.inf
+        self._terrain = TrueTerrain(terrain.grid, pace)
         self._referee = Referee(np.isfinite(truth_s_per_m))
         self._own_incarnation = self._incarnation = incarnation
         # Of the poses of simulated targets that others tell: which are news, and the highest incarnation.

@@ -16,6 +16,7 @@ from scipy.ndimage import label
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from shared_map.arrays import CellsOf
 from swarm.config.scenario import CostConfig, TargetConfig, Walk
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
@@ -46,14 +47,18 @@ class TrueTerrain:
         regions, _ = label(self.passable)
         sizes = np.bincount(regions.ravel())
         sizes[0] = 0
-        self.home: NDArray[np.int64] = np.flatnonzero(regions.ravel() == int(sizes.argmax()))
+        self._home = CellsOf(regions == int(sizes.argmax()))
+
+    @property
+    def home(self) -> NDArray[np.int64]:
         """Cells of the largest connected passable part, int64, ascending."""
+        return np.flatnonzero(self._home.mask)
 
     def lethal(self, cell: int) -> bool:
         return not self.passable.flat[cell]
 
     def random_home(self, chance: random.Random) -> int:
-        return int(self.home[chance.randrange(len(self.home))])
+        return self._home.cell(chance.randrange(len(self._home)))
 
     def step(self, cell: int, direction: int) -> int | None:
         """The cell that a step leads to; None where the step is not possible."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +25,13 @@ from planner_service.kernels.layout import (
     step_offsets,
 )
 from planner_service.tree.growth import grow_tree
-from shared_map.arrays import Floats
+from shared_map.arrays import Bools, Floats, private_copy
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
 
 Cells = NDArray[np.int64]
+_NONE: Floats = np.empty(0, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,8 @@ def floats_of_bits(bits: tuple[int, int]) -> tuple[float, float]:
     return lowest, highest
 
 
+_BLOCK = 1 << 10
+"""Cells that are copied at a time: a page of memory."""
 _FEWEST, _MOST = 1 << 9, 1 << 14
 """Buckets of a repair."""
 _SMALL = 1 << 20
@@ -108,23 +112,32 @@ class CostGrid:
         self._metres = grid.resolution_m
         self.length_weight_s = config.length_weight * grid.resolution_m
         """s; what a cell's length costs beside the time. It is part of every cell cost."""
-        self.cell_cost: Floats = np.full(self.size, np.inf, np.float32)
-        """float32 (size,), s: price of a straight step into each cell; inf is lethal, as is the border. Lethal
-        everywhere before `load`; `load` and `apply` write it, in place."""
+        self.cell_cost: Floats = _NONE
+        """float32 (size,), s: price of a straight step into each cell; inf is lethal, as is the border. Empty
+        before `load` or `share`; `apply` writes it, in place."""
         self.lowest_cell_cost = math.inf
         """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
         self.highest_cell_cost = 0.0
         """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
-        self.padded: PaddedGrid = (
-            *(self.cell_cost, step_offsets(self.stride)),
-            *(self.stride, self.rule, self.corners),
-        )
-        """The same for kernels."""
+        self._offsets = step_offsets(self.stride)
+        self._shared: Floats | None = None
+        """What `cell_cost` began as, where that is mapped: `share` sets it, `load` resets it."""
+        self._written: Bools = np.zeros(self.size // _BLOCK + 1, np.bool_)
+        """Blocks of `_BLOCK` cells in which a cell cost has changed since `share`. `apply` sets it."""
         self._moves = route_walk.moves_of(self.stride, self.rule)
+        self._make_scratch()
+
+    def _make_scratch(self) -> None:
+        """What kernels write to: one thread's."""
         self._lanes = route_walk.make_lanes()
         """Scratch of `walk`, which makes it longer where routes are."""
         self._repair_scratch: repair.Scratch | None = None
         """Made by the first repair of a small map."""
+
+    @property
+    def padded(self) -> PaddedGrid:
+        """The same for kernels."""
+        return self.cell_cost, self._offsets, self.stride, self.rule, self.corners
 
     @property
     def buckets(self) -> Buckets:
@@ -167,10 +180,62 @@ class CostGrid:
     def load(self, pace: Floats) -> None:
         """Take the whole map. Raises ValueError on a pace that is NaN, zero or negative."""
         check_pace(self.grid, pace)
+        self._shared = None
+        self.cell_cost = np.full(self.size, np.inf, np.float32)
         bad = kernels.pad_cell_costs(pace, self._metres, self.length_weight_s, self.stride, self.cell_cost)
         if bad:
             raise ValueError(f"{bad} cells have a pace that is NaN, zero or negative; lethal is inf")
         self._find_range()
+
+    @property
+    def terms(self) -> tuple[float, float]:
+        """(m, s): a cell costs its pace times the first, plus the second."""
+        return self._metres, self.length_weight_s
+
+    def share(self, cell_cost: Floats) -> None:
+        """Take cell costs that another cost grid of the same `terms` has loaded, from `open_array`. What `apply`
+        changes is this grid's own. Raises ValueError unless they are of this grid."""
+        if cell_cost.shape != (self.size,) or cell_cost.dtype != np.float32:
+            raise ValueError(f"cell costs of this map are float32, {self.size} cells")
+        self._shared = cell_cost
+        self._written[:] = False
+        self.cell_cost = private_copy(cell_cost)
+        self._find_range()
+
+    def snapshot(self) -> Self:
+        """The same costs, which nobody changes any more. Of shared ones only what has changed is copied."""
+        frozen = copy.copy(self)
+        frozen._make_scratch()
+        if self._shared is None:
+            frozen.cell_cost = self.cell_cost.copy()
+            return frozen
+        frozen.cell_cost = private_copy(self._shared)
+        for block in np.flatnonzero(self._written).tolist():
+            part = np.s_[block * _BLOCK : (block + 1) * _BLOCK]
+            frozen.cell_cost[part] = self.cell_cost[part]
+        return frozen
+
+    @property
+    def shared(self) -> Self | None:
+        """A snapshot as of `share`; None where nothing is shared."""
+        if self._shared is None:
+            return None
+        first = copy.copy(self)
+        first._make_scratch()
+        first.cell_cost = private_copy(self._shared)
+        first._find_range()
+        return first
+
+    def changes_since(self, older: Floats) -> Changes:
+        """What has changed since the cell costs of an earlier snapshot of this grid."""
+        if self._shared is None:
+            cells = np.flatnonzero(self.cell_cost != older)
+        else:
+            starts = np.flatnonzero(self._written)[:, None] * _BLOCK
+            near = (starts + np.arange(_BLOCK)).reshape(-1)
+            near = near[near < self.size]
+            cells = near[self.cell_cost[near] != older[near]]
+        return Changes(cells, older[cells], self.cell_cost[cells])
 
     def _find_range(self) -> None:
         bits = kernels.cell_cost_range(self.cell_cost.view(np.int32))
@@ -202,6 +267,7 @@ class CostGrid:
                 self.lowest_cell_cost = min(self.lowest_cell_cost, float(lowest))
                 self.highest_cell_cost = max(self.highest_cell_cost, float(highest))
                 found.append(Changes(cells[:count], before[:count], self.cell_cost[cells[:count]]))
+                self._written[cells[:count] // _BLOCK] = True
         if not found:
             return NO_CHANGES
         changes = found[0]

@@ -37,10 +37,11 @@ class CostToGoTree:
     def __init__(self, cost_grid: CostGrid) -> None:
         self.cost_grid = cost_grid
         """The map that the tree lies on. Whoever changes it calls `repair`, or grows the tree anew."""
-        self.cost: Floats = np.full(cost_grid.size, np.inf, np.float32)
-        """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no way. `grow`
-        and `take` set it, `move`, `grow_corridors`, `tighten`, `relabel` and `repair` change it."""
-        self.parent: NDArray[np.uint8] = np.full(cost_grid.size, NONE, np.uint8)
+        self.cost: Floats = np.empty(0, np.float32)
+        """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no way. Empty
+        before the first growth. `grow` and `take` set it, `move`, `grow_corridors`, `tighten`, `relabel` and
+        `repair` change it."""
+        self.parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         """uint8, padded: direction of each cell's next cell; NONE at the root and where there is no way."""
         self.root = -1
         """The target's cell, of the grid; -1 before the first growth. `grow`, `take` and `move` set it."""
@@ -65,6 +66,9 @@ class CostToGoTree:
         """Grow the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
         it is lethal."""
         self.cost_grid.check_root(root)
+        if not self.cost.size:
+            self.cost = np.empty(self.cost_grid.size, np.float32)
+            self.parent = np.full(self.cost_grid.size, NONE, np.uint8)
         self.reach = self.cost_grid.grow(self.cost_grid.pad(root), self.cost, self.parent)
         self._become_exact(root)
 

@@ -24,9 +24,15 @@ def bands(rows: int, band_rows: int = BAND_ROWS) -> list[tuple[int, int]]:
     return [(row, min(row + band_rows, rows)) for row in range(0, rows, band_rows)]
 
 
-def in_bands(rows: int, work: Callable[[int, int], None], what: str = "", progress: Progress = no_progress) -> None:
+def in_bands(
+    rows: int,
+    work: Callable[[int, int], None],
+    what: str = "",
+    progress: Progress = no_progress,
+    band_rows: int = BAND_ROWS,
+) -> None:
     """`work(row0, row1)` for all bands, on as many threads as there are cores (four at most)."""
-    todo = bands(rows)
+    todo = bands(rows, band_rows)
     workers = min(os.cpu_count() or 1, 4, len(todo))
     if workers < 2:
         for done, (row0, row1) in enumerate(todo):

@@ -16,8 +16,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bytes, Floats
+from shared_map.arrays import Bools, Bytes, Floats, give_back_memory, open_array, save_array
 from shared_map.terrain.hidden import true_ground
+from shared_map.terrain.homes import homes_of
+from shared_map.terrain.kept import fetch_kept, keep, kept_key
 from shared_map.terrain.layers import (
     TerrainClass,
     class_factors,
@@ -247,6 +249,7 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
         "pace": terrain.pace_s_per_m,
         "classes": terrain.classes,
         "truth": truth,
+        "homes": homes_of(terrain.pace_s_per_m, truth),
     }
     if terrain.ground_s_per_m is not terrain.pace_s_per_m:
         arrays["ground"] = terrain.ground_s_per_m
@@ -266,9 +269,7 @@ def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") 
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _META).unlink(missing_ok=True)
         for name, array in arrays.items():
-            path = folder / f"{name}.npy"
-            path.unlink(missing_ok=True)  # a process that has the old one mapped keeps it
-            np.save(path, np.ascontiguousarray(array), allow_pickle=False)
+            save_array(folder / f"{name}.npy", array)  # a process that has the old one mapped keeps it
         partial = folder / f"{_META}.part"
         partial.write_text(json.dumps(meta, indent=1), encoding="utf-8")
         partial.rename(folder / _META)
@@ -280,8 +281,8 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
     """The terrain that `save_prepared` left, mapped read-only; None if there is none, or one of another key.
 
     Raises TerrainError if it is damaged."""
-    meta = _read_meta(folder)
-    if meta is None or (key and meta.get("key") != key):
+    meta = _read_meta(folder, key)
+    if meta is None:
         return None
     try:
         grid = GridSpec(**meta["grid"])
@@ -312,14 +313,14 @@ def load_prepared(folder: Path, key: str = "") -> Terrain | None:
 
 def load_prepared_truth(folder: Path, key: str = "") -> Floats | None:
     """The truth beside a prepared terrain; None if there is none."""
-    meta = _read_meta(folder)
-    if meta is None or (key and meta.get("key") != key):
+    meta = _read_meta(folder, key)
+    if meta is None:
         return None
     grid = GridSpec(**meta["grid"])
     return _read_array(folder, "truth", (grid.rows, grid.cols), np.float32)
 
 
-def _read_meta(folder: Path) -> dict[str, Any] | None:
+def _read_meta(folder: Path, key: str) -> dict[str, Any] | None:
     try:
         if not (folder / _META).exists():
             return None
@@ -328,7 +329,7 @@ def _read_meta(folder: Path) -> dict[str, Any] | None:
         raise TerrainError(
             f"prepared terrain {folder / _META} is unreadable ({error}); delete the folder"
         ) from error
-    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT or (key and meta.get("key") != key):
         return None
     return meta
 
@@ -336,7 +337,7 @@ def _read_meta(folder: Path) -> dict[str, Any] | None:
 def _read_array(folder: Path, name: str, shape: Iterable[int], dtype: type[Any]) -> NDArray[Any]:
     path = folder / f"{name}.npy"
     try:
-        array: NDArray[Any] = np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+        array = open_array(path)
     except (OSError, ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
         raise TerrainError(f"prepared terrain {path} is unreadable ({error}); delete the folder") from error
     if array.shape != tuple(shape) or array.dtype != dtype:
@@ -362,9 +363,26 @@ def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
     return build_truth(setup.scenario, terrain)
 
 
+def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
+    """`homes_of` the terrain and truth of a run, as `load_terrain`; the caller must not write to it."""
+    meta = None if setup.run_dir is None else _read_meta(setup.run_dir, scenario_key(setup.scenario))
+    if setup.run_dir is not None and meta is not None and "homes" in meta["arrays"]:
+        return _read_array(setup.run_dir, "homes", (terrain.grid.rows, terrain.grid.cols), np.bool_)
+    return homes_of(terrain.pace_s_per_m, truth)
+
+
 def prepare(folder: Path, scenario: Scenario) -> tuple[Terrain, Floats]:
-    """Build terrain and truth of a scenario and leave them in a folder for the other processes."""
-    terrain = build_terrain(scenario)
-    truth = build_truth(scenario, terrain)
-    save_prepared(folder, terrain, truth, scenario_key(scenario))
-    return terrain, truth
+    """Build terrain and truth of a scenario, unless they are kept from an earlier run, and leave them in a folder
+    for the other processes. What is returned is mapped, as theirs."""
+    key, kept = scenario_key(scenario), kept_key(scenario)
+    if kept is None or not fetch_kept(kept, folder):
+        terrain = build_terrain(scenario)
+        save_prepared(folder, terrain, build_truth(scenario, terrain), key)
+        del terrain
+        give_back_memory()
+        if kept is not None:
+            keep(kept, [folder / _META, *folder.glob("*.npy")])
+    mapped, truth = load_prepared(folder, key), load_prepared_truth(folder, key)
+    if mapped is None or truth is None:
+        raise TerrainError(f"the prepared terrain in {folder} has gone: it is another run's; start again")
+    return mapped, truth

@@ -21,9 +21,6 @@ from swarm.runtime.stats import Counters
 
 log = logging.getLogger(__name__)
 
-WORK_GRACE_S = 1.5
-"""How long a closed worker waits for the job in hand; the launcher kills a process that takes 5 s to end."""
-
 
 _WORKER_NICE = 5
 """By how much less urgent jobs of a worker are than their process."""
@@ -90,11 +87,10 @@ class ThreadWorker:
                 self._inbox.fail(error)
 
     def close(self) -> None:
+        """Begin no other job. The one in hand is left to itself: nobody waits for it, and the process's end ends
+        it."""
         self._closed = True
         self._jobs.put(None)
-        self._thread.join(WORK_GRACE_S)
-        if self._thread.is_alive():
-            log.warning("left the job in hand, which did not end within %g s", WORK_GRACE_S)
 
 
 class Process:

@@ -91,7 +91,7 @@ def test_the_windows_of_variable_range_are_as_wide_as_in_the_papers_figure_3() -
 def test_a_growth_for_a_target_that_was_outside_is_made_up_for_once_it_is_back(outside: int) -> None:
     play = Play(random_pace(np.random.default_rng(3), 20, 20, 5.0, 0.1), PlannerConfig(strategy="rotation"))
     play.tree.update(play.pace, outside, [], 0)
-    grown = play.tree.full_job(play.pace, outside, 0)()
+    grown = play.tree.full_job(outside)()
     assert play.tree.adopt(grown, play.pace, play.target, [], 0, np.arange(400)).kind == "full"
     play.check()
 

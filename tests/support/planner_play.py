@@ -9,25 +9,37 @@ import numpy as np
 from support import slow_twins as naive
 from support.planner_strategies import Job, Marks, Move
 
-from planner_service.target_tree import GrownTree, TargetTree
+from planner_service.full_growth import GrownTree
+from planner_service.target_tree import TargetTree
+from planner_service.tree.corridors import CorridorSearch
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import RouteStatus
 
 
 class Play:
-    """A tree, the map it is told of, and the job that a worker may have of it."""
+    """A tree, the map it is told of, and the job that a worker may have of it.
+
+    has_worker  long growths are left to that job: until it is adopted, answers are about where the target was
+    """
 
     def __init__(
-        self, pace: np.ndarray, config: PlannerConfig, all_kernels: Callable[[], bool] = lambda: True
+        self,
+        pace: np.ndarray,
+        config: PlannerConfig,
+        all_kernels: Callable[[], bool] = lambda: True,
+        *,
+        has_worker: bool = False,
     ) -> None:
         self.pace = pace
         self.config = config
         self.grid = GridSpec(*pace.shape, 1.0)
-        self.tree = TargetTree(self.grid, config, None, all_kernels)
+        self.tree = TargetTree(self.grid, config, None, all_kernels, has_worker=has_worker)
+        self.has_worker = has_worker
         self.version = 0
         self.target = int(np.flatnonzero(np.isfinite(pace))[0])
         self.grown: GrownTree | None = None
+        self.search: CorridorSearch | None = None
         self.since: list[Window] = []
         self.rules = {
             "neighbours": config.neighbours,
@@ -49,14 +61,19 @@ class Play:
             self.version += 1
             self.tree.update(self.pace, self.target, [window], self.version)
         elif event.what == "begin":
-            job = self.tree.full_job(self.pace.copy(), self.target, self.version)
+            job = self.tree.full_job(self.target)
             self.grown = job()
+            if self.tree.wants_corridors:
+                self.search = self.tree.corridor_job()
             self.since = []
         elif event.what == "end" and self.grown is not None:
             self.tree.adopt(
                 self.grown, self.pace, self.target, self.since, self.version, np.arange(self.grid.cells)
             )
             self.grown = None
+            if self.search is not None:
+                self.tree.take_corridors(self.search.run())
+                self.search = None
         elif event.what == "force":
             self.tree.force([0, self.grid.cells - 1])
 
@@ -72,10 +89,14 @@ class Play:
     def check(self) -> None:
         """Laws (a) to (c), certificates and upper bounds, for a route from every cell."""
         routes = self.tree.routes(np.arange(self.grid.cells))
-        if not np.isfinite(self.pace.flat[self.target]):
+        waits = self.has_worker and not self.tree.ready
+        if waits or not np.isfinite(self.pace.flat[self.target]):
             assert all(route.status is RouteStatus.NO_TARGET for route in routes)
             return
-        optimum = naive.cost_to_go(self.pace, self.target, **self.rules).reshape(-1)
+        target = self.tree.target_cell
+        assert target is not None
+        assert self.has_worker or target == self.target
+        optimum = naive.cost_to_go(self.pace, target, **self.rules).reshape(-1)
         lethal = ~np.isfinite(self.pace.reshape(-1))
         for cell, route in enumerate(routes):
             if lethal[cell]:
@@ -91,7 +112,7 @@ class Play:
             found = naive.follow(self.pace, cell, routes[cell].directions, **self.rules)
             assert found is not None, "the route enters a lethal cell, squeezes or leaves the grid"
             last, driven[n] = found
-            assert last == self.target
+            assert last == target
         cost = np.array([routes[cell].cost_s for cell in cells])
         bound = np.array([routes[cell].lower_bound_s for cell in cells])
         upper = self.tree.cost_to_go_at(cells)
@@ -100,5 +121,5 @@ class Play:
         assert (bound <= best * (1 + 1e-12)).all()
         assert (cost >= best * (1 - 1e-6)).all()
         assert (upper >= driven * (1 - 1e-4)).all()
-        if self.config.strategy == "full":
+        if self.config.strategy == "full" and not self.has_worker:
             np.testing.assert_allclose(cost, best, rtol=1e-5)

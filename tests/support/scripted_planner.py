@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.actions import Action, GrowTree
 from planner_service.full_growth import GrownTree
-from planner_service.planner import Action, GrowTree, Planner
-from planner_service.target_tree import TargetTree, Update
+from planner_service.planner import Planner
+from planner_service.target_tree import TargetTree
+from planner_service.update import Update
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -37,6 +39,7 @@ class ScriptedTree(TargetTree):
         super().__init__(GRID, PlannerConfig())
         self.calls: list[tuple[Any, ...]] = []
         self.answers: list[Update] = []
+        self.told_version = -1
         self.gap = 1.0
         self.gaps: NDArray[np.float64] = np.empty(0)
 
@@ -46,12 +49,11 @@ class ScriptedTree(TargetTree):
         self.calls.append(("update", target_cell, list(dirty), map_version))
         return self._answer(target_cell, map_version, Update("full", GRID.window, GRID.cells))
 
-    def full_job(
-        self, pace_snapshot: NDArray[np.float32], target_cell: int, map_version: int
-    ) -> Callable[[], GrownTree]:
+    def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
+        map_version = self.told_version
         self.calls.append(("full_job", target_cell, map_version))
         cost, parent = np.zeros(1, np.float32), np.zeros(1, np.uint8)
-        return lambda: GrownTree(target_cell, map_version, cost, parent, cost, 1.0, None)
+        return lambda: GrownTree(target_cell, map_version, cost, cost, parent, cost, 1.0, None)
 
     def adopt(
         self,
@@ -86,6 +88,7 @@ class ScriptedTree(TargetTree):
         return [call for call in self.calls if call[0] == name]
 
     def _answer(self, target_cell: int, map_version: int, otherwise: Update) -> Update:
+        self.told_version = map_version
         update = self.answers.pop(0) if self.answers else otherwise
         if update.kind != "none":
             self.ready, self.target_cell, self.map_version = True, target_cell, map_version

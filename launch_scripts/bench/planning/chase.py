@@ -306,14 +306,15 @@ class _Racer:
         update = tree.update(self._pace, cell, [], 0)
         if update.kind == "full":
             tree.observe_full_ns(time.thread_time_ns() - began_ns)
+        if tree.wants_corridors:
+            tree.take_corridors(tree.corridor_job().run())
         if count:
             self.tally.count(update.kind)
         if not (update.wants_full or grow):
             return
         began_ns = time.thread_time_ns()
-        grown = tree.full_job(self._pace, cell, 0)()
-        if grown.corridors is None:
-            tree.observe_full_ns(time.thread_time_ns() - began_ns)
+        grown = tree.full_job(cell)()
+        tree.observe_full_ns(time.thread_time_ns() - began_ns)
         tree.adopt(grown, self._pace, cell, [], 0, followed)
         if count:
             self.tally.count("job")

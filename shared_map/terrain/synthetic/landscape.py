@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.terrain.layers import TerrainClass, gradient, gradient_of_padded
+from shared_map.terrain import layers
+from shared_map.terrain.layers import TerrainClass, grade_of_padded, gradient, gradient_of_padded
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
-from shared_map.terrain.synthetic.noise import fractal, mountains
+from shared_map.terrain.synthetic.noise import fractal_noise, mountain_noise
 from shared_map.terrain.synthetic.rivers import carve
 
 TINT = np.array(
@@ -49,12 +50,18 @@ def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Flo
     """
     rng = np.random.default_rng([seed, 1])
     broad = max(min(rows, cols) / 2.5, 8.0)
-    ridges = mountains(rng, rows, cols, broad, ridged=True)
-    where = mountains(rng, rows, cols, broad * 1.5)
-    hills = mountains(rng, rows, cols, broad / 2)
-    where -= np.float32(where.min())
-    where /= np.float32(max(float(where.max()), 1e-6))
-    height = ridges * where * where + hills * np.float32(0.15)
+    ridges = mountain_noise(rng, rows, cols, broad, ridged=True)
+    where = mountain_noise(rng, rows, cols, broad * 1.5).whole()
+    hills = mountain_noise(rng, rows, cols, broad / 2)
+    low = np.float32(where.min())
+    span = np.float32(max(float(np.float32(where.max()) - low), 1e-6))
+    height = where
+
+    def work(row0: int, row1: int) -> None:
+        share = (where[row0:row1] - low) / span
+        height[row0:row1] = ridges.band(row0, row1) * share * share + hills.band(row0, row1) * np.float32(0.15)
+
+    in_bands(rows, work)
     height -= np.float32(height.min())
     height *= np.float32(relief_m / max(float(height.max()), 1e-6))
     return height
@@ -108,18 +115,35 @@ def cover(elevation_m: Floats, resolution_m: float, seed: int) -> Bytes:
     """
     rows, cols = elevation_m.shape
     rng = np.random.default_rng([seed, 2])
-    east, north = gradient(elevation_m, resolution_m)
-    grade = np.sqrt(east * east + north * north)
-    patches = fractal(rng, rows, cols, max(min(rows, cols) / 12, 4.0))
-    known = ~np.isnan(elevation_m)
-    steep = np.quantile(grade[known], 0.985) if known.any() else 1.0
-    gentle = np.quantile(grade[known], 0.30) if known.any() else 0.0
+    grade = _grade(elevation_m, resolution_m)
+    patches = fractal_noise(rng, rows, cols, max(min(rows, cols) / 12, 4.0))
+    known = grade[~np.isnan(elevation_m)]
+    steep = np.quantile(known, 0.985) if known.size else 1.0
+    gentle = np.quantile(known, 0.30) if known.size else 0.0
     classes = np.full((rows, cols), TerrainClass.GRASS, np.uint8)
-    classes[(grade > gentle) & (patches > -0.12)] = TerrainClass.FOREST
-    classes[(grade <= gentle) & (patches < -0.35)] = TerrainClass.SOIL
-    classes[grade > max(float(steep), 0.3)] = TerrainClass.ROCK
-    classes[~known] = TerrainClass.UNKNOWN
+
+    def work(row0: int, row1: int) -> None:
+        here, slope, patch = classes[row0:row1], grade[row0:row1], patches.band(row0, row1)
+        here[(slope > gentle) & (patch > -0.12)] = TerrainClass.FOREST
+        here[(slope <= gentle) & (patch < -0.35)] = TerrainClass.SOIL
+        here[slope > max(float(steep), 0.3)] = TerrainClass.ROCK
+        here[np.isnan(elevation_m[row0:row1])] = TerrainClass.UNKNOWN
+
+    in_bands(rows, work)
     return classes
+
+
+def _grade(elevation_m: Floats, resolution_m: float) -> Floats:
+    """`layers.grade`, to the bit, in bands where no void makes that depend on the whole."""
+    if np.isnan(elevation_m).any():
+        return layers.grade(elevation_m, resolution_m)
+    steepness = np.empty(elevation_m.shape, np.float32)
+
+    def work(row0: int, row1: int) -> None:
+        steepness[row0:row1] = grade_of_padded(padded_rows(elevation_m, row0, row1), resolution_m)
+
+    in_bands(elevation_m.shape[0], work)
+    return steepness
 
 
 def flat_water(elevation_m: Floats, at_least: int = 4) -> Bools:
@@ -203,12 +227,12 @@ def paint_photo(
     uint8 (rows, cols, 3), red, green, blue
     """
     rows, cols = elevation_m.shape
-    texture = fractal(np.random.default_rng([seed, 3]), rows, cols, 16.0)
+    texture = fractal_noise(np.random.default_rng([seed, 3]), rows, cols, 16.0)
     low, high = float(np.nanmin(elevation_m)), float(np.nanmax(elevation_m))
     photo = np.empty((rows, cols, 3), np.uint8)
 
     def work(row0: int, row1: int) -> None:
-        here, grain = elevation_m[row0:row1], texture[row0:row1]
+        here, grain = elevation_m[row0:row1], texture.band(row0, row1)
         colour = TINT[np.minimum(classes[row0:row1], len(TINT) - 1)].astype(np.float32)
         water = classes[row0:row1] == TerrainClass.WATER
         height = np.nan_to_num((here - np.float32(low)) / np.float32(max(high - low, 1e-3)))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
+from shared_map.terrain.row_bands import in_bands
 from shared_map.terrain.synthetic.noise import fractal
 
 FORD_EVERY, FORD_LENGTH = 64, 4
@@ -39,8 +40,6 @@ def carve(elevation_m: Floats, count: int, resolution_m: float, seed: int) -> tu
     water, fords : bool (rows, cols)
         Deep cells, and shallow ones every `FORD_EVERY` cells along a river. No cell is both.
     """
-    from scipy import ndimage
-
     rng = np.random.default_rng([seed, 6])
     courses = _courses(elevation_m, count, rng)
     water, fords = np.zeros(elevation_m.shape, np.bool_), np.zeros(elevation_m.shape, np.bool_)
@@ -51,8 +50,8 @@ def carve(elevation_m: Floats, count: int, resolution_m: float, seed: int) -> tu
         water[rows, cols] = True
         shallow = (np.arange(len(rows)) + int(rng.integers(FORD_EVERY))) % FORD_EVERY < FORD_LENGTH
         fords[rows[shallow], cols[shallow]] = True
-    water = np.asarray(ndimage.binary_dilation(water), np.bool_)
-    fords = np.asarray(ndimage.binary_dilation(fords, iterations=2), np.bool_) & water
+    water = _wider(water)
+    fords = _wider(_wider(fords)) & water
     return _cut(elevation_m, level, resolution_m), water & ~fords, fords
 
 
@@ -116,8 +115,45 @@ def _cut(elevation_m: Floats, level: Floats, resolution_m: float) -> Floats:
     """A valley: nowhere higher above the river than its banks rise, steeper the farther away."""
     from scipy import ndimage
 
-    distance, nearest = ndimage.distance_transform_edt(np.isinf(level), return_indices=True)
-    away = distance.astype(np.float32) * np.float32(resolution_m)
-    rise = away * np.float32(_BANK_GRADE) * (np.float32(1) + away / np.float32(12 * resolution_m))
-    lowered: Floats = np.minimum(elevation_m, level[tuple(nearest)] + rise)
+    rows, cols = elevation_m.shape
+    dry = np.isinf(level)
+    lowered = elevation_m.copy()
+    if dry.all():
+        return lowered
+    # A river cuts nothing that is farther away than this, so that parts of the terrain can be cut by themselves.
+    most_m = float(elevation_m.max()) - float(level.min())
+    reach = 1
+    while reach < rows and _rise(np.float32(reach * resolution_m), resolution_m) <= most_m:
+        reach *= 2
+
+    def work(row0: int, row1: int) -> None:
+        above, below = max(row0 - reach, 0), min(row1 + reach, rows)
+        if dry[above:below].all():
+            return
+        nearest = ndimage.distance_transform_edt(dry[above:below], return_distances=False, return_indices=True)[
+            :, row0 - above : row1 - above
+        ]
+        south = nearest[0] - np.arange(row0 - above, row1 - above, dtype=np.int32)[:, None]
+        east = nearest[1] - np.arange(cols, dtype=np.int32)
+        away = np.sqrt((south * south + east * east).astype(np.float64)).astype(np.float32)
+        away *= np.float32(resolution_m)
+        bank = level[above:below][tuple(nearest)] + _rise(away, resolution_m)
+        np.minimum(elevation_m[row0:row1], bank, out=lowered[row0:row1])
+
+    in_bands(rows, work, band_rows=max(2 * reach, -(-rows // 4)))
     return lowered
+
+
+def _rise(away_m: Any, resolution_m: float) -> Any:
+    """How far a bank rises above the river, m."""
+    return away_m * np.float32(_BANK_GRADE) * (np.float32(1) + away_m / np.float32(12 * resolution_m))
+
+
+def _wider(cells: Bools) -> Bools:
+    """These cells and their four neighbours."""
+    wide = cells.copy()
+    wide[1:] |= cells[:-1]
+    wide[:-1] |= cells[1:]
+    wide[:, 1:] |= cells[:, :-1]
+    wide[:, :-1] |= cells[:, 1:]
+    return wide

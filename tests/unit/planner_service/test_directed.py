@@ -21,7 +21,7 @@ from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.traffic import Grant, Table
+from swarm.wire.messages.traffic import Granted
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent import Agent, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
@@ -232,7 +232,7 @@ def test_a_tree_grown_by_a_worker_is_the_same():
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
     tree.update(pace, 820, [], 0)
     before = tree.cost_to_go_at(np.arange(1600))
-    tree.adopt(tree.full_job(pace.copy(), 820, 0)(), pace, 820, [], 0, np.arange(0, 1600, 50))
+    tree.adopt(tree.full_job(820)(), pace, 820, [], 0, np.arange(0, 1600, 50))
     np.testing.assert_array_equal(tree.cost_to_go_at(np.arange(1600)), before)
     np.testing.assert_allclose(tree.last_gaps, 1.0, rtol=1e-5)
 
@@ -302,9 +302,9 @@ def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:
 
     def grant(seq: int, cells: list[int]) -> None:
         """As the warden of the only plot, which has nobody else to consider."""
-        grants = {"a0-00": Grant(cells, (1, seq))}
-        table = Table(plot=0, agent=plots.warden(0, 1), epoch=1, seq=seq, hosts={"a0": (1, seq)}, grants=grants)
-        agent.place(holdings.hear_table(table, lambda vehicle, found: found[0]))
+        warden, grants = plots.warden(0, 1), {"a0-00": cells}
+        granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=grants)
+        agent.place(holdings.hear_granted(granted, lambda vehicle, found: found[0], seq))
 
     grant(1, [start])
     agent.set_planners({"t": 1}, 0)

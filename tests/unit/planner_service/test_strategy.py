@@ -17,12 +17,14 @@ GRID = GridSpec(96, 96, 1.0)
 
 
 def kinds_of_moves(config: PlannerConfig, moves: int) -> list[str]:
-    """What each of so many moves of one cell to the east grew, and whether a full growth was asked for."""
+    """What each of so many moves of one cell to the east grew; "!" if a full growth, "~" if corridors were asked
+    for."""
     pace = np.ones((GRID.rows, GRID.cols), np.float32)
     tree = TargetTree(GRID, config)
     tree.update(pace, GRID.cell(48, 20), [], 0)
     updates = [tree.update(pace, GRID.cell(48, 21 + n), [], 0) for n in range(moves)]
-    return [update.kind + ("!" if update.wants_full else "") for update in updates]
+    asked = "~" if tree.wants_corridors else ""
+    return [update.kind + ("!" if update.wants_full else "") + asked for update in updates]
 
 
 def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None:
@@ -37,7 +39,7 @@ def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None
     [
         (StrategyRow(OnMove.WHOLE_TREE), ["full"] * 5),
         (StrategyRow(OnMove.BLOCK_WINDOW), ["window"] * 5),
-        (StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window!"] * 5),
+        (StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window~"] * 5),
         (StrategyRow(OnMove.SCHEDULED_WINDOW), ["window"] * 5),
         (StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.EVERY_FEW_MOVES), [*["window"] * 2, *["window!"] * 3]),
     ],

@@ -1,0 +1,36 @@
+"""What a planner wants done by the process around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from planner_service.full_growth import GrownTree
+from planner_service.tree.corridors import CorridorSearch
+from swarm.wire.messages.planning import PlannerStatus, PushedRoute
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A request that is not answered, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GrowTree:
+    """Run `job` on a worker and bring what it returns to `Planner.adopt`."""
+
+    job: Callable[[], GrownTree]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FindCorridors:
+    """Take the steps of `search` on a worker, one now and then, until it has found them; bring it to
+    `Planner.adopt_corridors`."""
+
+    search: CorridorSearch
+
+
+Action = GrowTree | FindCorridors | PushedRoute | PlannerStatus
+"""What a planner wants done: a growth run, corridors found, a message published."""

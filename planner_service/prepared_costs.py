@@ -1,0 +1,122 @@
+"""What the planners of one map on one machine have in common, in files of the run's folder.
+
+One computes it, all map it. A file's name is the digest of all that it follows from, so that it cannot be another
+map's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.tree import corridors
+from planner_service.tree.directed_cost_grid import cost_grid_of
+from shared_map import arrays
+from shared_map.arrays import Floats, open_array, private_copy, save_array
+from shared_map.source_digest import source_digest
+from shared_map.terrain.kept import keep_beside
+from shared_map.terrain.terrain import Terrain
+from swarm.config.scenario import PlannerConfig
+
+log = logging.getLogger(__name__)
+
+
+class PreparedCosts:
+    """Cell costs before any mark, and a `CorridorShelf` beside them.
+
+    cell_cost  float32, padded, s: what a `CostGrid` loads; mapped read-only
+    kept       of the terrain, if it is kept from run to run; its corridors are then, too
+    """
+
+    def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig, kept: str | None = None) -> None:
+        cost_grid = cost_grid_of(terrain.grid, config, terrain.climb)
+        of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.terms}"
+        of_ways = f"{of_costs} {cost_grid.rule} {cost_grid.corners} {corridors.LEAST} {corridors.SAMPLES}"
+        self._size = cost_grid.size
+        self._folder = folder
+        self._kept = kept
+        self._corridors = folder / f"corridors-{_digest(of_ways)}.npy"
+        self._claimed: IO[bytes] | None = None
+        path = folder / f"cell-costs-{_digest(of_costs)}.npy"
+        with _locked(folder / "cell-costs.lock"):
+            found = _read(path, np.float32, self._size)
+            if found is None:
+                cost_grid.load(private_copy(terrain.pace_s_per_m))  # kernels know arrays that may be written only
+                save_array(path, cost_grid.cell_cost)
+                found = open_array(path)
+        self.cell_cost: Floats = found
+
+    def load(self) -> NDArray[np.uint8] | None:
+        found = _read(self._corridors, np.uint8, self._size)
+        return None if found is None else private_copy(found)
+
+    def claim(self) -> bool:
+        """Released by the system if this process ends."""
+        try:
+            if self._claimed is None:
+                self._claimed = (self._folder / "corridors.lock").open("wb")
+            fcntl.flock(self._claimed, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError as error:  # a full disk: then each finds its own
+            log.warning("cannot share corridors in %s: %s", self._folder, error.strerror or error)
+        return True
+
+    def leave(self, level: NDArray[np.uint8]) -> None:
+        try:
+            save_array(self._corridors, level)
+            if self._kept is not None:
+                keep_beside(self._kept, self._corridors)
+        except OSError as error:
+            log.warning("cannot share corridors in %s: %s", self._folder, error.strerror or error)
+        if self._claimed is not None:
+            self._claimed.close()
+            self._claimed = None
+
+
+def prepared_costs(
+    folder: Path | None, terrain: Terrain, config: PlannerConfig, kept: str | None = None
+) -> PreparedCosts | None:
+    """None where there is no folder or it cannot be written: then a planner computes its own."""
+    if folder is None:
+        return None
+    try:
+        return PreparedCosts(folder, terrain, config, kept)
+    except OSError as error:
+        log.warning("cannot share cell costs in %s: %s", folder, error.strerror or error)
+        return None
+
+
+def _digest(text: str) -> str:
+    here = Path(__file__).parent
+    code = source_digest(here / "tree", here / "kernels", Path(arrays.__file__).parent)
+    return hashlib.blake2b(f"{code} {text}".encode(), digest_size=8).hexdigest()
+
+
+def _read(path: Path, dtype: type[np.generic], size: int) -> NDArray[Any] | None:
+    """None where the file is not there; a damaged one is as none, and is said."""
+    try:
+        found = open_array(path)
+        if found.shape != (size,) or found.dtype != dtype:
+            raise ValueError(f"it is {found.shape} {found.dtype}")
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        log.warning("%s is damaged (%s): computing it anew", path, error)
+        return None
+    return found
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with path.open("wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
