@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
 from swarm.wire.fields import column
-from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteStatus
 
 _STEP_ROW = np.array(STEP_ROW, np.int64)
@@ -23,13 +23,12 @@ _NOWHERE = np.empty(0, np.int64)
 class Follower:
     """One vehicle.
 
-    cell       where it is, by its last report or request
+    cell       on its path, by its agent's last report or its own request: where a new route for it begins
     route      what it was given last; None if nothing was, by this incarnation of the planner
     rows, cols of the cells of that route
     bounds     of that route and the cells next to it
     stale      there may be a better route than the one it has
     push_ns    it is not pushed another one before
-    stamp_ns   of its newest report, by its own clock
     """
 
     cell: int
@@ -41,7 +40,15 @@ class Follower:
     bounds: Window = _EMPTY
     stale: bool = False
     push_ns: int = 0
-    stamp_ns: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """The newest message of one agent: whom it named, when by its own clock, and when that was heard."""
+
+    ids: frozenset[str]
+    stamp_ns: int
+    heard_ns: int
 
 
 CAPACITY = 4096
@@ -53,9 +60,9 @@ MOST_PUSHES = 256
 class Followers:
     """The followers of one target, at most `CAPACITY`, each on a cell of the grid.
 
-    Registered by a request that names them, or by a report that they chase this target; dropped when they report
-    another target, when they have been silent for the lease, and, beyond the capacity, in the order in which they
-    were registered. A vehicle that reports registers itself again with its next report.
+    Registered by a request that names them, or by their agent's word that they chase this target; dropped when that
+    agent names them no more, when nothing was heard of them for the lease, and, beyond the capacity, in the order
+    in which they were registered. A vehicle that is dropped so is registered again by its agent's next word.
     """
 
     def __init__(self, target: str, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
@@ -64,6 +71,8 @@ class Followers:
         self._lease_ns = lease_ns
         self._max_cells = max_cells
         self._by_id: dict[str, Follower] = {}
+        self._told: dict[str, _Told] = {}
+        """Agent's name as an author -> its newest message, for the lease."""
 
     def __len__(self) -> int:
         return len(self._by_id)
@@ -71,28 +80,34 @@ class Followers:
     def all(self) -> Iterable[Follower]:
         return self._by_id.values()
 
+    def ids(self) -> Iterable[str]:
+        return self._by_id.keys()
+
     @property
     def cells(self) -> NDArray[np.int64]:
         """Where they all are."""
         return np.fromiter((follower.cell for follower in self._by_id.values()), np.int64, len(self._by_id))
 
-    def hear(self, fleet: Fleet, now_ns: int) -> None:
-        """Where an agent's vehicles are, and what they chase."""
-        index = fleet.target_ids.index(self._target) if self._target in fleet.target_ids else None
-        if index is None and not any(id in self._by_id for id in fleet.ids):
+    def hear(self, chasers: Chasers, now_ns: int) -> None:
+        """Which vehicles of an agent chase the target, and from where. Ignored if older than the last."""
+        before = self._told.get(chasers.author)
+        if before is not None and chasers.stamp_ns < before.stamp_ns:
             return
-        targets, cells = column(fleet.targets, "<u1").tolist(), column(fleet.cells, "<u4").tolist()
-        for id, cell, target in zip(fleet.ids, cells, targets, strict=True):
+        told = _Told(frozenset(chasers.ids), chasers.stamp_ns, now_ns)
+        if before is not None:
+            for id in before.ids - told.ids:
+                self._by_id.pop(id, None)
+        elif len(self._told) >= CAPACITY:
+            del self._told[next(iter(self._told))]
+        self._told[chasers.author] = told
+        for id, cell in zip(chasers.ids, column(chasers.cells, "<u4").tolist(), strict=True):
             follower = self._by_id.get(id)
-            if follower is not None and fleet.stamp_ns < follower.stamp_ns:
-                continue
-            if target != index or cell >= self._grid.cells:
-                if follower is not None:
-                    del self._by_id[id]
-                continue
-            if follower is None:
-                follower = self._register(id, Follower(cell, self._max_cells, now_ns))
-            follower.cell, follower.heard_ns, follower.stamp_ns = cell, now_ns, fleet.stamp_ns
+            if cell >= self._grid.cells:
+                self._by_id.pop(id, None)
+            elif follower is None:
+                self._register(id, Follower(cell, self._max_cells, now_ns))
+            else:
+                follower.cell, follower.heard_ns = cell, now_ns
 
     def given(self, vehicle: str, route: Route, max_cells: int, now_ns: int, push_ns: int) -> None:
         """A vehicle asked, and this is the answer. One outside the grid is no follower, whatever the status."""
@@ -125,9 +140,10 @@ class Followers:
         return follower
 
     def drop_silent(self, now_ns: int) -> None:
-        late = [id for id, follower in self._by_id.items() if now_ns - follower.heard_ns > self._lease_ns]
-        for id in late:
-            del self._by_id[id]
+        for heard in (self._by_id, self._told):
+            late = [id for id, each in heard.items() if now_ns - each.heard_ns > self._lease_ns]
+            for id in late:
+                del heard[id]
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
         """The tree is new inside a window, and the map changed in others: whose route does that concern?"""

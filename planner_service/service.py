@@ -22,8 +22,8 @@ from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
+from swarm.wire.messages.vehicles import Chasers
+from swarm.wire.topics import CHASERS, COST, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class PlannerService:
         self._member.join()
         self._sync.start(now_ns)
         self._bus.subscribe(SIGHTED if self._untracked else POSE, self._post, target=self._target)
-        self._bus.subscribe(FLEET, self._post)
+        self._bus.subscribe(CHASERS, self._post, target=self._target)
         self._candidacy.start()
         self._lead(self._candidacy.leads, now_ns)
 
@@ -94,8 +94,8 @@ class PlannerService:
                 if self._sightings.hear(sighted, now_ns):
                     for seen in self._sightings.best(now_ns).values():
                         self._planner.set_pose(pose_of(seen))
-            case Heard(message=Fleet() as fleet):
-                self._planner.hear_fleet(fleet, now_ns)
+            case Heard(message=Chasers() as chasers):
+                self._planner.hear_chasers(chasers, now_ns)
             case Asked(request=RouteRequest() | CostRequest() as request):
                 reply = self._planner.answer(request, now_ns)
                 if isinstance(reply, Refusal):

@@ -26,6 +26,7 @@ from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, Ro
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
 from swarm.wire.topics import (
+    CHASERS,
     COST,
     FLEET,
     FOLLOWED,
@@ -37,6 +38,7 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
+from vehicle_agent.chasers import ChasersReport
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
@@ -108,6 +110,7 @@ class AgentService:
         self._roster = Roster()
         self._now_ns = 0
         self._fleet = FleetReport(grid, self._author, group)
+        self._chasers = ChasersReport(self._author)
         self._asked_ns: dict[str, int] = {}
         """Tag of each open route request -> when it was sent."""
 
@@ -186,6 +189,9 @@ class AgentService:
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
+        chasing = ((id, vehicle.target, agent.holdings.path(id)) for id, vehicle in agent.vehicles.items())
+        for chasers in self._chasers.reports(chasing, now_ns):
+            self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, agent.places, now_ns)
         self._gauge()
 
