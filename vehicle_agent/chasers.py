@@ -25,8 +25,8 @@ class ChasersReport:
     """Makes the messages of one author.
 
     A planner reads pushed routes from the cells that it was told, and a vehicle can take a route that begins
-    anywhere on its path. So each vehicle tells the end of its path, and tells it anew when its path no longer has the
-    cell: seldom for one that is slow on a map of large cells, and never for one that waits.
+    anywhere on its path. So each vehicle tells the end of its path, and tells it anew when its path no longer has
+    the cell: seldom for one that is slow on a map of large cells, and never for one that waits.
     """
 
     def __init__(self, author: str) -> None:

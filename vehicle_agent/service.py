@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -111,8 +112,6 @@ class AgentService:
         self._now_ns = 0
         self._fleet = FleetReport(grid, self._author, group)
         self._chasers = ChasersReport(self._author)
-        self._asked_ns: dict[str, int] = {}
-        """Tag of each open route request -> when it was sent."""
 
     @property
     def agent(self) -> Agent:
@@ -146,14 +145,13 @@ class AgentService:
             case Heard(message=PushedRoute() as pushed):
                 self.counters.count("routes_pushed")
                 self._publish_followed(agent.route_pushed(pushed, now_ns))
-            case Replied(tag=tag, message=RouteReply() as reply):
-                self._observe_query(tag, now_ns)
+            case Replied(tag=tag, message=RouteReply() as reply, took_s=took_s):
+                self.counters.observe("route_query_ms", took_s * 1e3)
                 self.counters.count("routes_received", len(reply.routes))
                 self._publish_followed(agent.routes_given(_number(tag), reply, now_ns))
             case Replied(tag=tag, message=CostReply() as reply) if reply.target_cell is not None:
                 agent.costs_given(_number(tag), reply.target, column(reply.cost_to_go_s, "<f4"))
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
-                self._asked_ns.pop(tag, None)
                 agent.routes_ended(_number(tag), now_ns)
             case AskEnded(tag=tag, topic=topic) if topic is COST:
                 agent.costs_ended(_number(tag), now_ns)
@@ -184,7 +182,7 @@ class AgentService:
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(now_ns)
         self._tell_sighted(now_ns)
-        self._perform(agent.decide(now_ns), now_ns)
+        self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         for region, fleet in self._fleet.reports(agent.vehicles.values(), now_ns):
@@ -238,7 +236,7 @@ class AgentService:
 
     # --- doing what was decided -----------------------------------------------------------------------------
 
-    def _perform(self, actions: list[AgentAction], now_ns: int) -> None:
+    def _perform(self, actions: list[AgentAction]) -> None:
         for action in actions:
             match action:
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):
@@ -249,15 +247,17 @@ class AgentService:
                         max_cells=self._setup.scenario.vehicles.route_cells,
                         force=force,
                     )
-                    tag = f"route-{request}"
-                    self._asked_ns[tag] = now_ns
-                    self._bus.ask(ROUTE, asking, self._post, tag=tag, target=target)
+                    self._bus.ask(ROUTE, asking, self._post, tag=f"route-{request}", target=target)
                 case AskCosts(request, _, cells):
                     costs = CostRequest(cells=list(cells))
                     self._bus.ask(COST, costs, self._post, tag=f"cost-{request}")
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:
+            if 0 < route.lower_bound_s < math.inf:
+                self.counters.observe("followed_gap_excess", max(route.cost_s / route.lower_bound_s - 1.0, 0.0))
+            else:
+                self.counters.count("followed_unproven")
             followed = Followed(
                 vehicle=route.vehicle,
                 target=route.target,
@@ -267,11 +267,6 @@ class AgentService:
                 lower_bound_s=route.lower_bound_s,
             )
             self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=route.vehicle)
-
-    def _observe_query(self, tag: str, now_ns: int) -> None:
-        asked_ns = self._asked_ns.pop(tag, None)
-        if asked_ns is not None:
-            self.counters.observe("route_query_ms", (now_ns - asked_ns) / 1e6)
 
     def _gauge(self) -> None:
         states = [vehicle.state for vehicle in self._agent.vehicles.values()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder
+from launch_scripts.report.recorder import RECORDED, Recorder
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
@@ -13,7 +13,6 @@ from swarm.runtime.membership import NO_RUN
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo
-from swarm.wire.messages.vehicles import Followed
 from swarm.wire.topics import RUN
 
 _TAG = "launcher-run"
@@ -35,8 +34,8 @@ class Watcher:
         self._inbox = Inbox()
 
     def begin(self) -> None:
-        for topic in RECORDED_TOPICS:
-            self._bus.subscribe(topic, self._inbox.post)
+        for topic, every_s in RECORDED.items():
+            self._bus.subscribe(topic, self._inbox.post, every_s=every_s)
         self._bus.watch_alive(self._inbox.post)
 
     def listen(self, for_s: float) -> None:
@@ -65,8 +64,6 @@ class Watcher:
                 match message:
                     case Note():
                         self._note(message)
-                    case Followed():
-                        self.routes_served = True
                     case PlannerStatus(routes_served=served) if served:
                         self.routes_served = True
                 self.recorder.heard(message, fields, now_ns)

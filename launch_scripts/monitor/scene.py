@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.report.hillshade import hillshade
-from launch_scripts.report.latest_state import VehicleNow
+from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec, Window
@@ -39,6 +39,7 @@ STATE_COLOURS = {
     VehicleState.STRANDED: (150, 150, 20),
     VehicleState.LOST: (40, 84, 60),
 }
+_STATE_COLOURS = np.array([STATE_COLOURS[state] for state in VehicleState], np.uint8)
 TARGET_COLOUR = (255, 46, 46)
 SIGHTED_COLOUR = (255, 170, 150)
 LETHAL_MARK = (86, 22, 150)
@@ -216,16 +217,10 @@ def _lit_photo(seen: Level) -> Bytes:
 # --- what moves -------------------------------------------------------------------------------------------------
 
 
-def vehicle_points(mesh: TerrainMesh, vehicles: Mapping[str, VehicleNow]) -> Points:
+def vehicle_points(mesh: TerrainMesh, vehicles: VehicleColumns) -> Points:
     """All vehicles, coloured by state."""
-    now = list(vehicles.values())
-    positions = mesh.place(
-        np.array([vehicle.east_m for vehicle in now], np.float32),
-        np.array([vehicle.south_m for vehicle in now], np.float32),
-        0.15 * mesh.scale_m,
-    )
-    colours = np.array([STATE_COLOURS[vehicle.state] for vehicle in now], np.uint8).reshape(-1, 3)
-    return Points(list(vehicles), positions.reshape(-1, 3), colours)
+    positions = mesh.place(vehicles.east_m, vehicles.south_m, 0.15 * mesh.scale_m)
+    return Points(vehicles.ids, positions, _STATE_COLOURS[vehicles.states])
 
 
 def target_points(mesh: TerrainMesh, places_m: Mapping[str, tuple[float, float]]) -> Points:

@@ -210,7 +210,7 @@ FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
     "per new route",
     access(put="agent:agent", hear="monitor"),
-    newest=False, priority=Priority.BACKGROUND,
+    priority=Priority.BACKGROUND,
 )  # fmt: skip
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,

@@ -20,8 +20,8 @@ from launch_scripts.monitor.scene import (
     vehicle_points,
     window_outline,
 )
-from launch_scripts.report.latest_state import VehicleNow
 from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import Scenario
 from swarm.grid import Window
@@ -134,9 +134,12 @@ def test_what_was_lethal_before_anybody_drove_is_no_mark() -> None:
 
 def test_vehicles_are_shades_of_green_and_targets_red() -> None:
     mesh = TerrainMesh(hill(20, 20))
-    vehicles = {f"a0-{state:02d}": VehicleNow(10.0 * state, 20.0, 0.0, state, None) for state in VehicleState}
+    n = len(VehicleState)
+    ids = [f"a0-{state:02d}" for state in VehicleState]
+    places = np.linspace(10, 100, n, dtype=np.float32), np.full(n, 20, np.float32)
+    vehicles = VehicleColumns(ids, *places, np.array(VehicleState, np.uint8), np.full(n, -1), [])
     points = vehicle_points(mesh, vehicles)
-    assert points.ids == list(vehicles)
+    assert points.ids == ids
     assert [tuple(colour) for colour in points.colours.tolist()] == [STATE_COLOURS[state] for state in VehicleState]
     assert (points.colours[:, 1] >= points.colours[:, [0, 2]].max(axis=1)).all(), "green is the strongest"
     targets = target_points(mesh, {"t0": (50.0, 60.0)})
@@ -149,7 +152,7 @@ def test_vehicles_are_shades_of_green_and_targets_red() -> None:
 
 def test_nobody_there_is_nothing_to_draw() -> None:
     mesh = TerrainMesh(hill(20, 20))
-    assert vehicle_points(mesh, {}).positions.shape == (0, 3)
+    assert vehicle_points(mesh, gathered([])).positions.shape == (0, 3)
     assert poles(mesh, target_points(mesh, {})) == []
 
 

@@ -46,7 +46,7 @@ def test_no_target_gets_more_than_its_even_share_and_nobody_a_target_out_of_reac
 def test_no_vehicle_and_target_that_would_both_gain_are_kept_apart(
     world: tuple[NDArray[np.float64], list[int]],
 ) -> None:
-    """Stability: where another target is cheaper for a vehicle, those which go for it reach it at no higher cost."""
+    """Stability: where another target is cheaper for a vehicle, those that go for it reach it at no higher cost."""
     costs_s, current = world
     costs_s = costs_s.copy()
     chosen = spread(costs_s, current)
