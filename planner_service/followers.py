@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,8 @@ from swarm.wire.routes import Route, RouteStatus
 
 _STEP_ROW = np.array(STEP_ROW, np.int64)
 _STEP_COL = np.array(STEP_COL, np.int64)
-_EMPTY = Window(0, 0, 0, 0)
 _NOWHERE = np.empty(0, np.int64)
+_NOWHERE_BOUNDS = (0, 0, 0, 0)
 
 
 @dataclass(slots=True, eq=False)
@@ -26,7 +27,7 @@ class Follower:
     cell       on its path, by its agent's last report or its own request: where a new route for it begins
     route      what it was given last; None if nothing was, by this incarnation of the planner
     rows, cols of the cells of that route
-    bounds     of that route and the cells next to it
+    bounds     first row and column of that route and the cells next to it, and the first behind them
     stale      there may be a better route than the one it has
     push_ns    it is not pushed another one before
     """
@@ -37,7 +38,7 @@ class Follower:
     route: Route | None = None
     rows: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
     cols: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
-    bounds: Window = _EMPTY
+    bounds: tuple[int, int, int, int] = _NOWHERE_BOUNDS
     stale: bool = False
     push_ns: int = 0
 
@@ -122,16 +123,16 @@ class Followers:
     def sent(self, follower: Follower, route: Route, push_ns: int) -> None:
         follower.route, follower.stale, follower.push_ns = route, False, push_ns
         rows, cols = follower.rows, follower.cols = route_cells(self._grid, route)
-        follower.bounds = _EMPTY
+        follower.bounds = _NOWHERE_BOUNDS
         if len(rows):
             row0, col0, row1, col1 = int(rows.min()), int(cols.min()), int(rows.max()), int(cols.max())
-            follower.bounds = Window(row0 - 1, col0 - 1, row1 + 2, col1 + 2)
+            follower.bounds = (row0 - 1, col0 - 1, row1 + 2, col1 + 2)
 
     def forget_routes(self) -> None:
         """Another planner has given routes meanwhile: whatever is given next is news to every follower."""
         for follower in self._by_id.values():
             follower.route, follower.stale, follower.push_ns = None, True, 0
-            follower.rows, follower.cols, follower.bounds = _NOWHERE, _NOWHERE, _EMPTY
+            follower.rows, follower.cols, follower.bounds = _NOWHERE, _NOWHERE, _NOWHERE_BOUNDS
 
     def _register(self, vehicle: str, follower: Follower) -> Follower:
         if len(self._by_id) >= CAPACITY:
@@ -147,11 +148,20 @@ class Followers:
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
         """The tree is new inside a window, and the map changed in others: whose route does that concern?"""
-        whole = window == self._grid.window
-        for follower in self._by_id.values():
-            if not follower.stale:
-                inside = whole or window.contains(*self._grid.row_col(follower.cell))
-                follower.stale = inside or any(_crosses(follower, each) for each in changed)
+        fresh = [follower for follower in self._by_id.values() if not follower.stale]
+        cells = np.fromiter((follower.cell for follower in fresh), np.int64, len(fresh))
+        rows, cols = np.divmod(cells, self._grid.cols)
+        inside = (rows >= window.row0) & (rows < window.row1) & (cols >= window.col0) & (cols < window.col1)
+        for n in np.flatnonzero(inside).tolist():
+            fresh[n].stale = True
+        if not changed:
+            return
+        corners = chain.from_iterable(follower.bounds for follower in fresh)
+        row0, col0, row1, col1 = np.fromiter(corners, np.int64, 4 * len(fresh)).reshape(-1, 4, 1).swapaxes(0, 1)
+        each = np.array([(w.row0, w.col0, w.row1, w.col1) for w in changed], np.int64).T
+        near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
+        for n, m in np.argwhere(near).tolist():
+            fresh[n].stale = fresh[n].stale or _crosses(fresh[n], changed[m])
 
     def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
         """Followers with a stale route that may be pushed another one; of too many, those that waited longest."""
@@ -193,8 +203,6 @@ def route_cells(grid: GridSpec, route: Route) -> tuple[NDArray[np.int64], NDArra
 
 def _crosses(follower: Follower, window: Window) -> bool:
     """Whether the route passes through a window or next to it: a diagonal step depends on the cells beside it."""
-    if follower.bounds.empty or not follower.bounds.touches(window):
-        return False
     rows, cols = follower.rows, follower.cols
     return bool(
         (

@@ -58,7 +58,7 @@ class PlannerService:
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
         self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
-        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._planner = Planner(
             self._target,
             setup.incarnation,
