@@ -8,27 +8,23 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-import numpy as np
 import rerun as rr
 
 from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.recording_watch import RecordingWatch
 from launch_scripts.monitor.scene import (
-    Floats,
     RouteNow,
     TerrainMesh,
-    Trails,
     cell_at,
+    cells_along,
     label_places,
-    poles,
-    route_strip,
     sighting_points,
     target_points,
     vehicle_points,
-    window_outline,
 )
 from launch_scripts.monitor.sinks import Streams
+from launch_scripts.monitor.strips import Trails, poles, route_strips, window_outlines
 from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.report.samples import messages_per_s
 from launch_scripts.report.vehicle_columns import VehicleColumns
@@ -49,7 +45,6 @@ from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
-from vehicle_agent.driving.route_follower import route_cells
 
 log = logging.getLogger(__name__)
 
@@ -58,11 +53,11 @@ FRAME_HZ = 10.0
 _DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.5 / FRAME_HZ, FOLLOWED: 0.5, SIGHTED: 0.0}
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
 _TRAILS_NS = NS_PER_S // 2
-_WINDOWS_NS = NS_PER_S // 2
-"""Planners tell their windows so often."""
+_WINDOWS_NS = NS_PER_S
 _ROUTES_NS = 3 * NS_PER_S // 2
 """Period in which the routes to every target are drawn once."""
-_TEXTURES_PER_FRAME = 8
+_TEXTURES_NS, _TEXTURES_AT_ONCE = NS_PER_S // 2, 40
+"""Marks come many times a second to the same tiles, and each of their photos is drawn once for all."""
 _REFRESH_NS = NS_PER_S
 _ROUTES_SHOWN = 400
 _ROUTES_KEPT = 1 << 15
@@ -114,18 +109,14 @@ class MonitorService:
         self._stale_tiles: dict[int, None] = {}
         self._sightings = Sightings(replica.filter)
         self._sighted: Mapping[str, Sighted] = {}
-        self._fleets_new = self._targets_new = False
+        self._fleets_new = self._targets_new = self._windows_new = False
         self._windows: dict[str, tuple[int, ...]] = {}
         """Target -> the window that its planner grew last."""
-        self._outlines: dict[str, Floats] = {}
-        """Target -> what is drawn of it; none where the window is the whole terrain."""
-        self._windows_new: set[str] = set()
-        """Targets whose windows are not drawn yet."""
         self._windows_due_ns = 0
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
-        self._trails_due_ns = self._routes_due_ns = self._refresh_due_ns = 0
+        self._trails_due_ns = self._routes_due_ns = self._refresh_due_ns = self._textures_due_ns = 0
         self._next_route_target = self._next_refresh = 0
         self._last_sample_s = -1.0
 
@@ -161,7 +152,7 @@ class MonitorService:
             case PlannerStatus(target=target, window=window):
                 if self._windows.get(target) != tuple(window):
                     self._windows[target] = tuple(window)
-                    self._windows_new.add(target)
+                    self._windows_new = True
             case Followed() as followed:
                 self._follow(followed)
             case Note() as note:
@@ -179,7 +170,9 @@ class MonitorService:
             self._stale_tiles.update(dict.fromkeys(self._mesh.tiles_touching(window)))
         if not self._stale_tiles and now_ns >= self._refresh_due_ns:
             self._refresh(now_ns)
-        self._draw_textures(_TEXTURES_PER_FRAME)
+        if now_ns >= self._textures_due_ns:
+            self._textures_due_ns = now_ns + _TEXTURES_NS
+            self._draw_textures(_TEXTURES_AT_ONCE)
         self._draw_movers(now_ns)
         self._draw_plots(now_ns)
 
@@ -195,13 +188,13 @@ class MonitorService:
             self._drawing.note(text, "INFO" if up else "WARN")
 
     def _follow(self, followed: Followed) -> None:
-        cells = route_cells(self._terrain.grid, followed.start, followed.directions)
+        cells = cells_along(self._terrain.grid, followed.start, followed.directions)
         if cells is None:  # a route that leaves the grid is its sender's bug: skip it, and go on drawing
             self.counters.count("routes_unreadable")
             return
         if len(self._routes) >= _ROUTES_KEPT:
             self._routes.clear()
-        self._routes[followed.vehicle] = RouteNow(followed.target, np.array(cells, np.int64))
+        self._routes[followed.vehicle] = RouteNow(followed.target, cells)
 
     def _announce(self, now_ns: int) -> None:
         """Publishes the live view's address, once links have had time to learn of subscribers."""
@@ -262,27 +255,21 @@ class MonitorService:
             feet = poles(self._mesh, targets)
             self._drawing.targets(targets, feet, label_places(self._mesh, targets))
             if trails_due:
-                places = np.array([pole[0] for pole in feet], np.float32)
-                self._drawing.trails("targets", self._target_trails.advance(targets.ids, places))
+                self._drawing.trails("targets", self._target_trails.advance(targets.ids, feet[:, 0]))
         self._sightings.expire(now_ns)
         sighted = self._sightings.best(now_ns)
         if sighted != self._sighted:  # a new sighting, or one that expired
             self._sighted = sighted
             self._drawing.sightings(*sighting_points(self._mesh, sighted))
         if self._windows_new and now_ns >= self._windows_due_ns:
-            self._windows_due_ns = now_ns + _WINDOWS_NS
+            self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
             self._draw_windows()
 
     def _draw_windows(self) -> None:
-        """Draws the window that each planner grew last, unless it is the whole terrain. Only those that changed are
-        laid over the terrain anew."""
-        for target in self._windows_new:
-            window = Window(*(self._windows[target] or (0, 0, 0, 0)))
-            self._outlines.pop(target, None)
-            if not window.empty and window.cells < self._terrain.grid.cells:
-                self._outlines[target] = window_outline(self._mesh, window)
-        self._windows_new.clear()
-        self._drawing.windows([self._outlines[target] for target in sorted(self._outlines)])
+        """Draws the window that each planner grew last, unless it is the whole terrain."""
+        told = (Window(*self._windows[target]) for target in sorted(self._windows) if self._windows[target])
+        parts = [window for window in told if not window.empty and window.cells < self._terrain.grid.cells]
+        self._drawing.windows(window_outlines(self._mesh, parts))
 
     def _draw_routes(self, now_ns: int, vehicles: VehicleColumns) -> None:
         """Draws what is left of the routes, one target after the other."""
@@ -299,8 +286,8 @@ class MonitorService:
             place = float(vehicles.east_m[n]), float(vehicles.south_m[n])
             ahead = route.ahead_of(cell_at(self._terrain.grid, *place))
             if len(ahead) > 1:
-                strips.append(route_strip(self._mesh, ahead))
-        self._drawing.routes(target, strips)
+                strips.append(ahead)
+        self._drawing.routes(target, route_strips(self._mesh, strips))
 
     def _draw_plots(self, now_ns: int) -> None:
         samples = self.recorder.samples.newest

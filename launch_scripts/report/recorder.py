@@ -117,6 +117,9 @@ class Recorder:
         self.vehicle_tracks = Tracks(_TRACK_NS)
         self.target_tracks = Tracks(_TRACK_NS)
         self.routed: set[str] = set()
+        self._track_ids: list[str] = []
+        self._track_keys: list[TrackKey] = []
+        """Of the vehicles heard of last."""
         self._expected = _expected(scenario)
         self._sample_due_ns: int | None = None
         self._gap_max: float | None = None
@@ -189,8 +192,9 @@ class Recorder:
         moving = np.isin(vehicles.states, (VehicleState.FOLLOWING, VehicleState.ARRIVED))
         if len(self.routed) < self.scenario.vehicle_count:
             self.routed.update(vehicles.ids[n] for n in np.flatnonzero(moving).tolist())
-        keys: list[TrackKey] = [(id, 0) for id in vehicles.ids]
-        self.vehicle_tracks.add(now_ns, keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
+        if self._track_ids != vehicles.ids:
+            self._track_ids, self._track_keys = vehicles.ids, [(id, 0) for id in vehicles.ids]
+        self.vehicle_tracks.add(now_ns, self._track_keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
         poses = sorted(self.observed.poses.items())
         pieces: list[TrackKey] = [(id, pose.jumps) for id, pose in poses]
         places = [self.observed.place_m(pose) for _, pose in poses]

@@ -58,7 +58,7 @@ class MapSync:
     committed    what whole digests tell; default: the replica's own sets
     on_accepted  called with every set that is merged
     near         hold only regions that `enter` names, instead of the whole map
-    at_ticks     merge what others put at the next tick, all at once, for a service that uses the map at its ticks only
+    at_ticks     merge what others put at the next tick, all at once: for a service that uses the map at ticks only
     joined       the late join is over: an answer came, or every try failed
     """
 
