@@ -56,7 +56,7 @@ _TRAILS_NS = NS_PER_S // 2
 _WINDOWS_NS = NS_PER_S
 _ROUTES_NS = 3 * NS_PER_S // 2
 """Period in which the routes to every target are drawn once."""
-_TEXTURES_NS, _TEXTURES_AT_ONCE = NS_PER_S // 2, 40
+_TEXTURES_NS, _TEXTURES_AT_ONCE = NS_PER_S, 80
 """Marks come many times a second to the same tiles, and each of their photos is drawn once for all."""
 _REFRESH_NS = NS_PER_S
 _ROUTES_SHOWN = 400
@@ -95,7 +95,7 @@ class MonitorService:
         self.counters: Counters = self._member.counters
         self._cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, self._cost_map)
-        self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role)
+        self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role, at_ticks=True)
         self._mesh = mesh or TerrainMesh(terrain)
         self._target_ids = setup.scenario.target_ids
         self._rec = rec

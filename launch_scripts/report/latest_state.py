@@ -44,6 +44,8 @@ class Observed:
         self._stats: dict[tuple[str, str, int], Stats] = {}
         self._messages_before: dict[tuple[str, str, int], int] = {}
         self._fleets: dict[tuple[str, int], Fleet] = {}
+        self._vehicles: VehicleColumns | None = None
+        """What `_fleets` say, once somebody has asked; None since the last that was new."""
         self._marks: dict[tuple[str, int], MarkSet] = {}
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
@@ -69,6 +71,7 @@ class Observed:
                 fleet = self._fleets.get((message.author, message.region))
                 if fleet is None or message.seq >= fleet.seq:
                     self._fleets[message.author, message.region] = message
+                    self._vehicles = None
             case TargetPose():
                 pose = self.poses.get(message.target)
                 if pose is None or (message.incarnation, message.seq) >= (pose.incarnation, pose.seq):
@@ -118,7 +121,9 @@ class Observed:
 
     def vehicles(self) -> VehicleColumns:
         """Last reported state of every vehicle."""
-        return gathered(self._fleets.values())
+        if self._vehicles is None:
+            self._vehicles = gathered(self._fleets.values())
+        return self._vehicles
 
     def targets(self) -> dict[str, tuple[float, float]]:
         """(east, south) in metres of every target, in order of id."""

@@ -185,8 +185,8 @@ class Recorder:
             if sample_due:
                 self._sample_due_ns = now_ns + _SAMPLE_NS
                 self.samples.add(self.sample(now_ns, vehicles))
-        if self.ready_ns is None and self.routed and not self.missing():
-            self.ready_ns = now_ns
+            if self.ready_ns is None and self.routed and not self.missing():
+                self.ready_ns = now_ns
 
     def _sample_tracks(self, now_ns: int, vehicles: VehicleColumns) -> None:
         moving = np.isin(vehicles.states, (VehicleState.FOLLOWING, VehicleState.ARRIVED))
