@@ -15,6 +15,7 @@ import urllib.request
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -48,24 +49,27 @@ def terrain() -> Terrain:
     return little_terrain()
 
 
-def rows_by_entity(path: Path) -> dict[str, int]:
-    """Entity -> rows logged over time, without what is static."""
+def chunks(path: Path) -> list[Any]:
+    """What a recording holds."""
     from rerun.chunk import RrdReader
 
-    counts: dict[str, int] = {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a file without a footer
-        for chunk in RrdReader(str(path)).stream():
-            if not chunk.is_static:
-                counts[str(chunk.entity_path)] = counts.get(str(chunk.entity_path), 0) + chunk.num_rows
+        warnings.simplefilter("ignore")  # it has no footer
+        return list(RrdReader(str(path)).stream())
+
+
+def rows_by_entity(path: Path) -> dict[str, int]:
+    """Entity -> rows logged over time, without what is static."""
+    counts: dict[str, int] = {}
+    for chunk in chunks(path):
+        if not chunk.is_static:
+            counts[str(chunk.entity_path)] = counts.get(str(chunk.entity_path), 0) + chunk.num_rows
     return counts
 
 
 def still_entities(path: Path) -> set[str]:
     """Entities with something static."""
-    from rerun.chunk import RrdReader
-
-    return {str(chunk.entity_path) for chunk in RrdReader(str(path)).stream() if chunk.is_static}
+    return {str(chunk.entity_path) for chunk in chunks(path) if chunk.is_static}
 
 
 def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
