@@ -52,6 +52,8 @@ FRAME_HZ = 10.0
 """How often the view is drawn."""
 _DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.5 / FRAME_HZ, FOLLOWED: 0.5, SIGHTED: 0.0}
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
+_TARGETS_NS = NS_PER_S // 5
+"""Targets, each with its pole and its name, take as long to draw as all vehicles, which move faster."""
 _TRAILS_NS = NS_PER_S // 2
 _WINDOWS_NS = NS_PER_S
 _ROUTES_NS = 3 * NS_PER_S // 2
@@ -112,7 +114,7 @@ class MonitorService:
         self._fleets_new = self._targets_new = self._windows_new = False
         self._windows: dict[str, tuple[int, ...]] = {}
         """Target -> the window that its planner grew last."""
-        self._windows_due_ns = 0
+        self._windows_due_ns = self._targets_due_ns = 0
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
@@ -249,8 +251,8 @@ class MonitorService:
             if trails_due:
                 self._drawing.trails("vehicles", self._vehicle_trails.advance(points.ids, points.positions))
             self._draw_routes(now_ns, vehicles)
-        if self._targets_new:
-            self._targets_new = False
+        if self._targets_new and (trails_due or now_ns >= self._targets_due_ns):
+            self._targets_new, self._targets_due_ns = False, now_ns + _TARGETS_NS
             targets = target_points(self._mesh, self.recorder.observed.targets())
             feet = poles(self._mesh, targets)
             self._drawing.targets(targets, feet, label_places(self._mesh, targets))
