@@ -33,6 +33,7 @@ from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
+from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import Followed
@@ -89,6 +90,25 @@ def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: T
     textures = [rows[f"/world/ground/{tile}"] for tile in range(tiles)]
     assert min(textures) >= 1
     assert max(textures) >= 2, "marks change the photo"
+
+
+def test_a_window_is_drawn_when_it_changes_and_not_each_time_that_it_is_told(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
+
+    def told(at_s: float, *window: int) -> tuple[int, PlannerStatus]:
+        at_ns = int(at_s * NS_PER_S)
+        return at_ns, PlannerStatus(
+            target="t0", incarnation=1, stamp_ns=at_ns, strategy="full", target_cell=0, map_version=1,
+            tree_age_ms=0.0, window=list(window), growths=1, window_growths=1, growth_ms=1.0, routes_served=1,
+            following=0, gap_mean=None, gap_p95=None, gap_max=None,
+        )  # fmt: skip
+
+    rig.play([told(0.5 + n / 2, 4, 4, 20, 20) for n in range(10)])
+    rig.play([told(6.5 + n / 2, 8, 8, 24, 24) for n in range(6)])
+    rig.close()
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/windows"] == 2
 
 
 def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
