@@ -4,32 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
 from swarm.wire.fields import column
-from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteStatus
 
 _STEP_ROW = np.array(STEP_ROW, np.int64)
 _STEP_COL = np.array(STEP_COL, np.int64)
-_EMPTY = Window(0, 0, 0, 0)
 _NOWHERE = np.empty(0, np.int64)
+_NOWHERE_BOUNDS = (0, 0, 0, 0)
 
 
 @dataclass(slots=True, eq=False)
 class Follower:
     """One vehicle.
 
-    cell       where it is, by its last report or request
+    cell       on its path, by its agent's last report or its own request: where a new route for it begins
     route      what it was given last; None if nothing was, by this incarnation of the planner
     rows, cols of the cells of that route
-    bounds     of that route and the cells next to it
+    bounds     first row and column of that route and the cells next to it, and the first behind them
     stale      there may be a better route than the one it has
     push_ns    it is not pushed another one before
-    stamp_ns   of its newest report, by its own clock
     """
 
     cell: int
@@ -38,10 +38,18 @@ class Follower:
     route: Route | None = None
     rows: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
     cols: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
-    bounds: Window = _EMPTY
+    bounds: tuple[int, int, int, int] = _NOWHERE_BOUNDS
     stale: bool = False
     push_ns: int = 0
-    stamp_ns: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """The newest message of one agent: whom it named, when by its own clock, and when that was heard."""
+
+    ids: frozenset[str]
+    stamp_ns: int
+    heard_ns: int
 
 
 CAPACITY = 4096
@@ -53,9 +61,9 @@ MOST_PUSHES = 256
 class Followers:
     """The followers of one target, at most `CAPACITY`, each on a cell of the grid.
 
-    Registered by a request that names them, or by a report that they chase this target; dropped when they report
-    another target, when they have been silent for the lease, and, beyond the capacity, in the order in which they
-    were registered. A vehicle that reports registers itself again with its next report.
+    Registered by a request that names them, or by their agent's word that they chase this target; dropped when that
+    agent names them no more, when nothing was heard of them for the lease, and, beyond the capacity, in the order
+    in which they were registered. A vehicle that is dropped so is registered again by its agent's next word.
     """
 
     def __init__(self, target: str, grid: GridSpec, lease_ns: int, max_cells: int) -> None:
@@ -64,6 +72,8 @@ class Followers:
         self._lease_ns = lease_ns
         self._max_cells = max_cells
         self._by_id: dict[str, Follower] = {}
+        self._told: dict[str, _Told] = {}
+        """Agent's name as an author -> its newest message, for the lease."""
 
     def __len__(self) -> int:
         return len(self._by_id)
@@ -71,28 +81,34 @@ class Followers:
     def all(self) -> Iterable[Follower]:
         return self._by_id.values()
 
+    def ids(self) -> Iterable[str]:
+        return self._by_id.keys()
+
     @property
     def cells(self) -> NDArray[np.int64]:
         """Where they all are."""
         return np.fromiter((follower.cell for follower in self._by_id.values()), np.int64, len(self._by_id))
 
-    def hear(self, fleet: Fleet, now_ns: int) -> None:
-        """Where an agent's vehicles are, and what they chase."""
-        index = fleet.target_ids.index(self._target) if self._target in fleet.target_ids else None
-        if index is None and not any(id in self._by_id for id in fleet.ids):
+    def hear(self, chasers: Chasers, now_ns: int) -> None:
+        """Which vehicles of an agent chase the target, and from where. Ignored if older than the last."""
+        before = self._told.get(chasers.author)
+        if before is not None and chasers.stamp_ns < before.stamp_ns:
             return
-        targets, cells = column(fleet.targets, "<u1").tolist(), column(fleet.cells, "<u4").tolist()
-        for id, cell, target in zip(fleet.ids, cells, targets, strict=True):
+        told = _Told(frozenset(chasers.ids), chasers.stamp_ns, now_ns)
+        if before is not None:
+            for id in before.ids - told.ids:
+                self._by_id.pop(id, None)
+        elif len(self._told) >= CAPACITY:
+            del self._told[next(iter(self._told))]
+        self._told[chasers.author] = told
+        for id, cell in zip(chasers.ids, column(chasers.cells, "<u4").tolist(), strict=True):
             follower = self._by_id.get(id)
-            if follower is not None and fleet.stamp_ns < follower.stamp_ns:
-                continue
-            if target != index or cell >= self._grid.cells:
-                if follower is not None:
-                    del self._by_id[id]
-                continue
-            if follower is None:
-                follower = self._register(id, Follower(cell, self._max_cells, now_ns))
-            follower.cell, follower.heard_ns, follower.stamp_ns = cell, now_ns, fleet.stamp_ns
+            if cell >= self._grid.cells:
+                self._by_id.pop(id, None)
+            elif follower is None:
+                self._register(id, Follower(cell, self._max_cells, now_ns))
+            else:
+                follower.cell, follower.heard_ns = cell, now_ns
 
     def given(self, vehicle: str, route: Route, max_cells: int, now_ns: int, push_ns: int) -> None:
         """A vehicle asked, and this is the answer. One outside the grid is no follower, whatever the status."""
@@ -107,16 +123,16 @@ class Followers:
     def sent(self, follower: Follower, route: Route, push_ns: int) -> None:
         follower.route, follower.stale, follower.push_ns = route, False, push_ns
         rows, cols = follower.rows, follower.cols = route_cells(self._grid, route)
-        follower.bounds = _EMPTY
+        follower.bounds = _NOWHERE_BOUNDS
         if len(rows):
             row0, col0, row1, col1 = int(rows.min()), int(cols.min()), int(rows.max()), int(cols.max())
-            follower.bounds = Window(row0 - 1, col0 - 1, row1 + 2, col1 + 2)
+            follower.bounds = (row0 - 1, col0 - 1, row1 + 2, col1 + 2)
 
     def forget_routes(self) -> None:
         """Another planner has given routes meanwhile: whatever is given next is news to every follower."""
         for follower in self._by_id.values():
             follower.route, follower.stale, follower.push_ns = None, True, 0
-            follower.rows, follower.cols, follower.bounds = _NOWHERE, _NOWHERE, _EMPTY
+            follower.rows, follower.cols, follower.bounds = _NOWHERE, _NOWHERE, _NOWHERE_BOUNDS
 
     def _register(self, vehicle: str, follower: Follower) -> Follower:
         if len(self._by_id) >= CAPACITY:
@@ -125,17 +141,27 @@ class Followers:
         return follower
 
     def drop_silent(self, now_ns: int) -> None:
-        late = [id for id, follower in self._by_id.items() if now_ns - follower.heard_ns > self._lease_ns]
-        for id in late:
-            del self._by_id[id]
+        for heard in (self._by_id, self._told):
+            late = [id for id, each in heard.items() if now_ns - each.heard_ns > self._lease_ns]
+            for id in late:
+                del heard[id]
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
         """The tree is new inside a window, and the map changed in others: whose route does that concern?"""
-        whole = window == self._grid.window
-        for follower in self._by_id.values():
-            if not follower.stale:
-                inside = whole or window.contains(*self._grid.row_col(follower.cell))
-                follower.stale = inside or any(_crosses(follower, each) for each in changed)
+        fresh = [follower for follower in self._by_id.values() if not follower.stale]
+        cells = np.fromiter((follower.cell for follower in fresh), np.int64, len(fresh))
+        rows, cols = np.divmod(cells, self._grid.cols)
+        inside = (rows >= window.row0) & (rows < window.row1) & (cols >= window.col0) & (cols < window.col1)
+        for n in np.flatnonzero(inside).tolist():
+            fresh[n].stale = True
+        if not changed:
+            return
+        corners = chain.from_iterable(follower.bounds for follower in fresh)
+        row0, col0, row1, col1 = np.fromiter(corners, np.int64, 4 * len(fresh)).reshape(-1, 4, 1).swapaxes(0, 1)
+        each = np.array([(w.row0, w.col0, w.row1, w.col1) for w in changed], np.int64).T
+        near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
+        for n, m in np.argwhere(near).tolist():
+            fresh[n].stale = fresh[n].stale or _crosses(fresh[n], changed[m])
 
     def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
         """Followers with a stale route that may be pushed another one; of too many, those that waited longest."""
@@ -177,8 +203,6 @@ def route_cells(grid: GridSpec, route: Route) -> tuple[NDArray[np.int64], NDArra
 
 def _crosses(follower: Follower, window: Window) -> bool:
     """Whether the route passes through a window or next to it: a diagonal step depends on the cells beside it."""
-    if follower.bounds.empty or not follower.bounds.touches(window):
-        return False
     rows, cols = follower.rows, follower.cols
     return bool(
         (

@@ -29,7 +29,7 @@ from swarm.wire.messages.planning import (
     RouteRequest,
 )
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Fleet
+from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
@@ -128,9 +128,10 @@ class Planner:
         """Note where the target is, by the best sighting of it: sightings are ordered before they come here."""
         self._pose = pose
 
-    def hear_fleet(self, fleet: Fleet, now_ns: int) -> None:
-        """Note where an agent's vehicles are, and which of them chase this target."""
-        self.followers.hear(fleet, now_ns)
+    def hear_chasers(self, chasers: Chasers, now_ns: int) -> None:
+        """Note which vehicles of an agent chase this target, and from where."""
+        if chasers.target == self.target:
+            self.followers.hear(chasers, now_ns)
 
     def answer(self, request: RouteRequest | CostRequest, now_ns: int) -> RouteReply | CostReply | Refusal:
         """Answer from the tree as it is. Never waits for a growth that is under way."""

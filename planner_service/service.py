@@ -27,8 +27,8 @@ from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import COST, FLEET, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
+from swarm.wire.messages.vehicles import Chasers
+from swarm.wire.topics import CHASERS, COST, POSE, PUSHED_ROUTE, ROUTE, SIGHTED, STATUS
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class PlannerService:
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
         self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
-        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         tree = TargetTree(terrain.grid, scenario.planner, terrain.climb, all_kernels, has_worker=True)
         if prepared is not None:
             tree.share(prepared.cell_cost)
@@ -100,7 +100,7 @@ class PlannerService:
             self._bus.subscribe(SIGHTED, self._post, target=self._target)
         else:
             self._bus.collect(POSE, target=self._target)
-        self._bus.subscribe(FLEET, self._post)
+        self._bus.collect(CHASERS, target=self._target)
         self._candidacy.start()
         self._lead(self._candidacy.leads, now_ns)
 
@@ -114,8 +114,6 @@ class PlannerService:
                 if self._sightings.hear(sighted, now_ns):
                     for seen in self._sightings.best(now_ns).values():
                         self._planner.set_pose(pose_of(seen))
-            case Heard(message=Fleet() as fleet):
-                self._planner.hear_fleet(fleet, now_ns)
             case Asked(request=RouteRequest() | CostRequest()):
                 self._held.append((now_ns, event))
                 self._answer(now_ns)
@@ -134,6 +132,9 @@ class PlannerService:
         for heard in self._bus.collected(POSE):
             assert isinstance(heard.message, TargetPose)
             self._planner.hear_pose(heard.message, now_ns)
+        for heard in self._bus.collected(CHASERS):
+            assert isinstance(heard.message, Chasers)
+            self._planner.hear_chasers(heard.message, now_ns)
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)

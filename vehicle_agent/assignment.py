@@ -1,4 +1,4 @@
-"""Which target each vehicle goes for: the one that it reaches at the lowest cost, if the change is worth it."""
+"""Which target each vehicle goes for: at low cost, evenly spread over the targets, if the change is worth it."""
 
 from __future__ import annotations
 
@@ -74,6 +74,37 @@ def choose(
     return Choice(best)
 
 
+def spread(costs_s: NDArray[np.float64], current: Sequence[int]) -> NDArray[np.int64]:
+    """Which target each vehicle goes for: the cheapest pairs first, to each target an even share of the vehicles.
+
+    If each took the cheapest, all would end up in one herd (docs/method.md): those which chase one target stand
+    together when it is caught, and have the same cheapest target again.
+
+    Parameters
+    ----------
+    costs_s : (targets, vehicles) float64, inf where there is no route
+    current : (vehicles,) the target of each now, -1 for none; another must be cheaper by `HYSTERESIS`
+
+    Returns
+    -------
+    (vehicles,) int64, index of a target. -1 for a vehicle all whose targets have their share or are out of reach.
+    """
+    targets, vehicles = costs_s.shape
+    most = -(-vehicles // targets)
+    costs_s = costs_s.copy()
+    for vehicle, target in enumerate(current):
+        if target >= 0:
+            costs_s[target, vehicle] *= 1.0 - HYSTERESIS
+    chosen = np.full(vehicles, -1, np.int64)
+    left = [most] * targets
+    order = np.argsort(costs_s, axis=None, kind="stable")[: int(np.isfinite(costs_s).sum())]
+    for target, vehicle in zip(*(each.tolist() for each in np.divmod(order, vehicles)), strict=True):
+        if chosen[vehicle] < 0 and left[target]:
+            chosen[vehicle] = target
+            left[target] -= 1
+    return chosen
+
+
 class Assignment:
     """Asks all planners for the costs of all vehicles of an agent, and assigns each vehicle its target.
 
@@ -115,22 +146,40 @@ class Assignment:
     def costs_ended(
         self, request: int, vehicles: Mapping[str, Vehicle], planners: Mapping[str, int], now_ns: int
     ) -> None:
-        """All planners that will answer have: each vehicle takes the cheapest target."""
+        """All planners that will answer have: each vehicle takes its target."""
         asked = self._open
         if asked is None or asked.request != request:
             return
         self._open = None
         stuck = not self._costs_s
+        told = self._spread(asked, vehicles)
         for index, id in enumerate(asked.vehicles):
             vehicle = vehicles.get(id)
             if vehicle is None:
                 continue
             costs_s = {target: float(column[index]) for target, column in self._costs_s.items()}
+            if id in told:
+                costs_s = {target: cost_s if target == told[id] else math.inf for target, cost_s in costs_s.items()}
             self._assign(vehicle, costs_s, planners, now_ns)
             stuck = stuck or vehicle.state in (VehicleState.IDLE, VehicleState.STRANDED)
         if stuck:
             retry_ns = _STRANDED_RETRY_NS if self._costs_s else _RETRY_NS
             self._due_ns = min(self._due_ns, now_ns + retry_ns)
+
+    def _spread(self, asked: AskCosts, vehicles: Mapping[str, Vehicle]) -> dict[str, str]:
+        """The target of each vehicle that has a choice, so that not all go for the same."""
+        targets = [target for target in self._targets if target in self._costs_s]
+        # A vehicle whose planner is silent keeps to it, or is told that nothing is known.
+        now = {id: vehicles[id].target for id in asked.vehicles if id in vehicles}
+        free = [n for n, id in enumerate(asked.vehicles) if id in now and now[id] in (None, *targets)]
+        if not free or not targets:
+            return {}
+        costs_s = np.array([self._costs_s[target] for target in targets], np.float64)[:, free]
+        current = [-1 if (target := now[asked.vehicles[n]]) is None else targets.index(target) for n in free]
+        chosen = spread(costs_s, current)
+        return {
+            asked.vehicles[n]: targets[each] for n, each in zip(free, chosen.tolist(), strict=True) if each >= 0
+        }
 
     def _assign(
         self, vehicle: Vehicle, costs_s: Mapping[str, float], planners: Mapping[str, int], now_ns: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,6 +27,7 @@ from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, Ro
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
 from swarm.wire.topics import (
+    CHASERS,
     COST,
     FLEET,
     FOLLOWED,
@@ -37,6 +39,7 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
+from vehicle_agent.chasers import ChasersReport
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
@@ -109,8 +112,7 @@ class AgentService:
         self._roster = Roster()
         self._now_ns = 0
         self._fleet = FleetReport(self._author, group)
-        self._asked_ns: dict[str, int] = {}
-        """Tag of each open route request -> when it was sent."""
+        self._chasers = ChasersReport(self._author)
 
     @property
     def agent(self) -> Agent:
@@ -140,14 +142,13 @@ class AgentService:
             case Heard(message=PushedRoute() as pushed):
                 self.counters.count("routes_pushed")
                 self._publish_followed(agent.route_pushed(pushed, now_ns))
-            case Replied(tag=tag, message=RouteReply() as reply):
-                self._observe_query(tag, now_ns)
+            case Replied(tag=tag, message=RouteReply() as reply, took_s=took_s):
+                self.counters.observe("route_query_ms", took_s * 1e3)
                 self.counters.count("routes_received", len(reply.routes))
                 self._publish_followed(agent.routes_given(_number(tag), reply, now_ns))
             case Replied(tag=tag, message=CostReply() as reply) if reply.target_cell is not None:
                 agent.costs_given(_number(tag), reply.target, column(reply.cost_to_go_s, "<f4"))
             case AskEnded(tag=tag, topic=topic) if topic is ROUTE:
-                self._asked_ns.pop(tag, None)
                 agent.routes_ended(_number(tag), now_ns)
             case AskEnded(tag=tag, topic=topic) if topic is COST:
                 agent.costs_ended(_number(tag), now_ns)
@@ -181,11 +182,14 @@ class AgentService:
                 agent.map_changed(self._cost_map.take_dirty(), now_ns)
         places = Places(self._cost_map.grid, agent.vehicles.values())
         self._tell_sighted(places, now_ns)
-        self._perform(agent.decide(now_ns), now_ns)
+        self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         for region, fleet in self._fleet.reports(places, now_ns):
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
+        chasing = ((id, vehicle.target, agent.holdings.path(id)) for id, vehicle in agent.vehicles.items())
+        for chasers in self._chasers.reports(chasing, now_ns):
+            self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
         self._gauge()
 
@@ -239,7 +243,7 @@ class AgentService:
 
     # --- doing what was decided -----------------------------------------------------------------------------
 
-    def _perform(self, actions: list[AgentAction], now_ns: int) -> None:
+    def _perform(self, actions: list[AgentAction]) -> None:
         for action in actions:
             match action:
                 case AskRoutes(request, target, vehicles, cells, force, reroutes):
@@ -250,15 +254,17 @@ class AgentService:
                         max_cells=self._setup.scenario.vehicles.route_cells,
                         force=force,
                     )
-                    tag = f"route-{request}"
-                    self._asked_ns[tag] = now_ns
-                    self._bus.ask(ROUTE, asking, self._post, tag=tag, target=target)
+                    self._bus.ask(ROUTE, asking, self._post, tag=f"route-{request}", target=target)
                 case AskCosts(request, _, cells):
                     costs = CostRequest(cells=list(cells))
                     self._bus.ask(COST, costs, self._post, tag=f"cost-{request}")
 
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:
+            if 0 < route.lower_bound_s < math.inf:
+                self.counters.observe("followed_gap_excess", max(route.cost_s / route.lower_bound_s - 1.0, 0.0))
+            else:
+                self.counters.count("followed_unproven")
             followed = Followed(
                 vehicle=route.vehicle,
                 target=route.target,
@@ -268,11 +274,6 @@ class AgentService:
                 lower_bound_s=route.lower_bound_s,
             )
             self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=route.vehicle)
-
-    def _observe_query(self, tag: str, now_ns: int) -> None:
-        asked_ns = self._asked_ns.pop(tag, None)
-        if asked_ns is not None:
-            self.counters.observe("route_query_ms", (now_ns - asked_ns) / 1e6)
 
     def _gauge(self) -> None:
         states = [vehicle.state for vehicle in self._agent.vehicles.values()]

@@ -12,7 +12,7 @@ import time
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
@@ -116,9 +116,12 @@ class LocalSwarm:
     def poll(self) -> list[Ending]:
         """Reaps processes which ended, and starts those which are due."""
         endings = []
+        # One look at all: to ask each for its exit code costs a system call and a selector each time.
+        ended = wait([running.process.sentinel for running in self.running if running.process is not None], 0)
         for running in self.running:
-            if running.process is not None and running.process.exitcode is not None:
-                endings.append(self._ended(running, running.process))
+            process = running.process
+            if process is not None and process.sentinel in ended and process.exitcode is not None:
+                endings.append(self._ended(running, process))
             elif running.due_s is not None and time.monotonic() >= running.due_s:
                 try:
                     self._start(running)

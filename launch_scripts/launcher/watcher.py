@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder
+from launch_scripts.report.recorder import RECORDED, Recorder
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
@@ -13,7 +13,6 @@ from swarm.runtime.membership import NO_RUN
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo
-from swarm.wire.messages.vehicles import Followed
 from swarm.wire.topics import RUN
 
 _TAG = "launcher-run"
@@ -35,19 +34,17 @@ class Watcher:
         self._inbox = Inbox()
 
     def begin(self) -> None:
-        for topic in RECORDED_TOPICS:
-            self._bus.subscribe(topic, self._inbox.post)
+        for topic, every_s in RECORDED.items():
+            self._bus.subscribe(topic, self._inbox.post, every_s=every_s)
         self._bus.watch_alive(self._inbox.post)
 
     def listen(self, for_s: float) -> None:
-        """Takes in what arrives for some seconds."""
+        """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
+        time.sleep(for_s)
         until_s = time.monotonic() + for_s
-        while True:
-            left_s = until_s - time.monotonic()
-            event = self._inbox.take(max(left_s, 0.0))
-            if event is not None:
-                self._take(event)
-            if left_s <= 0:
+        while (event := self._inbox.take(0.0)) is not None:
+            self._take(event)
+            if time.monotonic() >= until_s:  # what comes faster than it is read must not keep the launcher here
                 return
 
     def now_ns(self) -> int:
@@ -65,8 +62,6 @@ class Watcher:
                 match message:
                     case Note():
                         self._note(message)
-                    case Followed():
-                        self.routes_served = True
                     case PlannerStatus(routes_served=served) if served:
                         self.routes_served = True
                 self.recorder.heard(message, fields, now_ns)

@@ -15,7 +15,7 @@ import rerun as rr
 from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, MeshTile, Points, TerrainMesh
 from launch_scripts.monitor.sinks import Streams
 from launch_scripts.report import palette
-from launch_scripts.report.recorder import Sample
+from launch_scripts.report.samples import Sample
 from swarm.wire.messages.vehicles import VehicleState
 
 _NAMES_SHOWN = 40
@@ -115,7 +115,7 @@ class Drawing:
             rr.Points3D.from_fields(positions=points.positions, colors=points.colours, radii=radii),
         )
 
-    def targets(self, points: Points, poles: list[Floats], names: Floats) -> None:
+    def targets(self, points: Points, poles: Floats, names: Floats) -> None:
         """Logs balls on poles, each with its name at `names`."""
         rec = self._rec
         rec.log("world/targets/poles", rr.LineStrips3D.from_fields(strips=poles))
@@ -137,15 +137,15 @@ class Drawing:
         balls = rr.Points3D(points.positions, colors=points.colours, radii=within_m, labels=points.ids)
         self._rec.log("world/targets/sighted", balls)
 
-    def trails(self, who: str, strips: list[Floats]) -> None:
+    def trails(self, who: str, strips: Floats) -> None:
         """Logs the newest piece of each trail; the view shows those of the last seconds together."""
-        if strips:
+        if len(strips):
             self._rec.log(f"world/trails/{who}", rr.LineStrips3D.from_fields(strips=strips))
 
-    def routes(self, target: str, strips: list[Floats]) -> None:
+    def routes(self, target: str, strips: Floats) -> None:
         self._rec.log(f"world/routes/{target}", rr.LineStrips3D.from_fields(strips=strips))
 
-    def windows(self, strips: list[Floats]) -> None:
+    def windows(self, strips: Floats) -> None:
         self._rec.log("world/windows", rr.LineStrips3D.from_fields(strips=strips))
 
     def plots(self, sample: Sample, messages_per_s: float | None) -> None:

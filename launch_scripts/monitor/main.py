@@ -8,7 +8,7 @@ from collections.abc import Callable
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.recording_watch import RecordingWatch
 from launch_scripts.monitor.scene import TerrainMesh
-from launch_scripts.monitor.service import MonitorService
+from launch_scripts.monitor.service import FRAME_HZ, MonitorService
 from launch_scripts.monitor.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
@@ -16,9 +16,6 @@ from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
-
-_FRAME_HZ = 10.0
-"""How often the view is drawn: as often as vehicles publish their positions."""
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
@@ -43,7 +40,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             live_url=sinks.live_url,
             recording=None if path is None else RecordingWatch(path, sinks.begin_file),
         )
-        process = Process(service, inbox, MonotonicClock(), _FRAME_HZ)
+        process = Process(service, inbox, MonotonicClock(), FRAME_HZ)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

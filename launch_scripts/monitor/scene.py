@@ -7,17 +7,17 @@ stretched so that gentle land still looks like land.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.report.hillshade import hillshade
-from launch_scripts.report.latest_state import VehicleNow
+from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
-from swarm.grid import GridSpec, Window
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -39,6 +39,8 @@ STATE_COLOURS = {
     VehicleState.STRANDED: (150, 150, 20),
     VehicleState.LOST: (40, 84, 60),
 }
+_STEP_ROW, _STEP_COL = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int64)
+_STATE_COLOURS = np.array([STATE_COLOURS[state] for state in VehicleState], np.uint8)
 TARGET_COLOUR = (255, 46, 46)
 SIGHTED_COLOUR = (255, 170, 150)
 LETHAL_MARK = (86, 22, 150)
@@ -216,16 +218,10 @@ def _lit_photo(seen: Level) -> Bytes:
 # --- what moves -------------------------------------------------------------------------------------------------
 
 
-def vehicle_points(mesh: TerrainMesh, vehicles: Mapping[str, VehicleNow]) -> Points:
+def vehicle_points(mesh: TerrainMesh, vehicles: VehicleColumns) -> Points:
     """All vehicles, coloured by state."""
-    now = list(vehicles.values())
-    positions = mesh.place(
-        np.array([vehicle.east_m for vehicle in now], np.float32),
-        np.array([vehicle.south_m for vehicle in now], np.float32),
-        0.15 * mesh.scale_m,
-    )
-    colours = np.array([STATE_COLOURS[vehicle.state] for vehicle in now], np.uint8).reshape(-1, 3)
-    return Points(list(vehicles), positions.reshape(-1, 3), colours)
+    positions = mesh.place(vehicles.east_m, vehicles.south_m, 0.15 * mesh.scale_m)
+    return Points(vehicles.ids, positions, _STATE_COLOURS[vehicles.states])
 
 
 def target_points(mesh: TerrainMesh, places_m: Mapping[str, tuple[float, float]]) -> Points:
@@ -251,33 +247,16 @@ def label_places(mesh: TerrainMesh, targets: Points) -> Floats:
     return names
 
 
-def poles(mesh: TerrainMesh, targets: Points) -> list[Floats]:
-    """A line from each target down to the terrain."""
-    feet = mesh.place(targets.positions[:, 0], -targets.positions[:, 1])
-    return [np.stack([foot, top]) for foot, top in zip(feet, targets.positions, strict=True)]
-
-
-def window_outline(mesh: TerrainMesh, window: Window) -> Floats:
-    """The border of a window, laid over the terrain."""
-    rows = np.clip([window.row0, window.row1 - 1], 0, mesh.grid.rows - 1)
-    cols = np.clip([window.col0, window.col1 - 1], 0, mesh.grid.cols - 1)
-    east, west = (np.full(_along(rows), col) for col in (cols[1], cols[0]))
-    north, south = (np.full(_along(cols), row) for row in (rows[0], rows[1]))
-    across, down = (np.linspace(ends[0], ends[1], _along(ends)).astype(int) for ends in (cols, rows))
-    row_path = np.concatenate([north, down, south, down[::-1]])
-    col_path = np.concatenate([across, east, across[::-1], west])
-    return mesh.place_cells(row_path * mesh.grid.cols + col_path, 0.25 * mesh.scale_m)
-
-
-def _along(ends: NDArray[np.integer]) -> int:
-    return int(min(max((ends[1] - ends[0]) // 4, 1) + 1, 65))
-
-
-def route_strip(mesh: TerrainMesh, cells: NDArray[np.integer], most: int = 64) -> Floats:
-    """A route over the terrain, thinned so that a hundred routes stay cheap to draw."""
-    if len(cells) > most:
-        cells = cells[np.unique(np.linspace(0, len(cells) - 1, most).astype(int))]
-    return mesh.place_cells(cells, 0.2 * mesh.scale_m)
+def cells_along(grid: GridSpec, start: int, directions: bytes) -> NDArray[np.int64] | None:
+    """The cells of a route, as `swarm.grid.walk`; None where that raises."""
+    codes = np.frombuffer(directions, np.uint8)
+    if not 0 <= start < grid.cells or int(codes.max(initial=0)) >= len(STEP_ROW):
+        return None
+    rows = start // grid.cols + np.cumsum(_STEP_ROW[codes])
+    cols = start % grid.cols + np.cumsum(_STEP_COL[codes])
+    if not ((rows >= 0) & (rows < grid.rows) & (cols >= 0) & (cols < grid.cols)).all():
+        return None
+    return np.concatenate([np.array([start], np.int64), rows * grid.cols + cols])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,25 +277,3 @@ def cell_at(grid: GridSpec, east_m: float, south_m: float) -> int:
     row = min(max(int(south_m // grid.resolution_m), 0), grid.rows - 1)
     col = min(max(int(east_m // grid.resolution_m), 0), grid.cols - 1)
     return row * grid.cols + col
-
-
-class Trails:
-    """Trails since the last drawing: one strip per id, which joins the one before."""
-
-    def __init__(self, longest_m: float) -> None:
-        self._longest_m = longest_m
-        self._last: dict[str, Floats] = {}
-
-    def advance(self, ids: Iterable[str], positions: Floats) -> list[Floats]:
-        """Strips from the last places to these; none for ids which stand still, are new, or jumped."""
-        strips = []
-        for id, position in zip(ids, positions, strict=True):
-            last = self._last.get(id)
-            if last is not None:
-                moved_m = float(np.hypot(*(position - last)[:2]))
-                if moved_m == 0:
-                    continue
-                if moved_m <= self._longest_m:
-                    strips.append(np.stack([last, position]))
-            self._last[id] = position
-        return strips

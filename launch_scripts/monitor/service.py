@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 
-import numpy as np
 import rerun as rr
 
 from launch_scripts.monitor.drawing import Drawing
@@ -17,19 +16,18 @@ from launch_scripts.monitor.recording_watch import RecordingWatch
 from launch_scripts.monitor.scene import (
     RouteNow,
     TerrainMesh,
-    Trails,
     cell_at,
+    cells_along,
     label_places,
-    poles,
-    route_strip,
     sighting_points,
     target_points,
     vehicle_points,
-    window_outline,
 )
 from launch_scripts.monitor.sinks import Streams
-from launch_scripts.report.latest_state import VehicleNow
-from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder, messages_per_s
+from launch_scripts.monitor.strips import Trails, poles, route_strips, window_outlines
+from launch_scripts.report.recorder import RECORDED, Recorder
+from launch_scripts.report.samples import messages_per_s
+from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
@@ -37,7 +35,7 @@ from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
-from swarm.grid import Window, walk
+from swarm.grid import Window
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
@@ -46,16 +44,26 @@ from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import MARKS, SIGHTED
+from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
 
 log = logging.getLogger(__name__)
 
+FRAME_HZ = 10.0
+"""How often the view is drawn."""
+_DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.5 / FRAME_HZ, FOLLOWED: 0.5, SIGHTED: 0.0}
+"""What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
+_TARGETS_NS = NS_PER_S // 5
+"""Targets, each with its pole and its name, take as long to draw as all vehicles, which move faster."""
 _TRAILS_NS = NS_PER_S // 2
+_WINDOWS_NS = NS_PER_S
 _ROUTES_NS = 3 * NS_PER_S // 2
 """Period in which the routes to every target are drawn once."""
-_TEXTURES_PER_FRAME = 8
+_TEXTURES_NS, _TEXTURES_AT_ONCE = NS_PER_S, 80
+"""Marks come many times a second to the same tiles, and each of their photos is drawn once for all."""
 _REFRESH_NS = NS_PER_S
 _ROUTES_SHOWN = 400
+_ROUTES_KEPT = 1 << 15
+"""Vehicles whose routes are remembered. Beyond that all are forgotten: their agents never had so many."""
 _ANNOUNCE_NS = NS_PER_S // 2
 
 
@@ -89,7 +97,7 @@ class MonitorService:
         self.counters: Counters = self._member.counters
         self._cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, self._cost_map)
-        self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role)
+        self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role, at_ticks=True)
         self._mesh = mesh or TerrainMesh(terrain)
         self._target_ids = setup.scenario.target_ids
         self._rec = rec
@@ -104,20 +112,22 @@ class MonitorService:
         self._sightings = Sightings(replica.filter)
         self._sighted: Mapping[str, Sighted] = {}
         self._fleets_new = self._targets_new = self._windows_new = False
+        self._windows: dict[str, tuple[int, ...]] = {}
+        """Target -> the window that its planner grew last."""
+        self._windows_due_ns = self._targets_due_ns = 0
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
-        self._trails_due_ns = self._routes_due_ns = self._refresh_due_ns = 0
+        self._trails_due_ns = self._routes_due_ns = self._refresh_due_ns = self._textures_due_ns = 0
         self._next_route_target = self._next_refresh = 0
         self._last_sample_s = -1.0
 
     def start(self, now_ns: int) -> None:
         self._started_ns = now_ns
         self._member.join()
-        for topic in RECORDED_TOPICS:
+        for topic, every_s in {**RECORDED, **_DRAWN}.items():
             if topic is not MARKS:
-                self._bus.subscribe(topic, self._post)
-        self._bus.subscribe(SIGHTED, self._post)
+                self._bus.subscribe(topic, self._post, every_s=every_s)
         self._bus.watch_alive(self._post)
         self._sync.start(now_ns)
         self._drawing.set_time(0, 0.0)
@@ -141,8 +151,10 @@ class MonitorService:
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
             case Sighted() as sighted:
                 self._sightings.hear(sighted, now_ns)
-            case PlannerStatus():
-                self._windows_new = True
+            case PlannerStatus(target=target, window=window):
+                if self._windows.get(target) != tuple(window):
+                    self._windows[target] = tuple(window)
+                    self._windows_new = True
             case Followed() as followed:
                 self._follow(followed)
             case Note() as note:
@@ -160,7 +172,9 @@ class MonitorService:
             self._stale_tiles.update(dict.fromkeys(self._mesh.tiles_touching(window)))
         if not self._stale_tiles and now_ns >= self._refresh_due_ns:
             self._refresh(now_ns)
-        self._draw_textures(_TEXTURES_PER_FRAME)
+        if now_ns >= self._textures_due_ns:
+            self._textures_due_ns = now_ns + _TEXTURES_NS
+            self._draw_textures(_TEXTURES_AT_ONCE)
         self._draw_movers(now_ns)
         self._draw_plots(now_ns)
 
@@ -176,12 +190,13 @@ class MonitorService:
             self._drawing.note(text, "INFO" if up else "WARN")
 
     def _follow(self, followed: Followed) -> None:
-        try:
-            cells = walk(self._terrain.grid, followed.start, followed.directions)
-        except ValueError:  # a route that leaves the grid is its sender's bug: skip it, and go on drawing
+        cells = cells_along(self._terrain.grid, followed.start, followed.directions)
+        if cells is None:  # a route that leaves the grid is its sender's bug: skip it, and go on drawing
             self.counters.count("routes_unreadable")
             return
-        self._routes[followed.vehicle] = RouteNow(followed.target, np.array(cells, np.int64))
+        if len(self._routes) >= _ROUTES_KEPT:
+            self._routes.clear()
+        self._routes[followed.vehicle] = RouteNow(followed.target, cells)
 
     def _announce(self, now_ns: int) -> None:
         """Publishes the live view's address, once links have had time to learn of subscribers."""
@@ -236,31 +251,29 @@ class MonitorService:
             if trails_due:
                 self._drawing.trails("vehicles", self._vehicle_trails.advance(points.ids, points.positions))
             self._draw_routes(now_ns, vehicles)
-        if self._targets_new:
-            self._targets_new = False
+        if self._targets_new and (trails_due or now_ns >= self._targets_due_ns):
+            self._targets_new, self._targets_due_ns = False, now_ns + _TARGETS_NS
             targets = target_points(self._mesh, self.recorder.observed.targets())
             feet = poles(self._mesh, targets)
             self._drawing.targets(targets, feet, label_places(self._mesh, targets))
             if trails_due:
-                places = np.array([pole[0] for pole in feet], np.float32)
-                self._drawing.trails("targets", self._target_trails.advance(targets.ids, places))
+                self._drawing.trails("targets", self._target_trails.advance(targets.ids, feet[:, 0]))
         self._sightings.expire(now_ns)
         sighted = self._sightings.best(now_ns)
         if sighted != self._sighted:  # a new sighting, or one that expired
             self._sighted = sighted
             self._drawing.sightings(*sighting_points(self._mesh, sighted))
-        if self._windows_new:
-            self._windows_new = False
+        if self._windows_new and now_ns >= self._windows_due_ns:
+            self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
             self._draw_windows()
 
     def _draw_windows(self) -> None:
         """Draws the window that each planner grew last, unless it is the whole terrain."""
-        told = [status.window for _, status in sorted(self.recorder.observed.status.items())]
-        windows = [Window(*window) for window in told if window]
-        parts = [window for window in windows if not window.empty and window.cells < self._terrain.grid.cells]
-        self._drawing.windows([window_outline(self._mesh, window) for window in parts])
+        told = (Window(*self._windows[target]) for target in sorted(self._windows) if self._windows[target])
+        parts = [window for window in told if not window.empty and window.cells < self._terrain.grid.cells]
+        self._drawing.windows(window_outlines(self._mesh, parts))
 
-    def _draw_routes(self, now_ns: int, vehicles: dict[str, VehicleNow]) -> None:
+    def _draw_routes(self, now_ns: int, vehicles: VehicleColumns) -> None:
         """Draws what is left of the routes, one target after the other."""
         if now_ns < self._routes_due_ns or not self._target_ids:
             return
@@ -268,20 +281,21 @@ class MonitorService:
         target = self._target_ids[self._next_route_target % len(self._target_ids)]
         self._next_route_target += 1
         strips = []
-        for id in list(vehicles)[:_ROUTES_SHOWN]:
-            vehicle, route = vehicles[id], self._routes.get(id)
-            if route is None or route.target != target or vehicle.target != target:
+        for n in vehicles.chasing(target)[:_ROUTES_SHOWN].tolist():
+            route = self._routes.get(vehicles.ids[n])
+            if route is None or route.target != target:
                 continue
-            ahead = route.ahead_of(cell_at(self._terrain.grid, vehicle.east_m, vehicle.south_m))
+            place = float(vehicles.east_m[n]), float(vehicles.south_m[n])
+            ahead = route.ahead_of(cell_at(self._terrain.grid, *place))
             if len(ahead) > 1:
-                strips.append(route_strip(self._mesh, ahead))
-        self._drawing.routes(target, strips)
+                strips.append(ahead)
+        self._drawing.routes(target, route_strips(self._mesh, strips))
 
     def _draw_plots(self, now_ns: int) -> None:
-        samples = self.recorder.samples
+        samples = self.recorder.samples.newest
         if not samples or samples[-1].time_s == self._last_sample_s:
             return
         self._last_sample_s = samples[-1].time_s
-        rates = messages_per_s(list(samples)[-2:])
+        rates = messages_per_s(samples)
         self._drawing.plots(samples[-1], rates[-1][1] if rates else None)
         self._drawing.summary(summary_markdown(self._setup, self.recorder.summary(now_ns)))

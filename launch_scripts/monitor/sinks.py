@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 
 APPLICATION = "terrain-swarm"
 _PORT_PATIENCE_S = 3.0
-_MEMORY = "256MiB"
-"""What the stream keeps for viewers that come later; the oldest goes first."""
+_MEMORY = "128MiB"
+"""What the stream keeps for viewers that come later; the oldest goes first. About 20 minutes of the demo."""
 
 T = TypeVar("T")
 
@@ -43,6 +43,12 @@ def new_recording_path(folder: Path) -> Path:
         except OSError as error:
             raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     raise StoreError(f"{folder} is full of recordings")
+
+
+def _file(path: Path) -> rr.FileSink:
+    """A file without a footer. For that rerun keeps an entry of every chunk in memory up to the end, 4 MB a minute
+    of the demo. What reads recordings reads those without one, too: a killed monitor leaves one in any case."""
+    return rr.FileSink(path, write_footer=False)
 
 
 class Streams:
@@ -77,7 +83,7 @@ class Sinks:
         self._gate: StreamGate | None = None
         sinks: list[rr.FileSink | rr.GrpcServerSink] = []
         if path is not None:
-            sinks.append(rr.FileSink(path, write_footer=True))
+            sinks.append(_file(path))
         if config.live:
             behind = _hidden_address()
             self._gate = _when_free(lambda port: StreamGate(port, behind), config.grpc_port, "grpc_port")
@@ -98,7 +104,7 @@ class Sinks:
         close the live view's port."""
         _, *earlier = self.streams.streams
         stream = self._stream()
-        stream.set_sinks(rr.FileSink(path, write_footer=True), default_blueprint=self._blueprint)
+        stream.set_sinks(_file(path), default_blueprint=self._blueprint)
         self.streams.streams = (self.rec, stream)
         for each in earlier:
             each.disconnect()

@@ -1,16 +1,16 @@
 """Newest message of every sender of a run: positions, counts, marks.
 
-Pure: the launcher, the monitor and the simulation pass it what they heard on `RECORDED_TOPICS`.
+Pure: the launcher, the monitor and the simulation pass it what they heard on `RECORDED`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.liveness import Peer
 from swarm.ranks import HIGHEST_RANK, ranked_id, split_rank
@@ -21,19 +21,8 @@ from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Beat, Stats
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.statements import MarkKind
-
-
-@dataclass(frozen=True, slots=True)
-class VehicleNow:
-    """Last reported place of a vehicle. `target` is None while it has none."""
-
-    east_m: float
-    south_m: float
-    heading_rad: float
-    state: VehicleState
-    target: str | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +44,8 @@ class Observed:
         self._stats: dict[tuple[str, str, int], Stats] = {}
         self._messages_before: dict[tuple[str, str, int], int] = {}
         self._fleets: dict[tuple[str, int], Fleet] = {}
+        self._vehicles: VehicleColumns | None = None
+        """What `_fleets` say, once somebody has asked; None since the last that was new."""
         self._marks: dict[tuple[str, int], MarkSet] = {}
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
@@ -80,6 +71,7 @@ class Observed:
                 fleet = self._fleets.get((message.author, message.region))
                 if fleet is None or message.seq >= fleet.seq:
                     self._fleets[message.author, message.region] = message
+                    self._vehicles = None
             case TargetPose():
                 pose = self.poses.get(message.target)
                 if pose is None or (message.incarnation, message.seq) >= (pose.incarnation, pose.seq):
@@ -127,23 +119,11 @@ class Observed:
 
     # --- places ---------------------------------------------------------------------------------------------------
 
-    def vehicles(self) -> dict[str, VehicleNow]:
-        """Last reported state of every vehicle, in order of id."""
-        now: dict[str, VehicleNow] = {}
-        for fleet in sorted(self._fleets.values(), key=lambda fleet: (fleet.stamp_ns, fleet.seq)):
-            rows = zip(
-                fleet.ids,
-                column(fleet.east_m, "<f4").tolist(),
-                column(fleet.south_m, "<f4").tolist(),
-                column(fleet.heading_rad, "<f4").tolist(),
-                fleet.states,
-                fleet.targets,
-                strict=True,
-            )
-            for id, east_m, south_m, heading_rad, state, target in rows:
-                chased = None if target == NO_TARGET else fleet.target_ids[target]
-                now[id] = VehicleNow(east_m, south_m, heading_rad, VehicleState(state), chased)
-        return dict(sorted(now.items()))
+    def vehicles(self) -> VehicleColumns:
+        """Last reported state of every vehicle."""
+        if self._vehicles is None:
+            self._vehicles = gathered(self._fleets.values())
+        return self._vehicles
 
     def targets(self) -> dict[str, tuple[float, float]]:
         """(east, south) in metres of every target, in order of id."""
@@ -206,11 +186,3 @@ class Observed:
     def histogram(self, name: str) -> Histogram:
         """Histogram of a name, over all incarnations of all processes."""
         return merged(stats.histograms.get(name, {}) for stats in self._stats.values())
-
-
-def count_states(vehicles: Mapping[str, VehicleNow]) -> tuple[int, ...]:
-    """Number of vehicles in each VehicleState, in its order."""
-    counts = [0] * len(VehicleState)
-    for vehicle in vehicles.values():
-        counts[vehicle.state] += 1
-    return tuple(counts)

@@ -16,12 +16,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 
 from launch_scripts.report.palette import BLUE, DARK_GREEN, FAINT, GREEN, INK, ORANGE, SKY, STATE_COLOURS, VIOLET
-from launch_scripts.report.recorder import Recorder, Sample, messages_per_s
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.samples import Sample, messages_per_s
 from swarm.runtime.stats import Histogram
 
 
 def draw_plots(figure: Figure, recorder: Recorder) -> None:
-    samples = list(recorder.samples)
+    samples = recorder.samples.all()
     left, width, height, gap = 0.648, 0.304, 0.107, 0.0556
     axes = [figure.add_axes((left, 0.708 - n * (height + gap), width, height)) for n in range(5)]
     end_s = max((sample.time_s for sample in samples), default=1.0) or 1.0

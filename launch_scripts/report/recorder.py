@@ -1,21 +1,22 @@
 """Records a run: takes messages, returns numbers. Launcher, monitor and simulation share it.
 
-Pure: time is an argument, and the owner of a bus passes it what comes on `RECORDED_TOPICS`.
+Pure: time is an argument, and the owner of a bus passes it what comes on `RECORDED`.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from launch_scripts.report.latest_state import MarkedCells, Observed, VehicleNow, count_states
+from launch_scripts.report.latest_state import MarkedCells, Observed
+from launch_scripts.report.samples import Sample, Samples, messages_per_s
 from launch_scripts.report.tracks import TrackKey, Tracks
+from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario
@@ -27,15 +28,21 @@ from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Followed, VehicleState
-from swarm.wire.topics import FLEET, FOLLOWED, LEAD, MARKS, NOTE, POSE, STATS, STATUS, Topic
+from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.topics import FLEET, LEAD, MARKS, NOTE, POSE, STATS, STATUS, Topic
 
-RECORDED_TOPICS: tuple[Topic, ...] = (STATS, STATUS, LEAD, FLEET, POSE, NOTE, FOLLOWED, MARKS)
+TRACK_S = 0.5
+"""Places are sampled so often."""
+RECORDED: dict[Topic, float] = {
+    STATS: 0.0, STATUS: 0.0, NOTE: 0.0, LEAD: TRACK_S, FLEET: TRACK_S, POSE: TRACK_S, MARKS: TRACK_S
+}  # fmt: skip
+"""What a recorder hears, and how often it takes the newest of each key, in seconds; 0 for all that comes."""
 
-_TRACK_NS = NS_PER_S // 2
+_TRACK_NS = int(TRACK_S * NS_PER_S)
 _SAMPLE_NS = NS_PER_S
-_SAMPLES_KEPT = 4096
 _NOTES_KEPT = 1000
+_CAPTURES_KEPT = 4096
+"""Places of captures: those of the first hours of a long run are forgotten, their number is not."""
 _CAPTURES_AT_ONCE = 100
 """Most captures counted between two poses: a hostile message must not fill the memory."""
 
@@ -46,22 +53,6 @@ class Capture:
     target: str
     east_m: float
     south_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """The run at one instant. `states` counts vehicles per VehicleState; totals are None until published."""
-
-    time_s: float
-    states: tuple[int, ...]
-    captures: int | None
-    marks: int | None
-    reroute_requests: int | None
-    routes_served: int | None
-    messages: int
-    alive: int
-    gaps: dict[str, float]
-    growth_ms: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,17 +109,20 @@ class Recorder:
         self.last_ns: int | None = None
         self.ready_ns: int | None = None
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
-        self.samples: deque[Sample] = deque(maxlen=_SAMPLES_KEPT)
-        self.captures: list[Capture] = []
+        self.samples = Samples()
+        self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
+        self.captures_of: Counter[str] = Counter()
+        """Target -> its captures."""
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
         self.vehicle_tracks = Tracks(_TRACK_NS)
         self.target_tracks = Tracks(_TRACK_NS)
         self.routed: set[str] = set()
+        self._track_ids: list[str] = []
+        self._track_keys: list[TrackKey] = []
+        """Of the vehicles heard of last."""
         self._expected = _expected(scenario)
         self._sample_due_ns: int | None = None
         self._gap_max: float | None = None
-        self._certified_excess = Histogram()
-        self._unproven = 0
 
     def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
         """Records one message; `fields` are the chunks of its key."""
@@ -138,9 +132,6 @@ class Recorder:
                 self._capture(message, now_ns)
             case PlannerStatus(gap_max=float(gap)):
                 self._gap_max = max(gap, self._gap_max or 0.0)
-            case Followed():
-                self.routed.add(message.vehicle)
-                self._certify(message)
             case Note():
                 self.notes.append((self.seconds(now_ns), message))
         self.observed.heard(message)
@@ -180,45 +171,41 @@ class Recorder:
             return
         # The place before the capture: the target may already stand elsewhere.
         capture = Capture(self.seconds(now_ns), pose.target, *self.observed.place_m(known))
-        self.captures += [capture] * min(pose.captures - known.captures, _CAPTURES_AT_ONCE)
-
-    def _certify(self, route: Followed) -> None:
-        if 0 < route.lower_bound_s < math.inf and math.isfinite(route.cost_s):
-            self._certified_excess.add(max(route.cost_s / route.lower_bound_s - 1.0, 0.0))
-        else:
-            self._unproven += 1
+        new = min(pose.captures - known.captures, _CAPTURES_AT_ONCE)
+        self.captures.extend([capture] * new)
+        self.captures_of[pose.target] += new
 
     def _look(self, now_ns: int) -> None:
-        if self.ready_ns is None and self.routed and not self.missing():
-            self.ready_ns = now_ns
         tracks_due = self.vehicle_tracks.due(now_ns)
         sample_due = self._sample_due_ns is None or now_ns >= self._sample_due_ns
-        if not (tracks_due or sample_due):
-            return
-        vehicles = self.observed.vehicles()
-        if tracks_due:
-            self._sample_tracks(now_ns, vehicles)
-        if sample_due:
-            self._sample_due_ns = now_ns + _SAMPLE_NS
-            self.samples.append(self.sample(now_ns, vehicles))
+        if tracks_due or sample_due:
+            vehicles = self.observed.vehicles()
+            if tracks_due:
+                self._sample_tracks(now_ns, vehicles)
+            if sample_due:
+                self._sample_due_ns = now_ns + _SAMPLE_NS
+                self.samples.add(self.sample(now_ns, vehicles))
+            if self.ready_ns is None and self.routed and not self.missing():
+                self.ready_ns = now_ns
 
-    def _sample_tracks(self, now_ns: int, vehicles: Mapping[str, VehicleNow]) -> None:
-        moving = (VehicleState.FOLLOWING, VehicleState.ARRIVED)
-        self.routed.update(id for id, vehicle in vehicles.items() if vehicle.state in moving)
-        keys: list[TrackKey] = [(id, 0) for id in vehicles]
-        places = [(vehicle.east_m, vehicle.south_m) for vehicle in vehicles.values()]
-        self.vehicle_tracks.add(now_ns, keys, np.array(places, np.float32))
+    def _sample_tracks(self, now_ns: int, vehicles: VehicleColumns) -> None:
+        moving = np.isin(vehicles.states, (VehicleState.FOLLOWING, VehicleState.ARRIVED))
+        if len(self.routed) < self.scenario.vehicle_count:
+            self.routed.update(vehicles.ids[n] for n in np.flatnonzero(moving).tolist())
+        if self._track_ids != vehicles.ids:
+            self._track_ids, self._track_keys = vehicles.ids, [(id, 0) for id in vehicles.ids]
+        self.vehicle_tracks.add(now_ns, self._track_keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
         poses = sorted(self.observed.poses.items())
         pieces: list[TrackKey] = [(id, pose.jumps) for id, pose in poses]
         places = [self.observed.place_m(pose) for _, pose in poses]
         self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
 
-    def sample(self, now_ns: int, vehicles: Mapping[str, VehicleNow]) -> Sample:
+    def sample(self, now_ns: int, vehicles: VehicleColumns) -> Sample:
         observed = self.observed
         status = sorted(observed.status.items())
         return Sample(
             time_s=self.seconds(now_ns),
-            states=count_states(vehicles),
+            states=vehicles.count_states(),
             captures=observed.total("captures"),
             marks=observed.total("marks"),
             reroute_requests=observed.total("reroute_requests"),
@@ -233,11 +220,11 @@ class Recorder:
         """The figures of the live table at a time."""
         observed = self.observed
         vehicles = observed.vehicles()
-        rates = messages_per_s(list(self.samples)[-2:])
+        rates = messages_per_s(self.samples.newest)
         return LiveSummary(
             elapsed_s=self.seconds(now_ns),
             targets=tuple(self._target_line(id, vehicles) for id in self.scenario.target_ids),
-            states=_by_state(count_states(vehicles)),
+            states=_by_state(vehicles.count_states()),
             captures=observed.total("captures"),
             reroute_requests=observed.total("reroute_requests"),
             marks=observed.total("marks"),
@@ -247,23 +234,23 @@ class Recorder:
             restarts=observed.restarts,
         )
 
-    def _target_line(self, id: str, vehicles: Mapping[str, VehicleNow]) -> TargetLine:
+    def _target_line(self, id: str, vehicles: VehicleColumns) -> TargetLine:
         observed = self.observed
         pose, status = observed.poses.get(id), observed.status.get(id)
         nearest_m = None
-        if pose is not None and vehicles:
+        if pose is not None and len(vehicles):
             east_m, south_m = observed.place_m(pose)
-            nearest_m = min(math.hypot(v.east_m - east_m, v.south_m - south_m) for v in vehicles.values())
+            nearest_m = float(np.hypot(vehicles.east_m - east_m, vehicles.south_m - south_m).min())
         return TargetLine(
             id=id,
             planner_up=observed.is_up("planner", id),
             rank=observed.rank("planner", id),
-            following=sum(1 for vehicle in vehicles.values() if vehicle.target == id),
+            following=len(vehicles.chasing(id)),
             nearest_m=nearest_m,
             growths=None if status is None else status.growths + status.window_growths,
             growth_ms=None if status is None else status.growth_ms,
             gap=None if status is None else status.gap_mean,
-            captures=sum(1 for capture in self.captures if capture.target == id),
+            captures=self.captures_of[id],
         )
 
     def report(
@@ -279,7 +266,7 @@ class Recorder:
         if seconds is None and self.first_ns is not None and self.last_ns is not None:
             seconds = (self.last_ns - self.first_ns) / NS_PER_S
         observed, total = self.observed, self.observed.total
-        rates = [rate for _, rate in messages_per_s(list(self.samples))]
+        rates = [rate for _, rate in messages_per_s(self.samples.all())]
         fields = {
             "scenario": self.scenario.name,
             "run_id": run_id,
@@ -297,7 +284,7 @@ class Recorder:
             "lethal_entries": total("lethal_entries"),
             "stranded": _whole(observed.gauge("stranded")),
             "lost": _whole(observed.gauge("lost")),
-            "states_at_end": _by_state(count_states(observed.vehicles())),
+            "states_at_end": _by_state(observed.vehicles().count_states()),
             "reroute_requests": total("reroute_requests"),
             "marks": total("marks"),
             "marked_cells": len(self.marked().cells) if observed.any_marks else None,
@@ -306,7 +293,10 @@ class Recorder:
             "growths": total("growths"),
             "window_growths": total("window_growths"),
             "gap": self._gap(),
-            "certified_gap": {**_excess(self._certified_excess), "unproven": self._unproven},
+            "certified_gap": {
+                **_excess(observed.histogram("followed_gap_excess")),
+                "unproven": total("followed_unproven") or 0,
+            },
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
             "messages_out": total("messages_out"),
             "messages_in": total("messages_in"),
@@ -318,7 +308,7 @@ class Recorder:
 
     def series(self, points: int = 120) -> dict[str, list[Any]]:
         """The run over time, at about `points` instants at most: lists with one value per `t_s`."""
-        samples = list(self.samples)
+        samples = self.samples.all()
         samples = samples[:: max(1, -(-len(samples) // points))]
         names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
         rates = {round(time_s, 6): rate for time_s, rate in messages_per_s(samples)}
@@ -351,15 +341,6 @@ TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "tick_
 
 def quantiles(histogram: Histogram) -> dict[str, float | None]:
     return {"p50": histogram.quantile(0.5), "p99": histogram.quantile(0.99)}
-
-
-def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
-    """(time, rate) between successive samples, from the first published count on."""
-    return [
-        (late.time_s, max(late.messages - early.messages, 0) / (late.time_s - early.time_s))
-        for early, late in itertools.pairwise(samples)
-        if late.time_s > early.time_s and early.messages > 0
-    ]
 
 
 def _expected(scenario: Scenario) -> list[tuple[str, str]]:

@@ -30,7 +30,10 @@ class Tracks:
         self._due_ns = now_ns + self._interval_ns
         if not keys:
             return
-        self._samplings.append((now_ns, tuple(keys), np.asarray(places_m, np.float32).reshape(-1, 2)))
+        before = self._samplings[-1][1] if self._samplings else ()
+        # The same keys come each time: they take most of the memory unless they are kept once.
+        shared = before if len(before) == len(keys) and before == tuple(keys) else tuple(keys)
+        self._samplings.append((now_ns, shared, np.asarray(places_m, np.float32).reshape(-1, 2)))
         self._count += len(keys)
         if self._count > self._limit and len(self._samplings) > 2:
             self._samplings = self._samplings[::2]

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 import msgspec
 
 from launch_scripts.process_table import STOP_ORDER, processes_of
-from launch_scripts.report.recorder import RECORDED_TOPICS, Recorder
+from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node
@@ -151,8 +151,8 @@ class Simulation:
                 case Disappeared(peer):
                     recorder.alive(peer, False, clock.now_ns())
 
-        for topic in RECORDED_TOPICS:
-            bus.subscribe(topic, post)
+        for topic, every_s in RECORDED.items():
+            bus.subscribe(topic, post, every_s=every_s)
         bus.watch_alive(post)
 
     def twin(self, name: str) -> None:

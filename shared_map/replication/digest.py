@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from swarm.wire.messages.marks import DIGEST_ROW, MarkSet
 
+_FEW = 64
+"""Rows up to which tuples are compared faster than arrays: digests of late changes come several times a second."""
+
 Held = Mapping[str, bytes]
 """Author -> rows of DIGEST_ROW, as in the message `Digest`."""
 
@@ -57,9 +60,14 @@ class Ledger:
         for author in sorted(theirs):
             rows = np.frombuffer(theirs[author], DIGEST_ROW)
             ours = self._authors.get(author)
-            newer = rows if ours is None else rows[_newer(rows, ours.sorted())]
-            if len(newer):
-                found.append((author, sorted(set(newer["tile"].tolist()))))
+            if ours is None:
+                tiles = rows["tile"].tolist()
+            elif len(rows) <= _FEW:
+                tiles = [tile for tile, *number in rows.tolist() if tuple(number) > ours.number(tile)]
+            else:
+                tiles = rows["tile"][_newer(rows, ours.sorted())].tolist()
+            if tiles:
+                found.append((author, sorted(set(tiles))))
         return found
 
     def ahead(self, theirs: Held, authors: list[str]) -> list[tuple[str, list[int]]]:
@@ -86,6 +94,14 @@ class _Rows:
         self._rows: NDArray[np.void] = np.zeros(0, DIGEST_ROW)  # in order of tile
         self._places: dict[int, int] = {}  # tile -> its place in `_rows`
         self.recorded: dict[int, tuple[int, int]] = {}
+
+    def number(self, tile: int) -> tuple[int, int]:
+        """(epoch, seq) of a tile's set; (-1, -1) without one."""
+        number = self.recorded.get(tile)
+        if number is None:
+            place = self._places.get(tile)
+            number = (-1, -1) if place is None else self._rows[place].item()[1:]
+        return number
 
     def drop(self, tile: int) -> int:
         """Returns how many are left."""

@@ -36,6 +36,8 @@ _MAX_ASKS = 16
 _CHANGES_EVERY_NS = NS_PER_S // 5
 _CHANGES_FOR_NS = 2 * NS_PER_S
 _OFFERS_AT_ONCE = 256
+_MOST_HEARD = 4096
+"""Sets that wait for a tick; more are merged as they come."""
 _QUANTUM = 16_384
 """Statements of one author that are merged before its quota is looked at again."""
 _MANY = "-"
@@ -56,6 +58,7 @@ class MapSync:
     committed    what whole digests tell; default: the replica's own sets
     on_accepted  called with every set that is merged
     near         hold only regions that `enter` names, instead of the whole map
+    at_ticks     merge what others put at the next tick, all at once: for a service that uses the map at ticks only
     joined       the late join is over: an answer came, or every try failed
     """
 
@@ -72,6 +75,7 @@ class MapSync:
         committed: Callable[[], dict[str, bytes]] | None = None,
         on_accepted: Callable[[MarkSet], None] = lambda mark_set: None,
         near: bool = False,
+        at_ticks: bool = False,
     ) -> None:
         self.replica = replica
         self.joined = False
@@ -87,6 +91,9 @@ class MapSync:
         self._warned_ns: dict[str, int] = {}  # author -> when a warning named it last
         self._join_due_ns: int | None = None  # ask again then
         self._join_tries = 0
+        self._at_ticks = at_ticks
+        self._heard: list[tuple[str, Message]] = []
+        """Sets that were put and are merged at the next tick; always empty unless `at_ticks`."""
         self._digest_ns = int(config.digest_s * NS_PER_S)
         self._digest_due_ns = 0
         self._changes_due_ns = 0
@@ -131,7 +138,10 @@ class MapSync:
         """True if the event concerns the map only, so that no other part needs to handle it."""
         match event:
             case HeardMany(topic=topic, samples=samples) if topic is MARKS:
-                self._hear(samples, now_ns)
+                if self._at_ticks and len(self._heard) < _MOST_HEARD:
+                    self._heard.extend(samples)
+                else:
+                    self._hear(samples, now_ns)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag in (_JOIN, _ENTER):
                 self._merge(self._sets_in(event), measured=False)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag.startswith(_RESYNC):
@@ -154,9 +164,12 @@ class MapSync:
 
     def tick(self, now_ns: int) -> None:
         """Publish what is due, compare the digests that have waited long enough, ask for what is missing."""
-        for heard in self._bus.collected(DIGEST):
-            assert isinstance(heard.message, Digest)
-            self._hear_digest(heard.message, now_ns)
+        for digest in self._bus.collected(DIGEST):
+            assert isinstance(digest.message, Digest)
+            self._hear_digest(digest.message, now_ns)
+        if self._heard:
+            heard, self._heard = self._heard, []
+            self._hear(heard, now_ns)
         self._merge_waiting(now_ns)
         self.publish(self.replica.tick(now_ns))
         if self._join_due_ns is not None and now_ns >= self._join_due_ns:

@@ -23,7 +23,7 @@ Bugs        Unknown fields, missing fields, a wildcard where one value is meant:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from swarm.liveness import Peer
@@ -101,12 +101,16 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Replied:
-    """One reply to what we asked under `tag`. `fields` are the chunks of its key."""
+    """One reply to what we asked under `tag`. `fields` are the chunks of its key.
+
+    took_s  from `ask` to its arrival here, by the bus's own clock: without the time that it waits to be handled
+    """
 
     tag: str
     topic: Topic
     fields: Mapping[str, str]
     message: Message
+    took_s: float = field(default=0.0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +177,14 @@ class Answerer(Protocol):
     def end(self) -> None: ...
 
 
+def check_subscription(topic: Topic, together: bool, every_s: float) -> None:
+    """Raise TypeError on a subscription that the topic does not allow."""
+    if together and topic.trusted:
+        raise TypeError(f"topic {topic.name} is trusted: each of its messages is checked by itself")
+    if every_s and (together or not topic.newest):
+        raise TypeError(f"topic {topic.name} cannot be sampled: each of its messages counts")
+
+
 class Bus(Protocol):
     """The network of one process. Keyword `fields` fill the topic's key; those not given are wildcards."""
 
@@ -191,11 +203,15 @@ class Bus(Protocol):
         process hears its own samples. Nothing is sent after `close`."""
         ...
 
-    def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
+    def subscribe(
+        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
+    ) -> None:
         """Post `Heard` for every sample from now on.
 
         together  post `HeardMany` of all samples that wait, for a topic of many small messages; the reader
                   compares each key with its message
+        every_s   post the newest sample of each key only, once in so many seconds: for a reader that is slower than
+                  the topic. What it does not read is not decoded. Only for topics of which the newest counts
         """
         ...
 

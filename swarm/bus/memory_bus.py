@@ -11,8 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from swarm.bus.bus import Appeared, Asked, Disappeared, Event, Heard, LinkChanged, Post
-from swarm.bus.memory_declarations import Declaration, Subscriptions, as_batches, checking_key, declare, narrowed
+from swarm.bus.bus import Appeared, Asked, Disappeared, Event, Heard, LinkChanged, Post, check_subscription
+from swarm.bus.memory_declarations import (
+    Declaration,
+    Subscriptions,
+    as_batches,
+    checking_key,
+    declare,
+    narrowed,
+    sampled,
+)
 from swarm.bus.memory_query import Asking, MemoryAnswerer
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S
@@ -162,10 +170,13 @@ class MemoryBus:
             for when_ns in network.arrivals_ns(self, subscription.bus, topic.name):
                 network.scheduler.at(when_ns, _Arrival(self, subscription, sample))
 
-    def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
-        if together and topic.trusted:
-            raise TypeError(f"topic {topic.name} is trusted: each of its messages is checked by itself")
+    def subscribe(
+        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
+    ) -> None:
+        check_subscription(topic, together, every_s)
         post = as_batches(post) if together else checking_key(post, self.counts)
+        if every_s:
+            post = sampled(self, post, int(every_s * NS_PER_S))
         subscriptions = self.network.subscriptions.setdefault((self.namespace, topic.name), Subscriptions())
         subscriptions.add(declare(self, topic, fields, post))
 

@@ -94,6 +94,26 @@ def checking_key(post: Post, counts: dict[str, int]) -> Post:
     return checked
 
 
+def sampled(bus: MemoryBus, post: Post, every_ns: int) -> Post:
+    """Posts the newest sample of each key, `every_ns` after the first that came."""
+    newest: dict[str, Heard] = {}
+
+    def flush() -> None:
+        waiting = list(newest.values())
+        newest.clear()
+        if not bus.closed:
+            for event in waiting:
+                post(event)
+
+    def arrive(event: Event) -> None:
+        if isinstance(event, Heard):
+            if not newest:
+                bus.network.scheduler.after(every_ns, flush)
+            newest[event.topic.below(event.fields)] = event
+
+    return arrive
+
+
 def as_batches(post: Post) -> Post:
     """Makes a `HeardMany` of each sample: in a simulation nothing waits, so each comes alone."""
 

@@ -28,6 +28,7 @@ class Asking:
     failure   the last refusal, or "timeout"
     asked     the question's payload
     over      whether `AskEnded` was posted: what comes later is dropped
+    began_ns  when it was asked
     """
 
     bus: MemoryBus
@@ -41,6 +42,15 @@ class Asking:
     failure: str | None = None
     asked: bytes = b""
     over: bool = False
+    began_ns: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.began_ns = self.bus.network.scheduler.clock.now_ns()
+
+    @property
+    def took_s(self) -> float:
+        """Since it was asked."""
+        return (self.bus.network.scheduler.clock.now_ns() - self.began_ns) / NS_PER_S
 
     def finish(self) -> None:
         if not self.over:
@@ -89,7 +99,6 @@ class MemoryAnswerer:
         key = asking.topic.below(named)
         code = code_of(bus.authenticator, asking.topic, key, payload, asking.asked)
         parsed = decode_either(payload, asking.topic.message, asking.topic.bulk)
-        reply = Replied(asking.tag, asking.topic, named, parsed)
 
         def arrive() -> None:
             if asking.over:
@@ -101,7 +110,7 @@ class MemoryAnswerer:
                 return
             asking.bus.counts["messages_in"] += 1
             asking.replies += 1
-            asking.post(reply)
+            asking.post(Replied(asking.tag, asking.topic, named, parsed, asking.took_s))
 
         self._send(payload, arrive)
 

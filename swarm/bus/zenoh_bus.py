@@ -27,11 +27,12 @@ from swarm.bus.bus import (
     LinkChanged,
     Post,
     Replied,
+    check_subscription,
 )
 from swarm.bus.endpoints import listening, wait_for_router
 from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
-from swarm.bus.zenoh_threads import attached, guarded, taken_from, timeout_of, waiting_in
+from swarm.bus.zenoh_threads import attached, guarded, newest_in, taken_from, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
@@ -117,7 +118,7 @@ class ZenohBus:
         """One per channel; those that have ended are removed when the next is ended."""
         self._logged_s: dict[str, float] = {}
         """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
-        self._closed = False
+        self._closing = threading.Event()
         """Set by `close`, for good: nothing is sent from then on."""
 
     @property
@@ -127,6 +128,10 @@ class ZenohBus:
     @property
     def counts(self) -> Mapping[str, int]:
         return self._counts
+
+    @property
+    def _closed(self) -> bool:
+        return self._closing.is_set()
 
     @property
     def session(self) -> zenoh.Session:
@@ -152,9 +157,10 @@ class ZenohBus:
             priority=_PRIORITIES[topic.priority],
         )
 
-    def subscribe(self, topic: Topic, post: Post, *, together: bool = False, **fields: str | int) -> None:
-        if together and topic.trusted:
-            raise TypeError(f"topic {topic.name} is trusted: each of its messages is checked by itself")
+    def subscribe(
+        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
+    ) -> None:
+        check_subscription(topic, together, every_s)
 
         def arrive(sample: zenoh.Sample) -> None:
             self._count("messages_in")
@@ -176,10 +182,13 @@ class ZenohBus:
                 post(HeardMany(topic, heard))
 
         subscriber = self._subscriber(topic, fields)
+        name = f"sub-{topic.name}"
         if together:
-            self._read(subscriber, arrive_together, f"sub-{topic.name}", together=True)
+            self._read(subscriber, arrive_together, name, lambda channel: [waiting_in(channel)])
+        elif every_s:
+            self._read(subscriber, arrive, name, lambda channel: newest_in(channel, self._closing, every_s))
         else:
-            self._read(subscriber, arrive, f"sub-{topic.name}")
+            self._read(subscriber, arrive, name)
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
         subscriber = self._subscriber(topic, fields)
@@ -299,9 +308,11 @@ class ZenohBus:
         replies = 0
         failure: str | None = None
         expression, asked = topic.expression(self._namespace, **fields), encode(request)
+        began_s = time.monotonic()
 
         def arrive(reply: zenoh.Reply) -> None:
             nonlocal replies, failure
+            took_s = time.monotonic() - began_s
             if reply.ok is None:
                 failure = reply.err.payload.to_bytes().decode("utf-8", "replace") if reply.err else "error"
                 failure = "timeout" if failure == "Timeout" else failure
@@ -317,7 +328,7 @@ class ZenohBus:
                 return
             replies += 1
             self._count("messages_in")
-            post(Replied(tag, topic, named, message))
+            post(Replied(tag, topic, named, message, took_s))
 
         def finish() -> None:
             post(AskEnded(tag, topic, replies, failure))
@@ -372,7 +383,7 @@ class ZenohBus:
         """Leave the network, within `_CLOSE_S` even if the router hangs, for which Zenoh would wait ten seconds."""
         if self._closed:
             return
-        self._closed = True
+        self._closing.set()
         closer = threading.Thread(target=self._undeclare, name="close", daemon=True)
         closer.start()
         closer.join(_CLOSE_S)
@@ -392,18 +403,22 @@ class ZenohBus:
             thread.join(timeout=2.0)
         self._session.close()  # type: ignore[no-untyped-call]
 
-    def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, *, together: bool = False) -> None:
-        """Read an entity's channel on a thread of its own until it is undeclared.
-
-        together  call `arrive` with lists of all that waits, instead of one item at a time
-        """
+    def _read(
+        self,
+        entity: Any,
+        arrive: Callable[[Any], None],
+        name: str,
+        take: Callable[[Any], Iterable[Any]] = lambda channel: (channel.recv(),),
+    ) -> None:
+        """Read an entity's channel on a thread of its own until it is undeclared: `take` and let `arrive` each."""
         self._entities.append(entity)
         channel = entity.handler  # a thread that waits on the entity itself keeps it from being undeclared
 
         def run() -> None:
             try:
                 while True:
-                    arrive(waiting_in(channel) if together else channel.recv())
+                    for item in take(channel):
+                        arrive(item)
             except zenoh.ZError:
                 if not self._closed and entity in self._entities:
                     raise  # by itself, so that nothing more would be heard

@@ -33,6 +33,16 @@ def taken_from(channel: Any, most: int) -> list[Any]:
     return items
 
 
+def newest_in(channel: Any, closing: threading.Event, wait_s: float) -> list[Any]:
+    """The newest item of each key in a channel, `wait_s` after the first that came; none once it is closing."""
+    newest = {str((item := channel.recv()).key_expr): item}
+    if closing.wait(wait_s):
+        return []
+    while (item := channel.try_recv()) is not None:
+        newest[str(item.key_expr)] = item
+    return list(newest.values())
+
+
 def guarded(callback: Callable[..., None]) -> Callable[..., None]:
     """A callback for Zenoh's own threads, which swallow an error: it ends like one of a thread of ours."""
 

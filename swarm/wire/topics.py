@@ -26,7 +26,7 @@ from swarm.wire.messages.planning import (
 from swarm.wire.messages.processes import Beat, Note, RunInfo, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
-from swarm.wire.messages.vehicles import Fleet, Followed
+from swarm.wire.messages.vehicles import Chasers, Fleet, Followed
 
 
 class Priority(Enum):
@@ -175,7 +175,13 @@ BASE_TILES = Topic(
 )  # fmt: skip
 FLEET = Topic(
     "fleet", "fleet/{region}/{author}", Fleet, "where the vehicles of an agent are; newest only", "every tick",
-    access(put="agent:author", hear="agent planner targets monitor"),
+    access(put="agent:author", hear="targets monitor"),
+)  # fmt: skip
+CHASERS = Topic(
+    "chasers", "target/{target}/chasers/{author}", Chasers,
+    "which vehicles of an agent chase a target, for its planner, and where routes for them may begin",
+    "when a vehicle takes or leaves the target or has driven past the cell told; else 1 Hz",
+    access(put="agent:author", hear="planner:target"),
 )  # fmt: skip
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", Standing,
@@ -209,7 +215,7 @@ FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
     "per new route",
     access(put="agent:agent", hear="monitor"),
-    newest=False, priority=Priority.BACKGROUND,
+    priority=Priority.BACKGROUND,
 )  # fmt: skip
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,
@@ -263,7 +269,7 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, STANDING, TABLE, GRANTED, STORED, KNOWN, FOLLOWED,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, FOLLOWED,
     PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, LEAD, STATS, NOTE,
 )  # fmt: skip
 

@@ -53,6 +53,8 @@ FORBIDDEN = [
     ("agent", "put", "marks/0/0/blue.a01.1"),
     ("agent", "put", "reservations/a1"),
     ("agent", "put", "target/t0/pose"),
+    ("agent", "put", "target/t0/chasers/red.a1.1"),
+    ("agent", "hear", "target/t0/chasers/blue.a0.1"),
     ("agent", "put", "vehicle/a1/v0/route"),
     ("agent", "put", "stats/router/0"),
     ("agent", "serve", "run/agent/zz"),
@@ -67,6 +69,8 @@ FORBIDDEN = [
     ("planner", "serve", "**"),
     ("planner", "put", "target/t0/pose"),
     ("planner", "hear", "world/target/t0/pose"),
+    ("planner", "hear", "target/t1/chasers/blue.a0.1"),
+    ("planner", "hear", "fleet/0/blue.a0.1"),
     ("planner", "raise", "alive/planner/t1/1"),
     ("standby", "serve", "target/t1/route"),
     ("standby", "serve", "target/t0.r1/route"),
@@ -380,17 +384,18 @@ def test_two_routers_pass_on_what_is_allowed_and_each_keeps_out_what_is_not(stag
     stage.open("router.north", "router", listen=(endpoint,), peers=(stage.endpoint,))
     agent, planner = stage.open(NAMES["agent"], **far), stage.open(NAMES["planner"])
     heard: list[str] = []
-    planner.declare_subscriber(f"{NAMESPACE}/fleet/*/*", lambda sample: heard.append(str(sample.key_expr)))
+    chasers = f"{NAMESPACE}/target/t0/chasers"
+    planner.declare_subscriber(f"{chasers}/*", lambda sample: heard.append(str(sample.key_expr)))
     cost = f"{NAMESPACE}/target/t0/cost"
     planner.declare_queryable(cost, lambda query: reply_under(query, [cost]))
 
     def met() -> bool:
         for author in ("red.a1.1", "blue.a0.1"):
-            agent.put(f"{NAMESPACE}/fleet/0/{author}", b"x")
+            agent.put(f"{chasers}/{author}", b"x")
         return len(heard) > 2 and bool(replies(agent, f"{NAMESPACE}/target/*/cost"))
 
     eventually(met, 10, "the routers to meet")
-    assert set(heard) == {f"{NAMESPACE}/fleet/0/blue.a0.1"}
+    assert set(heard) == {f"{chasers}/blue.a0.1"}
 
 
 def test_links_in_the_clear_stay_open_because_they_are_on_loopback_and_have_no_names(stage: Stage) -> None:

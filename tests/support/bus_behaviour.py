@@ -90,6 +90,26 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
     assert b.collected(NOTE) == []
 
 
+def test_a_slow_reader_gets_the_newest_of_each_key_at_its_own_pace(world: World):
+    a, b, box = world.bus("a"), world.bus("b"), Box()
+    b.subscribe(POSE, box, every_s=0.5)
+    world.settle()
+    for seq in range(1, 21):
+        for target in ("t0", "t1"):
+            a.publish(POSE, pose(target, seq=seq), target=target)
+    world.put_bytes(a, POSE, b"garbage", target="t2")
+    world.until(lambda: len(box) == 2)
+    assert {(event.fields["target"], event.message.seq) for event in box} == {("t0", 20), ("t1", 20)}
+    world.until(lambda: b.counts["payloads_dropped"] == 1)
+    a.publish(POSE, pose("t0", seq=21), target="t0")
+    world.until(lambda: len(box) == 3)
+    assert box[2].message.seq == 21
+    b.unsubscribe(POSE)
+    world.settle()
+    with pytest.raises(TypeError, match="each of its messages counts"):
+        b.subscribe(NOTE, box, every_s=0.5)
+
+
 def test_an_answer_may_carry_many_values_where_the_topic_says_so(world: World):
     a, b = world.bus("a"), world.bus("b")
     [many] = packed([marks("a0.1", tile) for tile in range(3)])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from support.scripted_planner import chasers
 from support.slow_twins import cost_to_go
 from support.swarm_model import SwarmModel
 
@@ -17,15 +18,13 @@ from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig, Scenario, Strategy, TargetConfig
 from swarm.grid import GridSpec, walk
-from swarm.wire.fields import pack_column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Fleet, VehicleState
 from swarm.wire.routes import Route
 from swarm.wire.statements import MarkKind
-from swarm.wire.topics import FLEET, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS, Topic
+from swarm.wire.topics import CHASERS, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS, Topic
 
 ROWS, COLS, RES = 40, 50, 10.0
 GRID = GridSpec(ROWS, COLS, RES)
@@ -135,21 +134,6 @@ class Swarm(SwarmModel):
     def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:
         self.author.sync.publish(self.author.replica.write(list(cells), kind, pace, self.now_ns))
 
-    def report(self, *vehicles: tuple[str, int], target: str = "t", seq: int = 1) -> None:
-        count = len(vehicles)
-        fleet = Fleet(
-            author="a0.1",
-            group="all",
-            region=0,
-            seq=seq,
-            stamp_ns=self.now_ns,
-            ids=[id for id, _ in vehicles],
-            target_ids=[target],
-            cells=pack_column([cell for _, cell in vehicles], "<u4"),
-            east_m=pack_column([0.0] * count, "<f4"),
-            south_m=pack_column([0.0] * count, "<f4"),
-            heading_rad=pack_column([0.0] * count, "<f4"),
-            states=bytes([VehicleState.FOLLOWING] * count),
-            targets=bytes([0] * count),
-        )
-        self.ear.bus.publish(FLEET, fleet, region=0, author="a0.1")
+    def report(self, *vehicles: tuple[str, int], target: str = "t") -> None:
+        told = chasers(*vehicles, target=target, stamp_ns=self.now_ns)
+        self.ear.bus.publish(CHASERS, told, target=target, author=told.author)

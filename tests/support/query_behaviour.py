@@ -30,6 +30,23 @@ def test_a_query_is_answered_once(world: World):
     ]
 
 
+def test_a_reply_tells_how_long_it_took_from_the_question_to_its_arrival(world: World):
+    a, b, asked_of, box = world.bus("a"), world.bus("b"), Box(), Box()
+    b.serve(RUN, asked_of, role="agent", id="b")
+    world.settle()
+    a.ask(RUN, Nothing(), box, tag="q", role="agent", id="b", timeout_s=10.0)
+    world.until(lambda: asked_of)
+    waited_s = asked_of[0].waited_s
+    world.settle()
+    waited_s = asked_of[0].waited_s - waited_s
+    assert waited_s > 0
+    asked_of[0].answer(run_info("b"))
+    asked_of[0].end()
+    world.until(lambda: box.of(AskEnded))
+    [reply] = box.of(Replied)
+    assert waited_s < reply.took_s < 10.0
+
+
 def test_a_wildcard_query_is_answered_by_everybody_ourselves_included(world: World):
     buses = {name: world.bus(name) for name in ("a", "b", "c")}
     for name, bus in buses.items():

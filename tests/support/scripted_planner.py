@@ -23,7 +23,7 @@ from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import PlannerStatus, RouteReply, RouteRequest
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteBatch, RouteStatus
 from swarm.wire.statements import MarkKind
 
@@ -169,9 +169,9 @@ class World:
         assert isinstance(reply, RouteReply)
         return reply
 
-    def fleet(self, *vehicles: tuple[str, int, str | None], stamp_ns: int | None = None) -> None:
-        report = fleet(*vehicles, stamp_ns=self.now_ns if stamp_ns is None else stamp_ns)
-        self.planner.hear_fleet(report, self.now_ns)
+    def chasers(self, *vehicles: tuple[str, int], target: str = "t0", stamp_ns: int | None = None) -> None:
+        told = chasers(*vehicles, target=target, stamp_ns=self.now_ns if stamp_ns is None else stamp_ns)
+        self.planner.hear_chasers(told, self.now_ns)
 
     def grow(self, action: Action, took_ns: int = 5_000_000) -> list[Action]:
         """Do a growth that was asked for."""
@@ -183,21 +183,11 @@ def pose(cell: int, seq: int = 1, incarnation: int = 1, target: str = "t0") -> T
     return TargetPose(target=target, incarnation=incarnation, seq=seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
 
 
-def fleet(*vehicles: tuple[str, int, str | None], stamp_ns: int) -> Fleet:
-    targets = sorted({target for _, _, target in vehicles if target is not None})
-    count = len(vehicles)
-    return Fleet(
-        author="a0.1",
-        group="all",
-        region=0,
-        seq=1,
+def chasers(*vehicles: tuple[str, int], stamp_ns: int, target: str = "t0", author: str = "all.a0.1") -> Chasers:
+    return Chasers(
+        target=target,
+        author=author,
         stamp_ns=stamp_ns,
-        ids=[id for id, _, _ in vehicles],
-        target_ids=targets,
-        cells=pack_column([cell for _, cell, _ in vehicles], "<u4"),
-        east_m=pack_column([0.0] * count, "<f4"),
-        south_m=pack_column([0.0] * count, "<f4"),
-        heading_rad=pack_column([0.0] * count, "<f4"),
-        states=bytes([VehicleState.FOLLOWING] * count),
-        targets=bytes([NO_TARGET if target is None else targets.index(target) for _, _, target in vehicles]),
+        ids=[id for id, _ in vehicles],
+        cells=pack_column([cell for _, cell in vehicles], "<u4"),
     )

@@ -37,6 +37,7 @@ from swarm.wire.messages.traffic import (
 )
 from swarm.wire.messages.vehicles import (
     NO_TARGET,
+    Chasers,
     Fleet,
     Followed,
     VehicleState,
@@ -140,6 +141,15 @@ def fleets(draw: st.DrawFn) -> Fleet:
 
 
 @st.composite
+def chasers(draw: st.DrawFn) -> Chasers:
+    named = draw(st.lists(ids, max_size=6))
+    where = draw(st.lists(st.integers(0, (1 << 32) - 1), min_size=len(named), max_size=len(named)))
+    return Chasers(
+        target=draw(ids), author=draw(ids), stamp_ns=draw(naturals), ids=named, cells=pack_column(where, "<u4")
+    )
+
+
+@st.composite
 def route_requests(draw: st.DrawFn) -> RouteRequest:
     asked = draw(st.lists(cells, max_size=5))
     place = draw(st.none() | st.tuples(cells, cells))
@@ -180,6 +190,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     BaseMapRequest: st.builds(BaseMapRequest, layers=st.lists(texts, max_size=3), regions=st.lists(regions)),
     BaseMapTile: st.builds(BaseMapTile, layer=texts, region=regions, data=st.binary(max_size=50)),
     Fleet: fleets(),
+    Chasers: chasers(),
     Standing: st.builds(
         Standing, plot=plots, agent=ids, life=naturals, seq=naturals, knows=stamps,
         vehicles=st.lists(stands, max_size=3), dead=st.lists(naturals, max_size=2), ended=st.booleans(),
@@ -278,6 +289,7 @@ EXAMPLES: tuple[Message, ...] = (
         south_m=pack_column([1.0, 2.0], "<f4"), heading_rad=pack_column([0.0, 3.0], "<f4"), states=bytes([2, 0]),
         targets=bytes([0, NO_TARGET]),
     ),
+    Chasers(target="t0", author="a0.7", stamp_ns=10, ids=["a0-00"], cells=pack_column([4], "<u4")),
     Standing(
         plot=0, agent="a0", life=1 << 32, seq=9, knows=(3, 17), dead=[5],
         vehicles=[Stand("a0-00", 4, 5, [4, 5], [6], [], 0, 1200)],

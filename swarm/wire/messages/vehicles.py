@@ -1,4 +1,4 @@
-"""Messages about vehicles: positions and followed routes."""
+"""Messages about vehicles: positions, whom they chase, followed routes."""
 
 from __future__ import annotations
 
@@ -79,6 +79,19 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
     def relate(self) -> None:
         if any(t != NO_TARGET and t >= len(self.target_ids) for t in set(self.targets)):
             raise ValueError("a target index points past target_ids")
+
+
+class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
+    """The vehicles of one agent process that chase one target. The newest replaces the older.
+
+    cells  uint32, one that each vehicle may stand on or enter, where a new route for it may begin
+    """
+
+    target: Id
+    author: Id
+    stamp_ns: StampNs
+    ids: Annotated[list[VehicleId], SMALL]
+    cells: Annotated[bytes, Column("<u4", per="ids")]
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -218,6 +219,8 @@ class Ended:
 
     def __init__(self, refused: bool = True) -> None:
         self._reason = ExitReason("cannot reach a router", 4, refused)
+        self._ended, self.sentinel = socket.socketpair()  # readable once the other end is closed
+        self._ended.close()
 
     def join(self, timeout_s: float) -> None:
         pass

@@ -15,6 +15,7 @@ import urllib.request
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -32,6 +33,7 @@ from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
+from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import Followed
@@ -48,24 +50,27 @@ def terrain() -> Terrain:
     return little_terrain()
 
 
-def rows_by_entity(path: Path) -> dict[str, int]:
-    """Entity -> rows logged over time, without what is static."""
+def chunks(path: Path) -> list[Any]:
+    """What a recording holds."""
     from rerun.chunk import RrdReader
 
-    counts: dict[str, int] = {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of a file without a footer
-        for chunk in RrdReader(str(path)).stream():
-            if not chunk.is_static:
-                counts[str(chunk.entity_path)] = counts.get(str(chunk.entity_path), 0) + chunk.num_rows
+        warnings.simplefilter("ignore")  # it has no footer
+        return list(RrdReader(str(path)).stream())
+
+
+def rows_by_entity(path: Path) -> dict[str, int]:
+    """Entity -> rows logged over time, without what is static."""
+    counts: dict[str, int] = {}
+    for chunk in chunks(path):
+        if not chunk.is_static:
+            counts[str(chunk.entity_path)] = counts.get(str(chunk.entity_path), 0) + chunk.num_rows
     return counts
 
 
 def still_entities(path: Path) -> set[str]:
     """Entities with something static."""
-    from rerun.chunk import RrdReader
-
-    return {str(chunk.entity_path) for chunk in RrdReader(str(path)).stream() if chunk.is_static}
+    return {str(chunk.entity_path) for chunk in chunks(path) if chunk.is_static}
 
 
 def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
@@ -85,6 +90,25 @@ def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: T
     textures = [rows[f"/world/ground/{tile}"] for tile in range(tiles)]
     assert min(textures) >= 1
     assert max(textures) >= 2, "marks change the photo"
+
+
+def test_a_window_is_drawn_when_it_changes_and_not_each_time_that_it_is_told(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
+
+    def told(at_s: float, *window: int) -> tuple[int, PlannerStatus]:
+        at_ns = int(at_s * NS_PER_S)
+        return at_ns, PlannerStatus(
+            target="t0", incarnation=1, stamp_ns=at_ns, strategy="full", target_cell=0, map_version=1,
+            tree_age_ms=0.0, window=list(window), growths=1, window_growths=1, growth_ms=1.0, routes_served=1,
+            following=0, gap_mean=None, gap_p95=None, gap_max=None,
+        )  # fmt: skip
+
+    rig.play([told(0.5 + n / 2, 4, 4, 20, 20) for n in range(10)])
+    rig.play([told(6.5 + n / 2, 8, 8, 24, 24) for n in range(6)])
+    rig.close()
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/windows"] == 2
 
 
 def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import pickle
 
 import msgspec
 import numpy as np
 import pytest
 
 from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.samples import Sample, Samples
 from launch_scripts.report.tracks import Tracks
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -22,7 +24,7 @@ from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Beat, Stats
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 from swarm.wire.statements import MarkKind
 
 GRID = GridSpec(64, 96, 10.0, west_m=1000.0, north_m=5000.0)
@@ -202,15 +204,22 @@ def test_the_gap_is_the_planners_and_its_max_the_largest_any_of_them_told(record
 
 
 def test_certified_gaps_come_from_the_routes_that_vehicles_begin(recorder: Recorder) -> None:
-    for bound_s in (100.0, 80.0, 0.0):
-        hear(
-            recorder,
-            Followed(vehicle="a0-00", target="t0", start=0, directions=b"", cost_s=100.0, lower_bound_s=bound_s),
-        )
+    hear(
+        recorder,
+        stats("agent", "a0", counts={"followed_unproven": 1}, followed_gap_excess=[0.0]),
+        stats("agent", "a1", followed_gap_excess=[0.25]),
+    )
     certified = recorder.report()["certified_gap"]
     assert certified["mean"] == pytest.approx(1.125, abs=0.005)
     assert certified["max"] == pytest.approx(1.25, abs=0.005)
     assert certified["unproven"] == 1
+
+
+def test_a_vehicle_that_has_followed_a_route_counts_as_routed_for_good(recorder: Recorder) -> None:
+    hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0), "a0-01": (2.0, 2.0)}, state=VehicleState.WAITING), at_s=0.0)
+    assert recorder.report()["vehicles_routed"] == 0
+    hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}, 1.0), at_s=1.0)
+    hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}, 2.0, state=VehicleState.STRANDED), at_s=2.0)
     assert recorder.report()["vehicles_routed"] == 1
 
 
@@ -221,8 +230,10 @@ def test_a_vehicle_that_crosses_into_another_region_is_counted_once_where_it_is_
         fleet("a0.1", {"a0-01": (30.0, 20.0)}, 2.0, region=1, state=VehicleState.ARRIVED),
     )
     vehicles = recorder.observed.vehicles()
-    assert list(vehicles) == ["a0-00", "a0-01"]
-    assert vehicles["a0-01"].east_m == 30.0
+    assert vehicles.ids == ["a0-00", "a0-01"]
+    assert vehicles.east_m.tolist() == [10.0, 30.0]
+    assert vehicles.chasing("t0").tolist() == [0, 1]
+    assert vehicles.chasing("t1").tolist() == []
     summary = recorder.summary(2 * NS_PER_S)
     assert summary.states == {
         "idle": 0, "waiting": 0, "following": 1, "arrived": 1, "stranded": 0, "lost": 0
@@ -312,13 +323,11 @@ def test_the_run_is_ready_when_all_processes_are_alive_and_a_vehicle_has_a_route
         assert recorder.ready_ns is None
         recorder.alive(Peer(role, id, 1), True, n)
     assert recorder.missing() == []
-    recorder.heard(
-        Followed(vehicle="a0-00", target="t0", start=0, directions=b"", cost_s=1.0, lower_bound_s=1.0), {}, 99
-    )
-    assert recorder.ready_ns == 99
+    hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}, 1.0), at_s=1.0)
+    assert recorder.ready_ns == NS_PER_S
     recorder.alive(Peer("planner", "t1", 1), False, 100)
     assert recorder.missing() == ["planner t1"]
-    assert recorder.ready_ns == 99
+    assert recorder.ready_ns == NS_PER_S
 
 
 def test_messages_per_second_are_the_difference_of_samples(recorder: Recorder) -> None:
@@ -343,3 +352,43 @@ def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
     assert lines["a", 0][0, 0] == 0
     assert lines["a", 0][-1, 0] > 900
     assert (np.diff(lines["a", 0][:, 0]) > 0).all()
+
+
+def test_the_keys_of_a_track_are_kept_once() -> None:
+    tracks = Tracks(interval_ns=1)
+    for now_ns in range(100):
+        tracks.add(now_ns, [(f"v{n}", 0) for n in range(50)], np.zeros((50, 2), np.float32))
+    assert len({id(keys) for _, keys, _ in tracks._samplings}) == 1
+
+
+def test_samples_thin_out_over_a_long_run_and_keep_its_beginning_and_its_end() -> None:
+    samples = Samples(limit=64)
+    for second in range(10_000):
+        samples.add(sample(float(second)))
+    times = [each.time_s for each in samples.all()]
+    assert 32 <= len(times) <= 65
+    assert (times[0], times[-1]) == (0.0, 9999.0)
+    assert len(set(np.diff(times[:-1]))) == 1
+    assert [each.time_s for each in samples.newest] == [9998.0, 9999.0]
+
+
+def sample(time_s: float) -> Sample:
+    return Sample(time_s, (0,) * len(VehicleState), 0, 0, 0, 0, 0, 0, {}, {})
+
+
+def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recorder) -> None:
+    """What a recorder holds, by its own lists: captures, samples and places are all bounded."""
+
+    def record(from_s: int, until_s: int, step_s: int) -> int:
+        for at_s in range(from_s, until_s, step_s):
+            places = {f"a0-{n:02d}": (float(at_s % 900), 5.0) for n in range(4)}
+            hear(recorder, fleet("a0.1", places, at_s), pose("t0", 1.0, 2.0, at_s, captures=at_s), at_s=at_s)
+        recorder.vehicle_tracks._limit = recorder.target_tracks._limit = 2000
+        return len(
+            pickle.dumps([recorder.samples, recorder.captures, recorder.vehicle_tracks, recorder.target_tracks])
+        )
+
+    hour = record(0, 12_000, 2)
+    day = record(12_000, 40_000, 2)
+    assert day < 1.5 * hour
+    assert recorder.captures_of["t0"] == 39_998

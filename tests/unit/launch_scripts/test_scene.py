@@ -11,20 +11,18 @@ from launch_scripts.monitor.scene import (
     STATE_COLOURS,
     RouteNow,
     TerrainMesh,
-    Trails,
     cell_at,
+    cells_along,
     label_places,
-    poles,
-    route_strip,
     target_points,
     vehicle_points,
-    window_outline,
 )
-from launch_scripts.report.latest_state import VehicleNow
+from launch_scripts.monitor.strips import Trails, poles, route_strips, window_outlines
 from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import Scenario
-from swarm.grid import Window
+from swarm.grid import Window, walk
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -134,9 +132,12 @@ def test_what_was_lethal_before_anybody_drove_is_no_mark() -> None:
 
 def test_vehicles_are_shades_of_green_and_targets_red() -> None:
     mesh = TerrainMesh(hill(20, 20))
-    vehicles = {f"a0-{state:02d}": VehicleNow(10.0 * state, 20.0, 0.0, state, None) for state in VehicleState}
+    n = len(VehicleState)
+    ids = [f"a0-{state:02d}" for state in VehicleState]
+    places = np.linspace(10, 100, n, dtype=np.float32), np.full(n, 20, np.float32)
+    vehicles = VehicleColumns(ids, *places, np.array(VehicleState, np.uint8), np.full(n, -1), [])
     points = vehicle_points(mesh, vehicles)
-    assert points.ids == list(vehicles)
+    assert points.ids == ids
     assert [tuple(colour) for colour in points.colours.tolist()] == [STATE_COLOURS[state] for state in VehicleState]
     assert (points.colours[:, 1] >= points.colours[:, [0, 2]].max(axis=1)).all(), "green is the strongest"
     targets = target_points(mesh, {"t0": (50.0, 60.0)})
@@ -149,8 +150,10 @@ def test_vehicles_are_shades_of_green_and_targets_red() -> None:
 
 def test_nobody_there_is_nothing_to_draw() -> None:
     mesh = TerrainMesh(hill(20, 20))
-    assert vehicle_points(mesh, {}).positions.shape == (0, 3)
-    assert poles(mesh, target_points(mesh, {})) == []
+    assert vehicle_points(mesh, gathered([])).positions.shape == (0, 3)
+    assert poles(mesh, target_points(mesh, {})).shape == (0, 2, 3)
+    assert window_outlines(mesh, []).shape[0] == 0
+    assert route_strips(mesh, []).shape == (0, 0, 3)
 
 
 def test_what_is_left_of_a_route_begins_where_the_vehicle_is() -> None:
@@ -162,15 +165,27 @@ def test_what_is_left_of_a_route_begins_where_the_vehicle_is() -> None:
 def test_a_long_route_is_drawn_with_few_points_that_keep_its_ends() -> None:
     mesh = TerrainMesh(hill(10, 1000))
     cells = np.arange(1000)
-    strip = route_strip(mesh, cells)
-    assert len(strip) == 64
-    assert strip[0, 0] == 5.0
-    assert strip[-1, 0] == 9995.0
+    long, short = route_strips(mesh, [cells, cells[:3]])
+    assert len(long) == len(short) == 64
+    assert (long[0, 0], long[-1, 0]) == (5.0, 9995.0)
+    assert short[:4, 0].tolist() == [5.0, 15.0, 25.0, 25.0]
+    assert (short[3:] == short[2]).all()
+
+
+def test_the_cells_of_a_route_are_those_of_a_walk_along_it_and_none_off_the_map() -> None:
+    grid = hill(10, 20).grid
+    directions = bytes([2, 2, 3, 4, 4, 5])
+    cells = cells_along(grid, 41, directions)
+    assert cells is not None
+    assert cells.tolist() == walk(grid, 41, directions)
+    assert cells_along(grid, 41, b"").tolist() == [41]
+    for start, wrong in ((0, bytes([0])), (19, bytes([2])), (200, b""), (-1, b""), (41, bytes([8]))):
+        assert cells_along(grid, start, wrong) is None
 
 
 def test_the_outline_of_a_window_is_closed_and_runs_along_its_border() -> None:
     mesh = TerrainMesh(hill(50, 60))
-    outline = window_outline(mesh, Window(10, 20, 31, 41))
+    outline, _ = window_outlines(mesh, [Window(10, 20, 31, 41), Window(0, 0, 5, 5)])
     assert outline[0].tolist() == outline[-1].tolist()
     assert (outline[:, 0].min(), outline[:, 0].max()) == (205.0, 405.0)
     assert (outline[:, 1].max(), outline[:, 1].min()) == (-105.0, -305.0)
@@ -184,11 +199,11 @@ def test_a_trail_grows_by_what_was_driven_and_breaks_where_something_jumped() ->
     def at(*east_m: float) -> np.ndarray:
         return np.array([[e, 0, 0] for e in east_m], np.float32)
 
-    assert trails.advance(["a", "b"], at(0, 0)) == []
+    assert len(trails.advance(["a", "b"], at(0, 0))) == 0
     (strip,) = trails.advance(["a", "b"], at(10, 0))
     assert strip[:, 0].tolist() == [0, 10]
-    assert trails.advance(["a", "b"], at(500, 0)) == []
-    (strip,) = trails.advance(["a"], at(510))
+    assert len(trails.advance(["a", "b"], at(500, 0))) == 0
+    (strip,) = trails.advance(["c", "a"], at(7, 510))
     assert strip[:, 0].tolist() == [500, 510]
 
 

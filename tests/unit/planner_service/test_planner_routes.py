@@ -83,7 +83,7 @@ def test_a_follower_whose_route_a_map_change_crosses_is_pushed_a_newer_route(rea
     follower, _ = ready.planner.followers.all()
     # The scripted tree knows no way around: the steps are the old ones, which is no news.
     assert not follower.stale
-    ready.fleet(("crossed", GRID.cell(11, 6), "t0"), ("clear", GRID.cell(1, 20), "t0"))
+    ready.chasers(("crossed", GRID.cell(11, 6)), ("clear", GRID.cell(1, 20)))
     ready.tree.answers = [Update("repair", Window(9, 12, 12, 13), 3)]
     ready.mark(GRID.cell(9, 12))
     (push,) = ready.tick()
@@ -104,7 +104,7 @@ def test_routes_are_pushed_to_a_vehicle_at_most_every_push_s(ready: World) -> No
 
 def test_a_route_that_only_says_what_the_vehicle_knows_is_not_pushed(ready: World) -> None:
     ready.ask(GRID.cell(10, 0), vehicles=["v"])
-    ready.fleet(("v", GRID.cell(10, 3), "t0"))
+    ready.chasers(("v", GRID.cell(10, 3)))
     for _ in range(30):
         ready.mark(GRID.cell(0, 29))
         ready.mark(GRID.cell(0, 28))
@@ -113,21 +113,25 @@ def test_a_route_that_only_says_what_the_vehicle_knows_is_not_pushed(ready: Worl
 
 def test_reports_tell_where_a_follower_is_now_and_who_else_follows(ready: World) -> None:
     ready.ask(GRID.cell(10, 0), vehicles=["v"])
-    ready.fleet(("v", GRID.cell(10, 3), "t0"), ("w", GRID.cell(3, 3), "t0"), ("x", 5, "t1"), ("y", 6, None))
+    ready.chasers(("v", GRID.cell(10, 3)), ("w", GRID.cell(3, 3)))
+    ready.chasers(("x", 5), target="t1")
     assert ready.planner.followers.cells.tolist() == [GRID.cell(10, 3), GRID.cell(3, 3)]
     assert ready.planner.status(0).following == 2
 
 
 def test_who_chases_another_target_is_dropped_at_once(ready: World) -> None:
     ready.ask(0, 1, vehicles=["v", "w"])
-    ready.fleet(("v", 0, "t1"), ("w", 1, None))
+    ready.chasers(("v", 0), ("w", 1))
+    ready.chasers(("w", 1))
+    assert ready.planner.followers.cells.tolist() == [1]
+    ready.chasers()
     assert len(ready.planner.followers) == 0
 
 
 def test_an_older_report_changes_nothing(ready: World) -> None:
-    ready.fleet(("v", 5, "t0"), stamp_ns=200)
-    ready.fleet(("v", 4, "t0"), stamp_ns=100)
-    ready.fleet(("v", 4, "t1"), stamp_ns=100)
+    ready.chasers(("v", 5), stamp_ns=200)
+    ready.chasers(("v", 4), stamp_ns=100)
+    ready.chasers(stamp_ns=100)
     assert ready.planner.followers.cells.tolist() == [5]
 
 
@@ -142,7 +146,7 @@ def test_who_is_silent_for_five_seconds_is_dropped(ready: World) -> None:
 
 
 def test_after_a_restart_those_who_report_to_follow_are_pushed_routes_without_asking(world: World) -> None:
-    world.fleet(("v", GRID.cell(10, 0), "t0"))
+    world.chasers(("v", GRID.cell(10, 0)))
     world.pose(10, 20)
     (push,) = world.tick()
     assert isinstance(push, PushedRoute)

@@ -22,7 +22,7 @@ from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Asked, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
-from swarm.clock import MonotonicClock
+from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.config.scenario import MapConfig, NetworkConfig, Scenario
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
@@ -48,6 +48,31 @@ def test_a_mark_reaches_every_replica_at_once() -> None:
     write(author, swarm, [5])
     swarm.run(0.01)
     assert listener.replica.winners(0).kinds.tolist() == [LETHAL]
+
+
+def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_and_a_flood_does_not_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("shared_map.replication.sync._MOST_HEARD", 3)
+    swarm = SwarmModel()
+    author = swarm.writer("a1.1")
+    replica = MapReplica(swarm.terrain.grid, Composite())
+    reader = swarm.start(
+        "p",
+        lambda bus, post: SyncService(MapSync(replica, bus, post, swarm.scenario.map, "planner", at_ticks=True)),
+        hz=1.0,
+        phase_ns=NS_PER_S,
+    )
+    for cell in (5, 6, 7):
+        write(author, swarm, [cell])
+        swarm.run(0.15)
+    assert reader.replica.held.fingerprint() != author.replica.held.fingerprint()
+    swarm.run(1)
+    assert all_equal([author, reader])
+    for cell in range(8, 13):
+        write(author, swarm, [cell])
+        swarm.run(0.15)
+    assert reader.replica.winners(0).cells.tolist()[-1] >= 11  # the fourth set did not wait
 
 
 def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -> None:

@@ -91,7 +91,7 @@ def test_at_the_start_all_planners_are_asked_once_for_all_vehicles(agent: Agent)
 def test_one_request_per_target_and_tick_for_all_who_need_a_route(agent: Agent) -> None:
     (asked,) = agent.decide(0)
     assert isinstance(asked, AskCosts)
-    answer_costs(agent, asked, 0, t0=[5.0, 6.0], t1=[9.0, 9.0])
+    answer_costs(agent, asked, 0, t0=[5.0, 6.0], t1=[math.inf, math.inf])
     (routes,) = agent.decide(S // 10)
     cells = (GRID.cell(5, 5), GRID.cell(5, 7))
     assert routes == AskRoutes(2, "t0", ("a0-00", "a0-01"), cells, force=False, reroutes=0)

@@ -1,0 +1,73 @@
+"""Which target each vehicle of an agent goes for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from vehicle_agent.assignment import HYSTERESIS, spread
+
+
+@st.composite
+def worlds(draw: st.DrawFn) -> tuple[NDArray[np.float64], list[int]]:
+    targets, vehicles = draw(st.integers(1, 5)), draw(st.integers(1, 12))
+    cost = st.sampled_from([1.0, 2.0, 3.0, 50.0, 51.0, math.inf])
+    rows = st.lists(cost, min_size=vehicles, max_size=vehicles)
+    costs_s = np.array(draw(st.lists(rows, min_size=targets, max_size=targets)))
+    current = draw(st.lists(st.integers(-1, targets - 1), min_size=vehicles, max_size=vehicles))
+    return costs_s, current
+
+
+@given(worlds())
+@settings(deadline=None)
+def test_no_target_gets_more_than_its_even_share_and_nobody_a_target_out_of_reach(
+    world: tuple[NDArray[np.float64], list[int]],
+) -> None:
+    costs_s, current = world
+    targets, vehicles = costs_s.shape
+    chosen = spread(costs_s, current)
+    share = math.ceil(vehicles / targets)
+    sizes = np.bincount(chosen[chosen >= 0], minlength=targets)
+    assert sizes.max() <= share
+    for vehicle, target in enumerate(chosen.tolist()):
+        reachable = np.flatnonzero(np.isfinite(costs_s[:, vehicle]))
+        if target >= 0:
+            assert target in reachable
+        else:
+            assert all(sizes[each] == share for each in reachable)
+
+
+@given(worlds())
+@settings(deadline=None)
+def test_no_vehicle_and_target_that_would_both_gain_are_kept_apart(
+    world: tuple[NDArray[np.float64], list[int]],
+) -> None:
+    """Stability: where another target is cheaper for a vehicle, those that go for it reach it at no higher cost."""
+    costs_s, current = world
+    costs_s = costs_s.copy()
+    chosen = spread(costs_s, current)
+    for vehicle, target in enumerate(current):
+        if target >= 0:
+            costs_s[target, vehicle] *= 1.0 - HYSTERESIS
+    share = math.ceil(costs_s.shape[1] / costs_s.shape[0])
+    for vehicle, target in enumerate(chosen.tolist()):
+        own_s = math.inf if target < 0 else costs_s[target, vehicle]
+        for other in np.flatnonzero(costs_s[:, vehicle] < own_s).tolist():
+            those = np.flatnonzero(chosen == other)
+            assert len(those) == share
+            assert costs_s[other, those].max() <= costs_s[other, vehicle]
+
+
+def test_a_herd_next_to_one_target_sends_most_of_its_vehicles_to_the_others() -> None:
+    costs_s = np.array([[1.0] * 10, [100.0] * 10])
+    assert np.bincount(spread(costs_s, [0] * 10)).tolist() == [5, 5]
+
+
+def test_vehicles_keep_their_targets_unless_another_is_cheaper_by_15_percent() -> None:
+    assert spread(np.array([[10.0, 10.0], [9.0, 8.0]]), [0, 0]).tolist() == [0, 1]
+    assert spread(np.array([[10.0, 8.6], [8.6, 10.0]]), [0, 1]).tolist() == [0, 1]
+    assert spread(np.array([[10.0, 8.4], [8.4, 10.0]]), [0, 1]).tolist() == [1, 0]

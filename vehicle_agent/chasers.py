@@ -1,0 +1,67 @@
+"""The messages in which an agent tells each planner where its chasers are: one per target."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.vehicles import Chasers
+
+HEARTBEAT_NS = NS_PER_S
+"""A target whose chasers stand still is told of them so often: the planner's lease is five times as long."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What was last published about a target: its chasers' cells, and when."""
+
+    cells: dict[str, int]
+    at_ns: int
+
+
+class ChasersReport:
+    """Makes the messages of one author.
+
+    A planner reads pushed routes from the cells that it was told, and a vehicle can take a route that begins
+    anywhere on its path. So each vehicle tells the end of its path, and tells it anew when its path no longer has
+    the cell: seldom for one that is slow on a map of large cells, and never for one that waits.
+    """
+
+    def __init__(self, author: str) -> None:
+        self._author = author
+        self._told: dict[str, _Told] = {}
+        """Target -> what its planner knows, for all targets that have chasers among the vehicles."""
+
+    def reports(self, vehicles: Iterable[tuple[str, str | None, Sequence[int]]], now_ns: int) -> Iterator[Chasers]:
+        """The messages that are due: of targets that a vehicle has taken or left, whose planner knows a cell that a
+        vehicle has left behind, or that were not told of for `HEARTBEAT_NS`.
+
+        vehicles  id, target and path of each: the cells that it may stand on or enter, in order, at least one
+        """
+        chasers: dict[str, dict[str, Sequence[int]]] = {target: {} for target in self._told}
+        for id, target, path in vehicles:
+            if target is not None and path:
+                chasers.setdefault(target, {})[id] = path
+        for target, paths in chasers.items():
+            told = self._told.get(target)
+            if told is not None and now_ns - told.at_ns < HEARTBEAT_NS and _holds(told.cells, paths):
+                continue
+            cells = {id: path[-1] for id, path in paths.items()}
+            if cells:
+                self._told[target] = _Told(cells, now_ns)
+            else:
+                del self._told[target]
+            yield Chasers(
+                target=target,
+                author=self._author,
+                stamp_ns=now_ns,
+                ids=list(cells),
+                cells=pack_column(list(cells.values()), "<u4"),
+            )
+
+
+def _holds(told: dict[str, int], paths: dict[str, Sequence[int]]) -> bool:
+    """Whether what was told is still true: the same vehicles, and each may still reach its cell."""
+    return told.keys() == paths.keys() and all(cell in paths[id] for id, cell in told.items())
