@@ -27,6 +27,7 @@ from swarm.bus.bus import (
     LinkChanged,
     Post,
     Replied,
+    new_counts,
 )
 from swarm.bus.endpoints import listening, wait_for_router
 from swarm.bus.zenoh_config import session_config
@@ -99,7 +100,7 @@ class ZenohBus:
         self._session = session
         self._namespace = namespace
         self._authenticator = authenticator
-        self._counts = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
+        self._counts = new_counts()
         self._counting = threading.Lock()
         """Held to add to `_counts`."""
         self._own_peers: list[Peer] = []
@@ -139,8 +140,8 @@ class ZenohBus:
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         if self._closed:
             return
-        self._count("messages_out")
         key, payload = topic.keyed(self._namespace, **fields), encode(message)
+        self._sent(payload)
         self._session.put(
             key,
             payload,
@@ -154,11 +155,10 @@ class ZenohBus:
             raise TypeError(f"topic {topic.name} is trusted: each of its messages is checked by itself")
 
         def arrive(sample: zenoh.Sample) -> None:
-            self._count("messages_in")
-            key = str(sample.key_expr)
+            key, payload = str(sample.key_expr), sample.payload.to_bytes()
+            self._received(payload)
             try:
                 named = self._fields(topic, key)
-                payload = sample.payload.to_bytes()
                 check_code(self._authenticator, attached(sample), topic, key, payload)
                 message = decode(payload, topic.message)
                 topic.check_key(named, message)
@@ -168,9 +168,10 @@ class ZenohBus:
             post(Heard(topic, named, message))
 
         def arrive_together(samples: list[zenoh.Sample]) -> None:
-            self._count("messages_in", len(samples))
             keys = [str(sample.key_expr) for sample in samples]
-            decoded = decode_many([sample.payload.to_bytes() for sample in samples], topic.message)
+            payloads = [sample.payload.to_bytes() for sample in samples]
+            self._received(*payloads)
+            decoded = decode_many(payloads, topic.message)
             heard: list[tuple[str, Message]] = []
             for key, message in zip(keys, decoded, strict=True):
                 if isinstance(message, ProtocolError):
@@ -198,11 +199,11 @@ class ZenohBus:
         concrete = {name: str(value) for name, value in fields.items()}
 
         def arrive(query: zenoh.Query) -> None:
-            self._count("messages_in")
             key = str(query.key_expr)
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
             timeout = parameters.pop(TIMEOUT_PARAMETER, "")
             answerer = _ZenohAnswerer(self, topic, query, concrete, parameters.get("format") == "json")
+            self._received(answerer.asked)
             try:
                 answerer.timeout_s = timeout_of(timeout)
                 check_code(self._authenticator, attached(query), topic, key, answerer.asked)
@@ -257,7 +258,7 @@ class ZenohBus:
                 self._drop(key, error)
                 return
             replies += 1
-            self._count("messages_in")
+            self._received(payload)
             post(Replied(tag, topic, named, message))
 
         def finish() -> None:
@@ -266,7 +267,7 @@ class ZenohBus:
         if self._closed:
             finish()
             return
-        self._count("messages_out")
+        self._sent(asked)
         self._session.get(
             f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
             zenoh.handlers.Callback(guarded(arrive), guarded(finish), indirect=False),
@@ -359,13 +360,21 @@ class ZenohBus:
             raise ProtocolError(f"{key} is not a key of topic {topic.name} ({topic.key})")
         return fields
 
-    def _count(self, name: str, by: int = 1) -> None:
-        """Several of zenoh's threads count: adding is not atomic."""
+    # Several of zenoh's threads count: adding is not atomic.
+
+    def _sent(self, payload: bytes) -> None:
         with self._counting:
-            self._counts[name] += by
+            self._counts["messages_out"] += 1
+            self._counts["bytes_out"] += len(payload)
+
+    def _received(self, *payloads: bytes) -> None:
+        with self._counting:
+            self._counts["messages_in"] += len(payloads)
+            self._counts["bytes_in"] += sum(map(len, payloads))
 
     def _drop(self, key: str, error: ProtocolError) -> None:
-        self._count("payloads_dropped")
+        with self._counting:
+            self._counts["payloads_dropped"] += 1
         now_s = time.monotonic()
         if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
             if len(self._logged_s) > _LOGGED_KEYS:
@@ -402,11 +411,11 @@ class _ZenohAnswerer:
         key = self._topic.keyed(self._bus.namespace, **{**self._concrete, **fields})
         if self._bus._closed or not self._query.key_expr.intersects(zenoh.KeyExpr(key)):
             return
-        self._bus._count("messages_out")
+        payload = encode_readable(message) if self._as_json else encode(message)
+        self._bus._sent(payload)
         if self._as_json:
-            self._query.reply(key, encode_readable(message), encoding=zenoh.Encoding.APPLICATION_JSON)
+            self._query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
         else:
-            payload = encode(message)
             code = code_of(self._bus._authenticator, self._topic, key, payload, self.asked)
             self._query.reply(key, payload, attachment=code)
 
