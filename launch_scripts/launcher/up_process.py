@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import json
 import os
 import signal
@@ -12,13 +11,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.launcher.parent_death import end_with_parent
 from launch_scripts.launcher.run_processes import processes
 from swarm.errors import SwarmError
 
 _END_S = 60.0
 _COMMAND = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1
 
 
 class UpProcess:
@@ -40,7 +38,7 @@ class UpProcess:
                 stdout=reported,
                 stderr=said,
                 start_new_session=True,
-                preexec_fn=_end_with_parent,
+                preexec_fn=lambda: end_with_parent(signal.SIGINT),
             )
 
     @property
@@ -87,8 +85,3 @@ class UpProcess:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         return left_behind
-
-
-def _end_with_parent() -> None:
-    """In the launcher, before it begins: the kernel tells it to stop when we are gone, even if we are killed."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGINT))

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
-from collections.abc import Iterator, Sequence
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from itertools import islice
+from typing import TypeVar
 
+from launch_scripts.launcher.parent_death import end_with_parent
 from launch_scripts.simulation.trial import SECONDS, Verdict, try_seed
 from launch_scripts.simulation.worlds import WORLDS
 from swarm.config.scenario import Scenario
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 MIX = "mix"
 """Each seed in the world of `WORLDS` that is its turn."""
@@ -26,19 +33,28 @@ def run_seeds(
 
     name   a world, `MIX`, or the name of the scenario that is `given`
     """
-    if jobs == 1 or len(seeds) == 1:
-        for seed in seeds:
-            yield try_seed(world_of(name, seed), seed, seconds, given)
+    yield from in_processes(functools.partial(_try, name, seconds, given), seeds, jobs)
+
+
+def _try(name: str, seconds: float, given: Scenario | None, seed: int) -> Verdict:
+    return try_seed(world_of(name, seed), seed, seconds, given)
+
+
+def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int) -> Iterator[R]:
+    """Call `work` with each item, in so many processes at a time; yields results as they come. The processes end
+    with this one, and when the caller stops to read. What `work` raises ends all."""
+    if jobs == 1 or len(items) == 1:
+        yield from map(work, items)
         return
     # Children of their own, not forks: numpy and numba have threads.
-    context = multiprocessing.get_context("spawn")
-    executor = ProcessPoolExecutor(jobs, mp_context=context)
-    waiting: set[Future[Verdict]] = set()
-    rest = iter(seeds)
+    executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _begin)
+    before = set(multiprocessing.active_children())
+    waiting: set[Future[R]] = set()
+    rest = iter(items)
     try:
         while True:
-            for seed in islice(rest, jobs + 1 - len(waiting)):
-                waiting.add(executor.submit(try_seed, world_of(name, seed), seed, seconds, given))
+            for item in islice(rest, jobs + 1 - len(waiting)):
+                waiting.add(executor.submit(work, item))
             if not waiting:
                 return
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -46,3 +62,12 @@ def run_seeds(
                 yield future.result()
     finally:
         executor.shutdown(wait=False, cancel_futures=True)
+        if waiting:
+            for child in set(multiprocessing.active_children()) - before:
+                child.terminate()
+
+
+def _begin() -> None:
+    """In a child: a Ctrl-C, which reaches the whole process group, is for the parent alone to act upon."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent(signal.SIGKILL)

@@ -1,0 +1,92 @@
+"""The page of figures in the documentation: each run replaces the section of its kind. Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from launch_scripts.bench.whole_swarm.figures import LIVE, SIMULATED, Figure, topic_figures
+from launch_scripts.bench.whole_swarm.series import figures_of, lines_of, remarks
+
+_INTRO = """# Scale figures
+
+Written by `swarm bench swarm ... --write docs/scale-figures.md`: each run replaces the section of its kind. The
+swarm is that of the built-in scenario `thousand`, with a map that grows with the vehicles (262 cells a vehicle);
+unless said otherwise, with an agent for each hundred vehicles, at least 4 and at most 40. *Power* is the exponent
+of the power of the number of vehicles that fits best. Trust ratios and CPU times more than times by the clock, which
+other work on the machine makes longer.
+"""
+_MEANINGS = "What the rows say"
+_ORDER = (_MEANINGS, "Live processes", "Simulation")
+
+
+def write_section(path: Path, report: dict[str, Any], command: str) -> None:
+    """Replace the section of this kind of run in a page, and make the page if there is none. Raises OSError."""
+    sections: dict[str, str] = {}
+    if path.exists():
+        for part in path.read_text(encoding="utf-8").split("\n## ")[1:]:
+            heading, _, text = part.partition("\n")
+            sections[heading] = text.strip("\n")
+    sections[_heading(report)] = "\n".join(_section(report, command))
+    sections[_MEANINGS] = "\n".join(_meanings())
+    ordered = sorted(sections, key=lambda heading: (_rank(heading), heading))
+    parts = [_INTRO, *(f"## {heading}\n\n{sections[heading]}\n" for heading in ordered)]
+    path.write_text("\n".join(parts), encoding="utf-8")
+
+
+def _heading(report: dict[str, Any]) -> str:
+    rows = report["rows"]
+    heading = _ORDER[2] if report["simulated"] else _ORDER[1]
+    if len(rows) > 1 and len({row["per_agent"] for row in rows}) == 1:
+        heading += f", {rows[0]['per_agent']} vehicles an agent"
+    return heading
+
+
+def _rank(heading: str) -> int:
+    return next((n for n, known in enumerate(_ORDER) if heading.startswith(known)), len(_ORDER))
+
+
+def _section(report: dict[str, Any], command: str) -> Iterator[str]:
+    rows = report["rows"]
+    yield f"`{command}`"
+    yield ""
+    yield (
+        f"{rows[0]['targets']} targets, ticks of {rows[0]['tick_hz']:g} Hz, {report['seconds']:g} s measured; "
+        f"{report['cores']} x {report['machine']}, Python {report['python']}, load {report['load']}."
+    )
+    yield ""
+    sizes = [
+        ["agents", *(f"{row['agents']:,}" for row in rows)],
+        ["cells a side", *(f"{row['side']:,}" for row in rows)],
+    ]
+    yield from _table(report, "vehicles", sizes, figures_of(report))
+    if topics := topic_figures(rows):
+        yield ""
+        yield "Delivered by topic, kB/s:"
+        yield ""
+        yield from _table(report, "topic", [], topics)
+    for remark in remarks(report):
+        yield ""
+        yield remark
+
+
+def _table(
+    report: dict[str, Any], first: str, above: Sequence[list[str]], figures: Sequence[Figure]
+) -> Iterator[str]:
+    headings = [first, *(f"{row['vehicles']:,}" for row in report["rows"])]
+    if len(report["rows"]) > 1:
+        headings.append("power")
+    yield f"| {' | '.join(headings)} |"
+    yield "|---" * len(headings) + "|"
+    for label, *cells in [*above, *lines_of(report, figures)]:
+        padded = [*cells, *[""] * (len(headings) - 1 - len(cells))]
+        shown = f"&nbsp;&nbsp;{label.strip()}" if label.startswith(" ") else label
+        yield f"| {' | '.join([shown, *padded])} |"
+
+
+def _meanings() -> Iterator[str]:
+    yield "| row | what it says |"
+    yield "|---|---|"
+    for label, meaning in {each.label: each.meaning for each in (*LIVE, *SIMULATED) if each.meaning}.items():
+        yield f"| {label.strip()} | {meaning} |"
