@@ -13,7 +13,9 @@ import pytest
 from support.live_swarm import SWARM, swarm
 from support.processes import eventually
 
-from launch_scripts.launcher.run_processes import processes
+from launch_scripts.launcher.run_processes import in_session, processes
+from launch_scripts.launcher.up_process import UpProcess
+from swarm.errors import SwarmError
 
 pytestmark = pytest.mark.network
 
@@ -70,11 +72,12 @@ def test_a_bench_that_is_ended_takes_its_swarm_with_it(temporary: Path, number: 
         bench = subprocess.Popen([*SWARM, *SMALL, "--seconds", "300"], stdout=said, stderr=said)
     try:
         eventually(lambda: len(running(temporary)) >= 10, 120, "the start of the swarm")
-        pids = running(temporary).values()
+        launcher = os.getsid(next(iter(running(temporary).values())))
+        assert launcher != os.getsid(bench.pid)
         bench.send_signal(number)
         assert bench.wait(90) != 0
-        eventually(lambda: running(temporary) == {}, 60, "the end of all processes")
-        assert not any(Path(f"/proc/{pid}/exe").exists() for pid in pids)
+        eventually(lambda: in_session(launcher) == [], 60, "the end of all processes")
+        assert running(temporary) == {}
         if number != signal.SIGKILL:
             assert list(temporary.glob("swarm-bench-*")) == []
             assert "interrupted" in (temporary / "said").read_text()
@@ -85,8 +88,13 @@ def test_a_bench_that_is_ended_takes_its_swarm_with_it(temporary: Path, number: 
             os.kill(pid, signal.SIGKILL)
 
 
-def test_a_map_on_which_the_vehicles_have_no_room_is_told_in_a_sentence(temporary: Path) -> None:
-    """The launcher's own sentence and exit code."""
-    ended = swarm(*SMALL, "--per-agent", "5", "--seed", "9007199254740993", timeout_s=60)
-    assert ended.returncode == 2
-    assert "Traceback" not in ended.stderr
+def test_a_launcher_that_refuses_is_quoted_with_its_exit_code(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    launcher = UpProcess("nowhere", run_dir, 5.0)
+    launcher.process.wait(60)
+    with pytest.raises(SwarmError, match=r"the launcher ended with code 2: no scenario 'nowhere'") as raised:
+        launcher.check()
+    assert raised.value.exit_code == 2
+    assert launcher.report() is None
+    assert launcher.end() == []

@@ -11,11 +11,12 @@ from launch_scripts.bench.whole_swarm.series import figures_of, lines_of, remark
 
 _INTRO = """# Scale figures
 
-Written by `swarm bench swarm ... --write docs/scale-figures.md`: each run replaces the section of its kind. The
-swarm is that of the built-in scenario `thousand`, with a map that grows with the vehicles (262 cells a vehicle);
-unless said otherwise, with an agent for each hundred vehicles, at least 4 and at most 40. *Power* is the exponent
-of the power of the number of vehicles that fits best. Trust ratios and CPU times more than times by the clock, which
-other work on the machine makes longer.
+Written by `swarm bench swarm ... --write docs/scale-figures.md`: each run replaces the section of its kind.
+
+The swarm is that of the built-in scenario `thousand`, with a map that grows with the vehicles, 262 cells a vehicle.
+Unless said otherwise it has an agent for each hundred vehicles, at least 4 and at most 40. *Power* is the exponent
+of the power of the number of vehicles that fits best. Trust ratios and CPU times more than times by the clock,
+which grow with other work on the machine.
 """
 _MEANINGS = "What the rows say"
 _ORDER = (_MEANINGS, "Live processes", "Simulation")

@@ -1,4 +1,4 @@
-"""`swarm bench swarm` and `swarm bench crowd`: sizes, what is read out of counters and reports, powers, the page."""
+"""`swarm bench swarm` and `swarm bench crowd`: sizes, what is read out of counters, exponents, the page."""
 
 from __future__ import annotations
 
