@@ -75,6 +75,16 @@ def cpu_s(pid: int) -> float | None:
     return None if fields is None else (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
 
 
+def machine_cpu_s() -> float | None:
+    """Seconds of CPU that all processes of the machine have used, and that its host took; None if not told."""
+    try:
+        fields = (_PROC / "stat").read_text(encoding="ascii").partition("\n")[0].split()[1:]
+        user, nice, system, _, _, *interrupts_and_stolen = map(int, fields[:8])
+    except (OSError, ValueError):
+        return None
+    return (user + nice + system + sum(interrupts_and_stolen)) / _TICKS_PER_S
+
+
 def pss_bytes(pid: int) -> int | None:
     """Memory of a process, of which shared pages count for their share; None if it has ended or may not be seen."""
     try:

@@ -61,10 +61,10 @@ def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int) -> Itera
             for future in done:
                 yield future.result()
     finally:
-        executor.shutdown(wait=False, cancel_futures=True)
         if waiting:
             for child in set(multiprocessing.active_children()) - before:
                 child.terminate()
+        executor.shutdown(cancel_futures=True)
 
 
 def _begin() -> None:

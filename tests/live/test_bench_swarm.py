@@ -13,7 +13,7 @@ import pytest
 from support.live_swarm import SWARM, swarm
 from support.processes import eventually
 
-from launch_scripts.launcher.run_processes import in_session, processes
+from launch_scripts.launcher.run_processes import cpu_s, in_session, processes
 from launch_scripts.launcher.up_process import UpProcess
 from swarm.errors import SwarmError
 
@@ -86,6 +86,32 @@ def test_a_bench_that_is_ended_takes_its_swarm_with_it(temporary: Path, number: 
         bench.kill()
         for pid in running(temporary).values():
             os.kill(pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_bench_of_crowds_that_is_ended_takes_its_processes_with_it(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    with (tmp_path / "said").open("w") as said:
+        bench = subprocess.Popen(
+            [*SWARM, "bench", "crowd", "--seeds", "0:50"], stdout=said, stderr=said, start_new_session=True
+        )
+    try:
+        # Two processes, which have imported everything.
+        eventually(
+            lambda: sum((cpu_s(pid) or 0.0) > 2.0 for pid in in_session(bench.pid)) >= 2, 90, "its processes"
+        )
+        if number == signal.SIGINT:
+            os.killpg(bench.pid, number)  # as a terminal sends it: to everybody
+        else:
+            bench.send_signal(number)
+        assert bench.wait(30) != 0
+        eventually(lambda: in_session(bench.pid) == [], 30, "the end of all processes")
+        assert "Traceback" not in (tmp_path / "said").read_text()
+    finally:
+        for pid in in_session(bench.pid):
+            os.kill(pid, signal.SIGKILL)
+        bench.wait(10)
 
 
 def test_a_launcher_that_refuses_is_quoted_with_its_exit_code(tmp_path: Path) -> None:

@@ -12,9 +12,12 @@ import typer
 
 from launch_scripts.bench.options import AsJson, names_of, numbers_of
 from launch_scripts.bench.show import progress_of, show
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError
 
 app = typer.Typer()
+Page = Annotated[
+    Path | None, typer.Option(help="Write the figures into this page (.md) too, in place of the last.")
+]
 
 
 @app.command()
@@ -37,9 +40,7 @@ def swarm(
     ] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="One process on a manual clock.")] = False,
     seed: Annotated[int, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = 5,
-    write: Annotated[
-        Path | None, typer.Option(help="Write the figures into this page (.md) too, in place of the last.")
-    ] = None,
+    write: Page = None,
     as_json: AsJson = False,
 ) -> None:
     """What a swarm costs: lateness, CPU, messages, memory, start-up, latency of routes, by number of vehicles.
@@ -52,11 +53,11 @@ def swarm(
     Starts the processes of `swarm up` on a free port of this machine, waits until every vehicle has a route,
     measures, and ends them: the scenario is `thousand` with a map that grows with the vehicles. With several sizes
     one after the other, and the power of the number of vehicles by which each figure grows. With --simulated the
-    same swarm in one process; each size gets 90 seconds at most.
+    same swarm in one process; each size gets 90 seconds of CPU at most.
 
     Exit code 1 if vehicles met or entered lethal cells, or a size could not be measured.
     """
-    from launch_scripts.bench.whole_swarm.page import write_section
+    from launch_scripts.bench.whole_swarm.page import write_sizes
     from launch_scripts.bench.whole_swarm.series import SERIES, broken, run_series, tables
     from launch_scripts.bench.whole_swarm.size import size_of
 
@@ -67,8 +68,7 @@ def swarm(
         size_of(each, targets, agents=agents, per_agent=per_agent, side=size, tick_hz=tick_hz, seed=seed)
         for each in many
     ]
-    if write is not None and (write.suffix != ".md" or not write.absolute().parent.is_dir()):
-        raise ConfigError(f"--write is {write}, expected a name that ends in .md, in a folder that is there")
+    _check_page(write)
     seconds = seconds or (10.0 if simulated else 30.0)
     with _ending_in_order():
         report = run_series(sizes, seconds, simulated, lambda text: typer.echo(text, err=True))
@@ -85,10 +85,7 @@ def swarm(
         }
         words = [f"--{name} {value}" for name, value in options.items() if value is not None]
         command = " ".join(["swarm bench swarm", *words, *(["--simulated"] if simulated else [])])
-        try:
-            write_section(write, report, command)
-        except OSError as error:
-            raise StoreError(f"cannot write {write}: {error.strerror or error}") from error
+        write_sizes(write, report, command)
     _exit_if(bool(broken(report)))
 
 
@@ -103,6 +100,7 @@ def crowd(
     size: Annotated[int, typer.Option(min=16, max=256, help="Cells a side.")] = 40,
     seconds: Annotated[float, typer.Option(min=1, max=3600, help="Simulated seconds of each drive.")] = 40.0,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="Drives at the same time.")] = 2,
+    write: Page = None,
     as_json: AsJson = False,
 ) -> None:
     """How crowds drive: cells a step, longest waits, arrivals, in dense worlds over many seeds. Some seven minutes.
@@ -112,13 +110,15 @@ def crowd(
     swarm bench crowd --worlds doors --seeds 0:20 --jobs 4 --json
 
     Simulated, without faults. 200 vehicles on 40 x 40 cells are an eighth of all cells: a hall, rooms with doors of
-    one cell, halls joined by corridors of one cell, pillars. A drive gets 300 seconds at most. Exit code 1 if
-    vehicles met or entered lethal cells.
+    one cell, halls joined by corridors of one cell, pillars. A drive gets 120 seconds of CPU at most. Exit code
+    1 if vehicles met or entered lethal cells.
     """
     from launch_scripts.bench.whole_swarm.crowd import broken, run, tables
+    from launch_scripts.bench.whole_swarm.page import write_crowds
     from launch_scripts.commands.simulate import parse_seeds
     from launch_scripts.simulation.worlds import CROWDS
 
+    _check_page(write)
     chosen = names_of(worlds, "worlds", CROWDS)
     some = parse_seeds(seeds)
     if agents > vehicles:
@@ -137,6 +137,9 @@ def crowd(
             progress=progress,
         )
     show(report, as_json, tables)
+    if write is not None:
+        words = f"--worlds {','.join(chosen)} --seeds {seeds} --vehicles {vehicles} --agents {agents} --size {size}"
+        write_crowds(write, report, f"swarm bench crowd {words} --seconds {seconds:g}")
     _exit_if(broken(report))
 
 
@@ -157,6 +160,12 @@ def _ending_in_order() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _check_page(page: Path | None) -> None:
+    """Raises ConfigError now, not after minutes of measuring."""
+    if page is not None and (page.suffix != ".md" or not page.absolute().parent.is_dir()):
+        raise ConfigError(f"--write is {page}, expected a name that ends in .md, in a folder that is there")
 
 
 def _exit_if(failed: bool) -> None:

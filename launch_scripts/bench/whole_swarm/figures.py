@@ -78,6 +78,11 @@ LIVE = (
     Figure("cpu_ms_per_s.launcher", "  launcher", "", 1, True),
     Figure("cpu_ms_per_s.targets", "  targets", "", 1, True),
     Figure("cpu_ms_per_s.keeper", "  keeper", "", 1, True),
+    Figure(
+        "cpu_others_ms_per_s",
+        "CPU of other work, ms/s",
+        "Of the whole machine, what measures included. Where it is not small, ticks are late because of it.",
+    ),
     Figure("cpu_agents_per_vehicle_ms_per_s", "CPU a vehicle, agents, ms/s"),
     Figure("cpu_all_per_vehicle_ms_per_s", "CPU a vehicle, all roles, ms/s"),
     Figure("cpu_planners_per_target_ms_per_s", "CPU a target, planners, ms/s"),
@@ -102,6 +107,7 @@ LIVE = (
     Figure("pss_mb.planner", "  planners", "", 1, True),
     Figure("pss_mb.monitor", "  monitor", "", 1, True),
     Figure("captures_per_min", "captures a minute", "Over the whole run."),
+    Figure("restarts", "processes started again"),
     Figure("collisions", "collisions", "Over the whole run, by what agents report."),
     Figure("lethal_entries", "lethal cells entered"),
 )

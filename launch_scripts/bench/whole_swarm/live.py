@@ -6,14 +6,14 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from launch_scripts.bench.whole_swarm.route_client import raw_answerer, route_client
 from launch_scripts.bench.whole_swarm.size import Size, scenario_text
 from launch_scripts.bench.whole_swarm.stats_window import StatsSpan, StatsWindow, histogram, ticks
 from launch_scripts.bench.wire.remote import Far
 from launch_scripts.launcher.options import free_ports
-from launch_scripts.launcher.run_processes import cpu_s, in_session, processes, pss_bytes
+from launch_scripts.launcher.run_processes import cpu_s, in_session, machine_cpu_s, processes, pss_bytes
 from launch_scripts.launcher.up_process import UpProcess
 from launch_scripts.process_table import processes_of
 from swarm.bus.bus import Heard
@@ -66,6 +66,14 @@ def measure_live(size: Size, seconds: float, tell: Tell) -> dict[str, Any]:
         return {**figures, **run.at_end(left_behind)}
 
 
+class _Cpu(NamedTuple):
+    """Seconds of CPU used until an instant: role and seconds by pid, and those of the whole machine."""
+
+    at_s: float
+    by_pid: dict[int, tuple[str, float]]
+    machine_s: float | None
+
+
 class _Run:
     """One measured run."""
 
@@ -98,20 +106,19 @@ class _Run:
             question = (self._scenario.target_ids, cells, route_cells, self._seconds, self._size.seed)
             self._tell(f"measuring for {self._seconds:g} s")
             self._window.begin()
-            before, from_s, own_s = self._cpu(), time.monotonic(), time.process_time()
+            before = self._cpu()
             if cells:
                 client.send(question)
             self._listen(self._seconds)
-            after, took_s = self._cpu(), time.monotonic() - from_s
-            own = (time.process_time() - own_s) / took_s
+            self._launcher.check()
+            after = self._cpu()
             memory = self._memory()
             route = client.recv() if cells and client.poll(_ANSWER_S) else None
         figures = {
             "routed_s": routed_s,
             "routed_share": len(self._answered) / self._size.vehicles,
-            "window_s": took_s,
-            **self._of_cpu(before, after, took_s),
-            "cpu_of_bench_ms_per_s": 1000 * own,
+            "window_s": after.at_s - before.at_s,
+            **self._of_cpu(before, after),
             **self._of_stats(),
             "route": route or {},
             "pss_mb": memory,
@@ -207,8 +214,9 @@ class _Run:
             else:
                 yield pid, names[pid].partition("-")[0] if pid in names else "helpers"
 
-    def _cpu(self) -> dict[int, tuple[str, float]]:
-        return {pid: (role, used) for pid, role in self._roles() if (used := cpu_s(pid)) is not None}
+    def _cpu(self) -> _Cpu:
+        by_pid = {pid: (role, used) for pid, role in self._roles() if (used := cpu_s(pid)) is not None}
+        return _Cpu(time.monotonic(), by_pid, machine_cpu_s())
 
     def _memory(self) -> dict[str, float]:
         found: dict[str, float] = {}
@@ -217,19 +225,22 @@ class _Run:
                 found[role] = found.get(role, 0.0) + used / 1e6
         return found
 
-    def _of_cpu(
-        self, before: dict[int, tuple[str, float]], after: dict[int, tuple[str, float]], took_s: float
-    ) -> dict[str, Any]:
+    def _of_cpu(self, before: _Cpu, after: _Cpu) -> dict[str, Any]:
+        ms_per_s = 1000 / (after.at_s - before.at_s)
         by_role: dict[str, float] = {}
-        for pid in before.keys() & after.keys():
-            role, used = after[pid]
-            by_role[role] = by_role.get(role, 0.0) + 1000 * (used - before[pid][1]) / took_s
+        for pid in before.by_pid.keys() & after.by_pid.keys():
+            role, used_s = after.by_pid[pid]
+            by_role[role] = by_role.get(role, 0.0) + ms_per_s * (used_s - before.by_pid[pid][1])
         every = sum(by_role.values()) if by_role else None
+        others = None
+        if every is not None and before.machine_s is not None and after.machine_s is not None:
+            others = max(ms_per_s * (after.machine_s - before.machine_s) - every, 0.0)
         agents, planners = by_role.get("agent"), by_role.get("planner")
         size = self._size
         return {
             "cpu_ms_per_s": dict(sorted(by_role.items(), key=lambda each: -each[1])),
             "cpu_all_ms_per_s": every,
+            "cpu_others_ms_per_s": others,
             "cpu_agents_per_vehicle_ms_per_s": None if agents is None else agents / size.vehicles,
             "cpu_all_per_vehicle_ms_per_s": None if every is None else every / size.vehicles,
             "cpu_planners_per_target_ms_per_s": None if planners is None else planners / size.targets,

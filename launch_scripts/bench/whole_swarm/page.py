@@ -6,8 +6,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.bench.tables import on_machine
+from launch_scripts.bench.whole_swarm import crowd
 from launch_scripts.bench.whole_swarm.figures import LIVE, SIMULATED, Figure, topic_figures
 from launch_scripts.bench.whole_swarm.series import figures_of, lines_of, remarks
+from swarm.errors import StoreError
 
 _INTRO = """# Scale figures
 
@@ -19,21 +22,33 @@ of the power of the number of vehicles that fits best. Trust ratios and CPU time
 which grow with other work on the machine.
 """
 _MEANINGS = "What the rows say"
-_ORDER = (_MEANINGS, "Live processes", "Simulation")
+_ORDER = (_MEANINGS, "Live processes", "Simulation", "Crowds")
 
 
-def write_section(path: Path, report: dict[str, Any], command: str) -> None:
-    """Replace the section of this kind of run in a page, and make the page if there is none. Raises OSError."""
-    sections: dict[str, str] = {}
-    if path.exists():
-        for part in path.read_text(encoding="utf-8").split("\n## ")[1:]:
-            heading, _, text = part.partition("\n")
-            sections[heading] = text.strip("\n")
-    sections[_heading(report)] = "\n".join(_section(report, command))
-    sections[_MEANINGS] = "\n".join(_meanings())
-    ordered = sorted(sections, key=lambda heading: (_rank(heading), heading))
-    parts = [_INTRO, *(f"## {heading}\n\n{sections[heading]}\n" for heading in ordered)]
-    path.write_text("\n".join(parts), encoding="utf-8")
+def write_sizes(path: Path, report: dict[str, Any], command: str) -> None:
+    """Replace the section of this kind of run, as `series.run_series` reports it. Raises StoreError."""
+    _write_section(path, _heading(report), "\n".join(_sizes(report, command)))
+
+
+def write_crowds(path: Path, report: dict[str, Any], command: str) -> None:
+    """Replace the section of crowds, as `crowd.run` reports them. Raises StoreError."""
+    _write_section(path, _ORDER[3], "\n".join(_crowds(report, command)))
+
+
+def _write_section(path: Path, heading: str, text: str) -> None:
+    try:
+        sections: dict[str, str] = {}
+        if path.exists():
+            for part in path.read_text(encoding="utf-8").split("\n## ")[1:]:
+                name, _, kept = part.partition("\n")
+                sections[name] = kept.strip("\n")
+        sections[heading] = text
+        sections[_MEANINGS] = "\n".join(_meanings())
+        ordered = sorted(sections, key=lambda each: (_rank(each), each))
+        parts = [_INTRO, *(f"## {each}\n\n{sections[each]}\n" for each in ordered)]
+        path.write_text("\n".join(parts), encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def _heading(report: dict[str, Any]) -> str:
@@ -48,13 +63,13 @@ def _rank(heading: str) -> int:
     return next((n for n, known in enumerate(_ORDER) if heading.startswith(known)), len(_ORDER))
 
 
-def _section(report: dict[str, Any], command: str) -> Iterator[str]:
+def _sizes(report: dict[str, Any], command: str) -> Iterator[str]:
     rows = report["rows"]
     yield f"`{command}`"
     yield ""
     yield (
-        f"{rows[0]['targets']} targets, ticks of {rows[0]['tick_hz']:g} Hz, {report['seconds']:g} s measured; "
-        f"{report['cores']} x {report['machine']}, Python {report['python']}, load {report['load']}."
+        f"{rows[0]['targets']} targets, ticks of {rows[0]['tick_hz']:g} Hz, {report['seconds']:g} s measured. "
+        f"{on_machine(report)}"
     )
     yield ""
     sizes = [
@@ -70,6 +85,18 @@ def _section(report: dict[str, Any], command: str) -> Iterator[str]:
     for remark in remarks(report):
         yield ""
         yield remark
+
+
+def _crowds(report: dict[str, Any], command: str) -> Iterator[str]:
+    yield f"`{command}`"
+    yield ""
+    yield f"{' '.join(crowd.remarks(report))} {on_machine(report)}"
+    yield ""
+    headings = (heading.replace("-\n", "").replace("\n", " ") for heading, _ in crowd.COLUMNS)
+    yield f"| {' | '.join(headings)} |"
+    yield "|---" * len(crowd.COLUMNS) + "|"
+    for row in report["rows"]:
+        yield f"| {' | '.join(write(row) for _, write in crowd.COLUMNS)} |"
 
 
 def _table(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import multiprocessing
@@ -14,12 +15,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 from typer.testing import CliRunner
 
 from launch_scripts.bench.cli import app
 from launch_scripts.bench.whole_swarm import crowd, series
 from launch_scripts.bench.whole_swarm.figures import LIVE, SIMULATED, Figure, exponent, exponents, topic_figures
-from launch_scripts.bench.whole_swarm.page import write_section
+from launch_scripts.bench.whole_swarm.page import write_sizes
 from launch_scripts.bench.whole_swarm.size import CELLS_PER_VEHICLE, scenario_of, size_of
 from launch_scripts.bench.whole_swarm.stats_window import StatsWindow, ticks
 from launch_scripts.launcher.options import find_scenario
@@ -236,11 +238,11 @@ def report(simulated: bool, *rows: dict[str, Any]) -> dict[str, Any]:
 
 def test_a_run_replaces_the_section_of_its_kind_and_keeps_the_others(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    write_section(page, report(True, row(100, times_real_time=4.0)), "first")
-    write_section(page, report(False, row(100, up_s=7.0), row(300, up_s=8.0)), "second")
+    write_sizes(page, report(True, row(100, times_real_time=4.0)), "first")
+    write_sizes(page, report(False, row(100, up_s=7.0), row(300, up_s=8.0)), "second")
     several = [{**row(n), "per_agent": 25} for n in (100, 200)]
-    write_section(page, report(True, *several), "third")
-    write_section(page, report(True, row(1000, times_real_time=0.5)), "fourth")
+    write_sizes(page, report(True, *several), "third")
+    write_sizes(page, report(True, row(1000, times_real_time=0.5)), "fourth")
     text = page.read_text()
     headings = [line.removeprefix("## ") for line in text.splitlines() if line.startswith("## ")]
     assert headings == ["What the rows say", "Live processes", "Simulation", "Simulation, 25 vehicles an agent"]
@@ -249,7 +251,7 @@ def test_a_run_replaces_the_section_of_its_kind_and_keeps_the_others(tmp_path: P
     assert "| up, s | 7 | 8 |  |" in text
     assert "| times real time, by the clock | 0.500 |" in text
     again = text
-    write_section(page, report(True, row(1000, times_real_time=0.5)), "fourth")
+    write_sizes(page, report(True, row(1000, times_real_time=0.5)), "fourth")
     assert page.read_text() == again
 
 
@@ -261,7 +263,7 @@ def test_every_line_of_a_table_has_as_many_cells_as_its_head(tmp_path: Path) -> 
         row(1000, failed="no memory"),
     ]
     assert [figure.label for figure in topic_figures(rows)] == ["pose", "fleet"]
-    write_section(tmp_path / "page.md", report(True, *rows), "command")
+    write_sizes(tmp_path / "page.md", report(True, *rows), "command")
     text = (tmp_path / "page.md").read_text()
     tables = [part.splitlines() for part in text.split("\n\n") if part.startswith("|")]
     assert len(tables) == 3
@@ -339,22 +341,9 @@ def test_the_worst_wait_of_several_drives_counts_and_shares_are_of_all_vehicles(
     assert found["collisions"] == 0
 
 
-def test_a_small_crowd_is_driven_and_shown() -> None:
-    options = [
-        "--worlds",
-        "open",
-        "--seeds",
-        "1:2",
-        "--vehicles",
-        "12",
-        "--agents",
-        "3",
-        "--size",
-        "16",
-        "--seconds",
-        "8",
-    ]
-    ran = CliRunner().invoke(app, ["crowd", *options, "--jobs", "1", "--json"], catch_exceptions=False)
+def test_a_small_crowd_is_driven_shown_and_written_into_the_page(tmp_path: Path) -> None:
+    words = "crowd --worlds open --seeds 1:2 --vehicles 12 --agents 3 --size 16 --seconds 8 --jobs 1 --json --write"
+    ran = CliRunner().invoke(app, [*words.split(), str(tmp_path / "page.md")], catch_exceptions=False)
     assert ran.exit_code == 0, ran.output
     found = json.loads(ran.stdout)
     [drive], [shown] = found["drives"], found["rows"]
@@ -364,7 +353,14 @@ def test_a_small_crowd_is_driven_and_shown() -> None:
     assert drive["longest_wait_s"] < 8.0
     assert drive["arrivals"] > 0
     assert (drive["collisions"], drive["lethal_entries"]) == (0, 0)
-    assert max(len(str(line)) for line in ran.stderr.splitlines() or [""]) <= 200
+    text = (tmp_path / "page.md").read_text()
+    assert "## Crowds\n\n`swarm bench crowd --worlds open --seeds 1:2" in text
+    assert f"| open | {shown['cells_per_step']:.2f} |" in text
+    lines = Console(width=80, file=io.StringIO())
+    for part in crowd.tables(found):
+        lines.print(part)
+    assert isinstance(lines.file, io.StringIO)
+    assert "…" not in lines.file.getvalue()
 
 
 def test_a_simulated_swarm_is_measured() -> None:
