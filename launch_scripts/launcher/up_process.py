@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.launcher.parent_death import end_with_parent
 from launch_scripts.launcher.run_processes import processes
+from launch_scripts.parent_death import end_with_parent
 from swarm.errors import SwarmError
 
 _END_S = 60.0

@@ -4,22 +4,32 @@ from __future__ import annotations
 
 import functools
 import multiprocessing
+import re
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from itertools import islice
 from typing import TypeVar
 
-from launch_scripts.launcher.parent_death import end_with_parent
+from launch_scripts.parent_death import end_with_parent
 from launch_scripts.simulation.trial import SECONDS, Verdict, try_seed
 from launch_scripts.simulation.worlds import WORLDS
 from swarm.config.scenario import Scenario
+from swarm.errors import ConfigError
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 MIX = "mix"
 """Each seed in the world of `WORLDS` that is its turn."""
+
+
+def parse_seeds(text: str) -> range:
+    """`A:B` is the seeds from A to B - 1. Raises ConfigError."""
+    match = re.fullmatch(r"([0-9]{1,15}):([0-9]{1,15})", text)
+    if match is None or int(match[1]) >= int(match[2]):
+        raise ConfigError(f"--seeds: {text!r} is not A:B with A < B, such as 0:100 for the seeds 0 to 99")
+    return range(int(match[1]), int(match[2]))
 
 
 def world_of(name: str, seed: int) -> str:

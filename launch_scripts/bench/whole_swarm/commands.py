@@ -115,7 +115,7 @@ def crowd(
     """
     from launch_scripts.bench.whole_swarm.crowd import broken, run, tables
     from launch_scripts.bench.whole_swarm.page import write_crowds
-    from launch_scripts.commands.simulate import parse_seeds
+    from launch_scripts.simulation.campaign import parse_seeds
     from launch_scripts.simulation.worlds import CROWDS
 
     _check_page(write)
