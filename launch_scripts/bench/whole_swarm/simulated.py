@@ -50,11 +50,15 @@ def run(size: Size, seconds: float, limit_s: float) -> dict[str, Any]:
     built_s = time.perf_counter() - began_s
     delivered = _Delivered()
     limit = TimeLimit(limit_s)
-    simulation.run_until(WARM_UP_S)
+
+    def run_until(until_s: float) -> None:
+        while simulation.now_s < until_s and not limit.is_up:
+            simulation.run_until(min(simulation.now_s + _STEP_S, until_s))
+
+    run_until(WARM_UP_S)
     simulation.network.trace = lambda _, source, destination, topic, payload: delivered.add(topic, payload)
     from_s, wall_s, cpu_s = simulation.now_s, time.perf_counter(), time.process_time()
-    while simulation.now_s < WARM_UP_S + seconds and not limit.is_up:
-        simulation.run_until(min(simulation.now_s + _STEP_S, WARM_UP_S + seconds))
+    run_until(WARM_UP_S + seconds)
     passed_s = simulation.now_s - from_s
     cpu_s, wall_s = time.process_time() - cpu_s, time.perf_counter() - wall_s
     report = simulation.report(simulation.now_s)
