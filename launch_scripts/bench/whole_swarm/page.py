@@ -10,9 +10,10 @@ from launch_scripts.bench.tables import on_machine
 from launch_scripts.bench.whole_swarm import crowd
 from launch_scripts.bench.whole_swarm.figures import LIVE, SIMULATED, Figure, topic_figures
 from launch_scripts.bench.whole_swarm.series import figures_of, lines_of, remarks
-from swarm.errors import StoreError
+from swarm.errors import ConfigError, StoreError
 
-_INTRO = """# Scale figures
+_TITLE = "# Scale figures"
+_INTRO = f"""{_TITLE}
 
 Written by `swarm bench swarm ... --write docs/scale-figures.md`: each run replaces the section of its kind.
 
@@ -23,6 +24,17 @@ which grow with other work on the machine.
 """
 _MEANINGS = "What the rows say"
 _ORDER = (_MEANINGS, "Live processes", "Simulation", "Crowds")
+
+
+def check(path: Path) -> None:
+    """Raises ConfigError on a path that is no such page and can be none, before minutes of measuring."""
+    if path.suffix != ".md" or not path.absolute().parent.is_dir():
+        raise ConfigError(f"--write is {path}, expected a name that ends in .md, in a folder that is there")
+    try:
+        if path.exists() and not path.read_text(encoding="utf-8").startswith(_TITLE):
+            raise ConfigError(f"--write is {path}, which is another page: it does not begin with {_TITLE!r}")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--write is {path}, which cannot be read: {error}") from error
 
 
 def write_sizes(path: Path, report: dict[str, Any], command: str) -> None:

@@ -255,6 +255,16 @@ def test_a_run_replaces_the_section_of_its_kind_and_keeps_the_others(tmp_path: P
     assert page.read_text() == again
 
 
+def test_another_page_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("# Mine\n")
+    (tmp_path / "page.md").write_bytes(b"\xff\xfe")
+    for name, complaint in (("README.md", "which is another page"), ("page.md", "which cannot be read")):
+        ran = CliRunner().invoke(app, ["swarm", "--vehicles", "5", "--write", str(tmp_path / name)])
+        assert isinstance(ran.exception, ConfigError)
+        assert complaint in str(ran.exception)
+    assert (tmp_path / "README.md").read_text() == "# Mine\n"
+
+
 def test_every_line_of_a_table_has_as_many_cells_as_its_head(tmp_path: Path) -> None:
     topics = {"fleet": {"bytes_per_s": 2000.0}, "pose": {"bytes_per_s": 9000.0}}
     rows = [
