@@ -21,6 +21,7 @@ The swarm is that of the built-in scenario `thousand`, with a map that grows wit
 Unless said otherwise it has an agent for each hundred vehicles, at least 4 and at most 40. *Power* is the exponent
 of the power of the number of vehicles that fits best. Trust ratios and CPU times more than times by the clock,
 which grow with other work on the machine.
+[Decision 36](decisions/0036-how-a-whole-swarm-is-measured.md) says how it is measured.
 """
 _MEANINGS = "What the rows say"
 _ORDER = (_MEANINGS, "Live processes", "Simulation", "Crowds")
