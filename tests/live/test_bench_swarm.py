@@ -89,18 +89,25 @@ def test_a_bench_that_is_ended_takes_its_swarm_with_it(temporary: Path, number: 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_a_bench_of_crowds_that_is_ended_takes_its_processes_with_it(
-    tmp_path: Path, number: signal.Signals
+@pytest.mark.parametrize(
+    ("words", "processes"),
+    [("crowd --seeds 0:50", 2), ("swarm --vehicles 100 --simulated --seconds 600", 1)],
+    ids=["crowds", "simulated"],
+)
+def test_a_simulated_bench_that_is_ended_takes_its_processes_with_it(
+    tmp_path: Path, number: signal.Signals, words: str, processes: int
 ) -> None:
     with (tmp_path / "said").open("w") as said:
         bench = subprocess.Popen(
-            [*SWARM, "bench", "crowd", "--seeds", "0:50"], stdout=said, stderr=said, start_new_session=True
+            [*SWARM, "bench", *words.split()], stdout=said, stderr=said, start_new_session=True
         )
+
+    def at_work() -> int:
+        """Processes which have imported everything."""
+        return sum((cpu_s(pid) or 0.0) > 2.0 for pid in in_session(bench.pid) if pid != bench.pid)
+
     try:
-        # Two processes, which have imported everything.
-        eventually(
-            lambda: sum((cpu_s(pid) or 0.0) > 2.0 for pid in in_session(bench.pid)) >= 2, 90, "its processes"
-        )
+        eventually(lambda: at_work() >= processes, 200, "its processes")
         if number == signal.SIGINT:
             os.killpg(bench.pid, number)  # as a terminal sends it: to everybody
         else:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import resource
+import signal
 import sys
 import time
 from typing import Any
@@ -15,6 +16,7 @@ import msgspec
 
 from launch_scripts.bench.isolated import TimeLimit, measure
 from launch_scripts.bench.whole_swarm.size import Size, scenario_of, size_of
+from launch_scripts.parent_death import end_with_parent
 
 WARM_UP_S = 1.0
 """Simulated seconds before the measured ones: all processes start in them."""
@@ -93,6 +95,7 @@ def run(size: Size, seconds: float, limit_s: float) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    end_with_parent(signal.SIGKILL)
     found = run(msgspec.json.decode(sys.argv[1], type=Size), float(sys.argv[2]), float(sys.argv[3]))
     json.dump(found, sys.stdout)
     sys.stdout.write("\n")
