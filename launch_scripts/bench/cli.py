@@ -3,66 +3,33 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from launch_scripts.bench.options import AsJson, Picture, check_picture, names_of, numbers_of
 from launch_scripts.bench.show import progress_of, show
+from launch_scripts.bench.whole_swarm import commands as whole_swarm
 from swarm.config.scenario import Strategy
 from swarm.errors import ConfigError
 
 app = typer.Typer(
     name="bench",
-    help="Measure: trees beside other libraries, the paper's tables, scale, gaps, terrain, the wire.",
+    help="Measure: trees beside other libraries, the paper's tables, scale, gaps, terrain, the wire, whole swarms.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of fields, roots and walks.")]
 Frames = Annotated[int, typer.Option(min=1, help="Frames; each target moves one cell a frame.")]
 FieldOption = Annotated[
     str, typer.Option(help="terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces in s/m.")
 ]
 Strategies = Annotated[str, typer.Option(help="Strategies, several with commas.")]
-Picture = Annotated[Path | None, typer.Option(help="Write a plot (.png) too.")]
 _ALLOWED = typing.get_args(Strategy)
 _ALL = ",".join(_ALLOWED)
-
-
-def _names(text: str, what: str, allowed: Sequence[str]) -> tuple[Any, ...]:
-    """Names separated by commas. Raises ConfigError on none, and on one which is not allowed."""
-    chosen = tuple(name.strip() for name in text.split(",") if name.strip())
-    if not chosen:
-        raise ConfigError(f"--{what} is {text!r}, expected some of {', '.join(allowed)}")
-    for name in chosen:
-        if name not in allowed:
-            raise ConfigError(f"--{what}: {name!r} is not one of {', '.join(allowed)}")
-    return chosen
-
-
-def _numbers(text: str, name: str, least: int = 1) -> tuple[int, ...]:
-    try:
-        found = tuple(int(part) for part in text.split(","))
-    except ValueError:
-        found = ()
-    if not found or min(found) < least:
-        raise ConfigError(f"--{name} is {text!r}, expected numbers of at least {least} such as 512,1024")
-    return found
-
-
-def _check_picture(picture: Path | None) -> None:
-    """Raises ConfigError now, not after minutes of measuring."""
-    if picture is None:
-        return
-    if picture.suffix.lower() != ".png":
-        raise ConfigError(f"--picture is {picture}, expected a name that ends in .png")
-    if not picture.absolute().parent.is_dir():
-        raise ConfigError(f"--picture is {picture}: there is no folder {picture.absolute().parent}")
 
 
 @app.command()
@@ -177,9 +144,9 @@ def scale(
         raise ConfigError(f"--field is {field!r}, expected {', '.join(FIELDS)}: a file has only one size")
     if sizes is None:
         sizes = "512,1024,2048,4096" if full else "512,1024,2048"
-    axes = (_numbers(sizes, "sizes", 16), _numbers(targets, "targets"), _numbers(vehicles, "vehicles"))
-    chosen = _names(strategies, "strategies", _ALLOWED)
-    _check_picture(picture)
+    axes = (numbers_of(sizes, "sizes", 16), numbers_of(targets, "targets"), numbers_of(vehicles, "vehicles"))
+    chosen = names_of(strategies, "strategies", _ALLOWED)
+    check_picture(picture)
     with progress_of("scale") as progress:
         report = run_scale(
             points_of(*axes, full),
@@ -223,9 +190,9 @@ def gap(
     """
     from launch_scripts.bench.planning.gap import WALKS, run_gap, tables
 
-    walks = _names(walk, "walk", WALKS)
-    chosen = _names(strategies, "strategies", _ALLOWED)
-    _check_picture(picture)
+    walks = names_of(walk, "walk", WALKS)
+    chosen = names_of(strategies, "strategies", _ALLOWED)
+    check_picture(picture)
     with progress_of("gap") as progress:
         report = run_gap(
             dem,
@@ -255,7 +222,7 @@ def directed(
     """A full tree where uphill is not downhill (cost.directional), beside one where it is."""
     from launch_scripts.bench.planning.directed import run
 
-    show(run(_numbers(sizes, "sizes", 16), repeats, seed), as_json)
+    show(run(numbers_of(sizes, "sizes", 16), repeats, seed), as_json)
 
 
 @app.command()
@@ -319,7 +286,7 @@ def wire(
     """
     from launch_scripts.bench.wire.overview import PARTS, run, tables
 
-    chosen = _names(parts, "parts", PARTS)
+    chosen = names_of(parts, "parts", PARTS)
     with progress_of("wire") as progress:
         report = run(
             chosen,
@@ -387,5 +354,8 @@ def presence(
     from launch_scripts.bench.wire.presence import run
 
     with progress_of("presence") as progress:
-        report = run(_numbers(vehicles, "vehicles", 25), rounds, progress)
+        report = run(numbers_of(vehicles, "vehicles", 25), rounds, progress)
     show(report, as_json)
+
+
+app.add_typer(whole_swarm.app)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,19 @@ def measure(module: str, *words: str, environment: dict[str, str] | None = None)
         raise SwarmError(f"measuring {' '.join(words)} failed with exit code {done.returncode}: {last}")
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
+
+
+class TimeLimit:
+    """Seconds of CPU that this process may use from now on. By the clock it gets four times as long, for a machine
+    which is shared."""
+
+    def __init__(self, cpu_s: float) -> None:
+        self._until_cpu_s = time.process_time() + cpu_s
+        self._until_s = time.monotonic() + 4 * cpu_s
+
+    @property
+    def is_up(self) -> bool:
+        return time.process_time() >= self._until_cpu_s or time.monotonic() >= self._until_s
 
 
 def peak_bytes(work: Callable[[], object]) -> int:

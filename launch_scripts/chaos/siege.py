@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,18 +15,19 @@ import numpy as np
 from launch_scripts.chaos.blows import BLOWS, Blow, blows
 from launch_scripts.chaos.hostile import KINDS, Hostile
 from launch_scripts.chaos.lies import NAMES, Lies
-from launch_scripts.chaos.processes import Usage, has_ended, processes, usage
 from launch_scripts.chaos.recovery import Recovery
 from launch_scripts.chaos.stranger import Stranger
 from launch_scripts.chaos.tally import Ended, Outcome, Sample, Tally, name_of
 from launch_scripts.launcher.options import find_scenario, make_run_dir, with_port
+from launch_scripts.launcher.run_processes import Usage, has_ended, processes, usage
+from launch_scripts.launcher.up_process import UpProcess
 from launch_scripts.process_table import processes_of
 from launch_scripts.world.referee import Collision, Referee
 from shared_map.terrain.terrain import build_terrain, build_truth
 from swarm.bus.endpoints import listening
 from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario
-from swarm.errors import BusError, ProtocolError, SwarmError
+from swarm.errors import BusError, ProtocolError
 from swarm.wire.codec import decode
 from swarm.wire.topics import FLEET
 
@@ -45,11 +43,7 @@ _MATERIAL_S = 1.0
 """So long before each burst everything that is said is kept as material."""
 _MESSAGES_PER_S = 2000.0
 """Faster ones would be dropped by our own session, and not reach the router."""
-_END_S = 60.0
 _MARGIN_S = 600.0
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1
-_COMMAND = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,48 +120,23 @@ class Siege:
     # --- the swarm ------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def _swarm(self) -> Iterator[subprocess.Popen[bytes]]:
-        """`swarm up`, in a session of its own; ends it, and all that it started."""
-        options = self._options
+    def _swarm(self) -> Iterator[UpProcess]:
+        """`swarm up`; ends it, and all that it started."""
         port = self._scenario.network.connect[0].rpartition(":")[2]
-        limit_s = (options.seconds or _LONGEST_S) + _MARGIN_S
-        command = [*_COMMAND, "up", options.scenario, "--port", port, "--plain", "--no-live"]
-        command += ["--seconds", f"{limit_s:g}", "--run-id", self.run_dir.name, "--runs", str(options.runs)]
-        with (self.run_dir / "up.log").open("wb") as output:
-            launcher = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                preexec_fn=_end_with_parent,
-            )
+        limit_s = (self._options.seconds or _LONGEST_S) + _MARGIN_S
+        launcher = UpProcess(self._options.scenario, self.run_dir, limit_s, "--port", port, "--no-live")
         try:
             yield launcher
         finally:
-            self._end(launcher)
+            self.tally.left_behind += launcher.end()
 
-    def _end(self, launcher: subprocess.Popen[bytes]) -> None:
-        if launcher.poll() is None:
-            launcher.send_signal(signal.SIGINT)
-            try:
-                launcher.wait(_END_S)
-            except subprocess.TimeoutExpired:
-                self.tally.left_behind.append("the launcher")
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(launcher.pid, signal.SIGKILL)
-                launcher.wait(10)
-        for name, pid in processes(self.run_dir).items():
-            self.tally.left_behind.append(name)
-            _send(pid, signal.SIGKILL)
-
-    def _join(self, launcher: subprocess.Popen[bytes]) -> Stranger:
+    def _join(self, launcher: UpProcess) -> Stranger:
         """Wait until the swarm is up and every vehicle has been heard of."""
         began_s = time.monotonic()
         stranger: Stranger | None = None
         try:
             while time.monotonic() < began_s + _UP_WITHIN_S:
-                self._check(launcher)
+                launcher.check()
                 if stranger is None:
                     if listening(self._scenario.network.connect[0]):
                         stranger = Stranger(self._scenario.network)
@@ -185,22 +154,15 @@ class Siege:
                 stranger.close()
             raise
 
-    def _check(self, launcher: subprocess.Popen[bytes]) -> None:
-        if launcher.poll() is not None:
-            last = (self.run_dir / "up.log").read_text(errors="replace").strip().splitlines()[-1:]
-            raise SwarmError(f"the launcher ended with code {launcher.returncode}: {' '.join(last)}")
-
     # --- blows ----------------------------------------------------------------------------------------------
 
-    def _besiege(self, launcher: subprocess.Popen[bytes], stranger: Stranger) -> None:
+    def _besiege(self, launcher: UpProcess, stranger: Stranger) -> None:
         options = self._options
         for number, blow in enumerate(blows(options.seed, self._names, options.kinds, options.every_s / 2)):
             if self._finished():
                 return
-            if launcher.poll() is not None:
-                self.tally.ended.append(
-                    Ended(at_s=self._now_s, name="launcher", reason=f"exit code {launcher.returncode}")
-                )
+            if (code := launcher.process.poll()) is not None:
+                self.tally.ended.append(Ended(at_s=self._now_s, name="launcher", reason=f"exit code {code}"))
                 return
             began_s = self._now_s
             outcome = self._strike(stranger, blow)
@@ -367,8 +329,3 @@ def _sentence(outcome: Outcome) -> str:
 def _send(pid: int, number: signal.Signals) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, number)
-
-
-def _end_with_parent() -> None:
-    """In the launcher, before it begins: the kernel tells it to stop when we are gone, even if we are killed."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGINT))

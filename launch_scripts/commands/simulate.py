@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -46,7 +45,7 @@ def simulate_once(name: str, seed: int | None, seconds: float | None, trace: Pat
 def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: int, as_json: bool) -> bool:
     """Run many seeds with faults, and print what they break. True if every law held in all of them."""
     from launch_scripts.launcher.options import find_scenario
-    from launch_scripts.simulation.campaign import MIX, run_seeds
+    from launch_scripts.simulation.campaign import MIX, parse_seeds, run_seeds
     from launch_scripts.simulation.trial import SECONDS
     from launch_scripts.simulation.worlds import WORLDS
 
@@ -67,16 +66,6 @@ def simulate_seeds(name: str | None, seeds: str, seconds: float | None, jobs: in
     else:
         _print_total(total)
     return not total["failing"]
-
-
-def parse_seeds(text: str) -> range:
-    """`A:B` is the seeds from A to B - 1. Raises ConfigError."""
-    from swarm.errors import ConfigError
-
-    match = re.fullmatch(r"([0-9]{1,15}):([0-9]{1,15})", text)
-    if match is None or int(match[1]) >= int(match[2]):
-        raise ConfigError(f"--seeds: {text!r} is not A:B with A < B, such as 0:100 for the seeds 0 to 99")
-    return range(int(match[1]), int(match[2]))
 
 
 def _line(verdict: Verdict, done: int, many: int) -> str:

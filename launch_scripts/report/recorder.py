@@ -300,8 +300,11 @@ class Recorder:
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
             "messages_out": total("messages_out"),
             "messages_in": total("messages_in"),
+            "bytes_out": total("bytes_out"),
+            "bytes_in": total("bytes_in"),
             "messages_per_s": _mean(rates),
             "payloads_dropped": total("payloads_dropped"),
+            "ticks_late": total("ticks_late"),
             "ticks_dropped": total("ticks_dropped"),
         }
         return {name: _rounded(value) for name, value in fields.items()}

@@ -185,6 +185,12 @@ def check_subscription(topic: Topic, together: bool, every_s: float) -> None:
         raise TypeError(f"topic {topic.name} cannot be sampled: each of its messages counts")
 
 
+def new_counts() -> dict[str, int]:
+    """What a bus counts: messages and the bytes of their payloads, and payloads which it dropped. Keys, codes and
+    what the network adds are not in the bytes."""
+    return {"messages_out": 0, "messages_in": 0, "bytes_out": 0, "bytes_in": 0, "payloads_dropped": 0}
+
+
 class Bus(Protocol):
     """The network of one process. Keyword `fields` fill the topic's key; those not given are wildcards."""
 
@@ -195,7 +201,7 @@ class Bus(Protocol):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """`messages_out, messages_in, payloads_dropped`, since the bus was opened."""
+        """As `new_counts`, since the bus was opened."""
         ...
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:

@@ -11,7 +11,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from swarm.bus.bus import Appeared, Asked, Disappeared, Event, Heard, LinkChanged, Post, check_subscription
+from swarm.bus.bus import (
+    Appeared,
+    Asked,
+    Disappeared,
+    Event,
+    Heard,
+    LinkChanged,
+    Post,
+    check_subscription,
+    new_counts,
+)
 from swarm.bus.memory_declarations import (
     Declaration,
     Subscriptions,
@@ -145,7 +155,7 @@ class MemoryBus:
         self.authenticator = authenticator
         self.closed = False
         """Once true, nothing is sent or posted any more."""
-        self.counts: dict[str, int] = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
+        self.counts = new_counts()
         self.queryables: dict[str, list[Declaration]] = {}
         """Topic -> what is served, in order; subscriptions are the network's."""
         self.watchers: list[_Watcher] = []
@@ -162,7 +172,7 @@ class MemoryBus:
         """Put any payload at all: tests send garbage with it."""
         if self.closed:
             return
-        self.counts["messages_out"] += 1
+        self.sent(payload)
         named = topic.one(fields)
         sample = _Sample(topic, named, payload, code_of(self.authenticator, topic, topic.below(named), payload))
         network = self.network
@@ -243,7 +253,8 @@ class MemoryBus:
         if self.closed:
             scheduler.after(0, asking.finish)
             return
-        self.counts["messages_out"] += 1
+        payload = encode(request)
+        self.sent(payload)
         queryables = [
             queryable
             for bus in self.network.buses
@@ -255,7 +266,7 @@ class MemoryBus:
         if not queryables:
             scheduler.after(0, asking.finish)
             return
-        asking.asked = payload = encode(request)
+        asking.asked = payload
         parsed = decode(payload, topic.request)
         code = code_of(self.authenticator, topic, topic.below(wanted), payload)
         for index, queryable in enumerate(queryables):
@@ -287,6 +298,14 @@ class MemoryBus:
         for subscriptions in self.network.subscriptions.values():
             subscriptions.remove(self)
         self.network.compare_tokens()
+
+    def sent(self, payload: bytes) -> None:
+        self.counts["messages_out"] += 1
+        self.counts["bytes_out"] += len(payload)
+
+    def received(self, payload: bytes) -> None:
+        self.counts["messages_in"] += 1
+        self.counts["bytes_in"] += len(payload)
 
     def later(self, delay_ns: int, post: Post, event: Event) -> None:
         """Post an event after a delay, unless the bus is closed by then."""
@@ -372,7 +391,7 @@ class _Arrival:
         bus = self.subscription.bus
         if not bus.traced(self.source, self.sample.topic.name, self.sample.payload):
             return
-        bus.counts["messages_in"] += 1
+        bus.received(self.sample.payload)
         if self.subscription.post is None:
             bus.keep(self.sample)
         else:
@@ -394,7 +413,7 @@ class _Delivery:
         event, topic = self.event, self.event.topic
         if not self.to.traced(self.source, topic.name, self.payload):
             return
-        self.to.counts["messages_in"] += 1
+        self.to.received(self.payload)
         try:
             check_code(self.to.authenticator, self.code, topic, topic.below(event.fields), self.payload)
         except ProtocolError as error:

@@ -94,8 +94,8 @@ class MemoryAnswerer:
         named = asking.topic.one({**self.queryable.narrow, **fields})
         if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
             return
-        bus.counts["messages_out"] += 1
         payload = encode(message)
+        bus.sent(payload)
         key = asking.topic.below(named)
         code = code_of(bus.authenticator, asking.topic, key, payload, asking.asked)
         parsed = decode_either(payload, asking.topic.message, asking.topic.bulk)
@@ -108,7 +108,7 @@ class MemoryAnswerer:
             except ProtocolError:
                 asking.bus.counts["payloads_dropped"] += 1
                 return
-            asking.bus.counts["messages_in"] += 1
+            asking.bus.received(payload)
             asking.replies += 1
             asking.post(Replied(asking.tag, asking.topic, named, parsed, asking.took_s))
 

@@ -28,6 +28,7 @@ from swarm.bus.bus import (
     Post,
     Replied,
     check_subscription,
+    new_counts,
 )
 from swarm.bus.endpoints import listening, wait_for_router
 from swarm.bus.zenoh_answerer import ZenohAnswerer
@@ -101,7 +102,7 @@ class ZenohBus:
         self._session = session
         self._namespace = namespace
         self._authenticator = authenticator
-        self._counts = {"messages_out": 0, "messages_in": 0, "payloads_dropped": 0}
+        self._counts = new_counts()
         self._counting = threading.Lock()
         """Held to add to `_counts`."""
         self._own_peers: list[Peer] = []
@@ -147,8 +148,8 @@ class ZenohBus:
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         if self._closed:
             return
-        self._count("messages_out")
         key, payload = topic.keyed(self._namespace, **fields), encode(message)
+        self._sent(payload)
         self._session.put(
             key,
             payload,
@@ -163,15 +164,17 @@ class ZenohBus:
         check_subscription(topic, together, every_s)
 
         def arrive(sample: zenoh.Sample) -> None:
-            self._count("messages_in")
-            heard = self._heard(topic, sample)
+            payload = sample.payload.to_bytes()
+            self._received(payload)
+            heard = self._heard(topic, sample, payload)
             if heard is not None:
                 post(heard)
 
         def arrive_together(samples: list[zenoh.Sample]) -> None:
-            self._count("messages_in", len(samples))
             keys = [str(sample.key_expr) for sample in samples]
-            decoded = decode_many([sample.payload.to_bytes() for sample in samples], topic.message)
+            payloads = [sample.payload.to_bytes() for sample in samples]
+            self._received(*payloads)
+            decoded = decode_many(payloads, topic.message)
             heard: list[tuple[str, Message]] = []
             for key, message in zip(keys, decoded, strict=True):
                 if isinstance(message, ProtocolError):
@@ -199,11 +202,14 @@ class ZenohBus:
         heard = []
         for subscriber in self._collecting.get(topic.name, ()):
             samples = taken_from(subscriber.handler, topic.buffer)
+            payloads = [sample.payload.to_bytes() for sample in samples]
             if samples:
-                self._count("messages_in", len(samples))
-            if topic.newest and len(samples) > 1:
-                samples = list({str(sample.key_expr): sample for sample in samples}.values())
-            heard += [each for each in (self._heard(topic, sample) for sample in samples) if each is not None]
+                self._received(*payloads)
+            waiting = list(zip(samples, payloads, strict=True))
+            if topic.newest and len(waiting) > 1:
+                waiting = list({str(each[0].key_expr): each for each in waiting}.values())
+            events = (self._heard(topic, sample, payload) for sample, payload in waiting)
+            heard += [event for event in events if event is not None]
         return heard
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
@@ -231,11 +237,11 @@ class ZenohBus:
         key = topic.keyed(self._namespace, **{**concrete, **fields})
         if not query.key_expr.intersects(zenoh.KeyExpr(key)):
             return
-        self._count("messages_out")
+        payload = encode_readable(message) if as_json else encode(message)
+        self._sent(payload)
         if as_json:
-            query.reply(key, encode_readable(message), encoding=zenoh.Encoding.APPLICATION_JSON)
+            query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
         else:
-            payload = encode(message)
             query.reply(key, payload, attachment=code_of(self._authenticator, topic, key, payload, asked))
 
     def _subscriber(self, topic: Topic, fields: Mapping[str, str | int]) -> Any:
@@ -244,12 +250,11 @@ class ZenohBus:
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
 
-    def _heard(self, topic: Topic, sample: zenoh.Sample) -> Heard | None:
+    def _heard(self, topic: Topic, sample: zenoh.Sample, payload: bytes) -> Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
         key = str(sample.key_expr)
         try:
             named = self._fields(topic, key)
-            payload = sample.payload.to_bytes()
             check_code(self._authenticator, attached(sample), topic, key, payload)
             message = decode(payload, topic.message)
             topic.check_key(named, message)
@@ -265,12 +270,12 @@ class ZenohBus:
         concrete = {name: str(value) for name, value in fields.items()}
 
         def arrive(query: zenoh.Query) -> None:
-            self._count("messages_in")
             key = str(query.key_expr)
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
             timeout = parameters.pop(TIMEOUT_PARAMETER, "")
             as_json = parameters.get("format") == "json"
             answerer = ZenohAnswerer(query, partial(self._reply, topic, concrete, as_json))
+            self._received(answerer.asked)
             try:
                 answerer.timeout_s = timeout_of(timeout)
                 check_code(self._authenticator, attached(query), topic, key, answerer.asked)
@@ -327,7 +332,7 @@ class ZenohBus:
                 self._drop(key, error)
                 return
             replies += 1
-            self._count("messages_in")
+            self._received(payload)
             post(Replied(tag, topic, named, message, took_s))
 
         def finish() -> None:
@@ -336,7 +341,7 @@ class ZenohBus:
         if self._closed:
             finish()
             return
-        self._count("messages_out")
+        self._sent(asked)
         self._session.get(
             f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
             zenoh.handlers.Callback(guarded(arrive), guarded(finish), indirect=False),
@@ -433,13 +438,21 @@ class ZenohBus:
             raise ProtocolError(f"{key} is not a key of topic {topic.name} ({topic.key})")
         return fields
 
-    def _count(self, name: str, by: int = 1) -> None:
-        """Several of zenoh's threads count: adding is not atomic."""
+    # Several of zenoh's threads count: adding is not atomic.
+
+    def _sent(self, payload: bytes) -> None:
         with self._counting:
-            self._counts[name] += by
+            self._counts["messages_out"] += 1
+            self._counts["bytes_out"] += len(payload)
+
+    def _received(self, *payloads: bytes) -> None:
+        with self._counting:
+            self._counts["messages_in"] += len(payloads)
+            self._counts["bytes_in"] += sum(map(len, payloads))
 
     def _drop(self, key: str, error: ProtocolError) -> None:
-        self._count("payloads_dropped")
+        with self._counting:
+            self._counts["payloads_dropped"] += 1
         now_s = time.monotonic()
         if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
             if len(self._logged_s) > _LOGGED_KEYS:

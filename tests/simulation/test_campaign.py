@@ -7,8 +7,8 @@ import json
 import msgspec
 import pytest
 
-from launch_scripts.commands.simulate import parse_seeds, simulate_seeds
-from launch_scripts.simulation.campaign import MIX, run_seeds, world_of
+from launch_scripts.commands.simulate import simulate_seeds
+from launch_scripts.simulation.campaign import MIX, parse_seeds, run_seeds, world_of
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial, Verdict, try_seed

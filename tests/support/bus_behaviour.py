@@ -9,6 +9,7 @@ from support.bus_world import Box, World, answering, asked, marks, note, pose, r
 from shared_map.replication.mark_sets import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
+from swarm.wire.codec import encode
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import MarksRequest
 from swarm.wire.topics import MARKS, NOTE, POSE, RUN
@@ -26,6 +27,7 @@ def test_a_subscriber_hears_the_message_and_the_fields_of_its_key(world: World):
     assert box == [Heard(POSE, {"target": "t0"}, pose())]
     assert a.counts["messages_out"] == 1
     assert b.counts["messages_in"] == 1
+    assert a.counts["bytes_out"] == b.counts["bytes_in"] == len(encode(pose()))
 
 
 def test_a_process_hears_itself(world: World):

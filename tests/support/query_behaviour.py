@@ -8,6 +8,7 @@ import pytest
 from support.bus_world import Box, World, answering, asked, marks, run_info
 
 from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.wire.codec import encode
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import MarksRequest
 from swarm.wire.messages.traffic import Claim, Table
@@ -28,6 +29,9 @@ def test_a_query_is_answered_once(world: World):
         Replied("q", RUN, {"role": "agent", "id": "b"}, run_info("b")),
         AskEnded("q", RUN, 1, None),
     ]
+    question, answer = len(encode(Nothing())), len(encode(run_info("b")))
+    assert (a.counts["bytes_out"], a.counts["bytes_in"]) == (question, answer)
+    assert (b.counts["bytes_out"], b.counts["bytes_in"]) == (answer, question)
 
 
 def test_a_reply_tells_how_long_it_took_from_the_question_to_its_arrival(world: World):

@@ -79,7 +79,7 @@ def route_queries(far: Far, queries: int) -> dict[str, float]:
         for _ in range(queries):
             request = RouteRequest(cells=[int(random.integers(_SIDE * _SIDE))])
             began_ns = time.monotonic_ns()
-            answered = _route(bus, inbox, request)
+            answered = ask_route(bus, inbox, request)
             ours_us.append((time.monotonic_ns() - began_ns) / 1e3)
             if answered is None:
                 raise SwarmError("the planner gave no route")
@@ -110,20 +110,23 @@ def _first_route(bus: ZenohBus, inbox: Inbox) -> RouteReply:
     pose = TargetPose(target=_TARGET, incarnation=1, seq=1, stamp_ns=time.time_ns(), cell=cell, x_m=0.0, y_m=0.0)
     while time.monotonic() < deadline_s:
         bus.publish(POSE, pose, target=_TARGET)
-        reply = _route(bus, inbox, RouteRequest(cells=[0]))
+        reply = ask_route(bus, inbox, RouteRequest(cells=[0]))
         if reply is not None and reply.routes[0].status is RouteStatus.OK:
             return reply
         time.sleep(0.1)
     raise SwarmError("the planner was not ready in time")
 
 
-def _route(bus: ZenohBus, inbox: Inbox, request: RouteRequest) -> RouteReply | None:
+def ask_route(
+    bus: ZenohBus, inbox: Inbox, request: RouteRequest, target: str = _TARGET, timeout_s: float = 2.0
+) -> RouteReply | None:
+    """A planner's answer; None if there is none in time."""
     asked_as = str(time.monotonic_ns())
-    bus.ask(ROUTE, request, inbox.post, tag=asked_as, target=_TARGET)
+    bus.ask(ROUTE, request, inbox.post, tag=asked_as, timeout_s=timeout_s, target=target)
     found: RouteReply | None = None
     while found is None:
-        match inbox.take(5.0):
-            case Replied(message=RouteReply() as reply) if reply.routes:
+        match inbox.take(timeout_s + 3.0):
+            case Replied(tag=tag, message=RouteReply() as reply) if tag == asked_as and reply.routes:
                 found = reply
             case AskEnded(tag=tag) if tag == asked_as:
                 return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import socket
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from launch_scripts.launcher.options import free_ports
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_sets import packed
 from shared_map.replication.marks import Statements, mark_set
@@ -57,18 +58,20 @@ def map_key(tile: int, author: str) -> str:
 
 
 class Far:
-    """Processes beside this one, on one router. They end with the context."""
+    """Processes beside this one, on one router. They end with the context.
 
-    def __init__(self) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-        self.network = NetworkConfig(namespace=NAMESPACE, listen=(endpoint,), connect=(endpoint,))
+    network  whose router runs already; by default one is started
+    """
+
+    def __init__(self, network: NetworkConfig | None = None) -> None:
+        self._starts_router = network is None
+        self.network = network or _on_free_port()
         self._spawning = multiprocessing.get_context("spawn")
         self._running: list[tuple[BaseProcess, Connection]] = []
 
     def __enter__(self) -> Far:
-        self.start(_router)
+        if self._starts_router:
+            self.start(_router)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -79,7 +82,12 @@ class Far:
         """Runs `run(network, pipe, *given)` in a process; returns once it has sent "ready"."""
         here, there = self._spawning.Pipe()
         process = self._spawning.Process(target=run, args=(self.network, there, *given), daemon=True)
-        process.start()
+        # A Ctrl-C reaches the whole process group. These are ended by us, in order.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self._running.append((process, here))
         if not here.poll(_READY_S) or here.recv() != "ready":
             raise SwarmError(f"the process {run.__name__} was not ready within {_READY_S:.0f} s")
@@ -94,6 +102,12 @@ class Far:
         if process.is_alive():
             process.kill()
             process.join(_END_S)
+
+
+def _on_free_port() -> NetworkConfig:
+    [port] = free_ports(1)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    return NetworkConfig(namespace=NAMESPACE, listen=(endpoint,), connect=(endpoint,))
 
 
 def asked(far: Connection, *question: Any, within_s: float = 60.0) -> Any:

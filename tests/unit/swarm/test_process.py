@@ -167,8 +167,31 @@ def test_late_ticks_are_taken_once_and_the_missed_ones_counted():
     process = Process(service, inbox, clock, tick_hz=10)
     process.run()
     assert [tick // 10**6 for tick in service.ticks] == [0, 100, 450, 550]
-    assert service.counters.counts == {"ticks_dropped": 2, "events_dropped": 0, "asks_expired": 0}
+    # Due at 200 and 300 and never taken; the one of 400 comes at 450, the next is in time again.
+    assert service.counters.counts == {
+        "ticks_dropped": 2,
+        "ticks_late": 2,
+        "events_dropped": 0,
+        "asks_expired": 0,
+    }
     assert service.log == ["start", "stop"]
+
+
+@pytest.mark.parametrize(("took_ms", "late"), [(149, 0), (151, 1), (260, 2), (250, 1)])
+def test_a_tick_is_late_which_comes_more_than_half_a_period_after_it_was_due_or_never(took_ms, late):
+    clock, inbox = ManualClock(), Inbox()
+
+    def on_tick(ticks: list[int]) -> None:
+        if len(ticks) == 2:
+            process.stop()
+        else:
+            clock.advance_to(clock.now_ns() + took_ms * 1_000_000)
+
+    service = Recording(on_tick)
+    process = Process(service, inbox, clock, tick_hz=10)
+    process.run()
+    assert service.counters.counts["ticks_late"] == late
+    assert service.counters.counts["ticks_dropped"] == (took_ms - 100) // 100
 
 
 def test_events_are_handled_between_ticks_and_ticks_come_though_the_inbox_is_full():

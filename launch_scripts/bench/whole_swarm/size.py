@@ -1,0 +1,171 @@
+"""How large a measured swarm is, and its scenario: that of `thousand`, with a map which grows with the vehicles."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import MOST_TARGETS, Scenario
+from swarm.errors import ConfigError
+
+CELLS_PER_VEHICLE = 262.144
+"""As `thousand` has it: 512 x 512 cells for 1,000 vehicles."""
+_VEHICLES_AN_AGENT = 100
+_FEWEST_AGENTS, _MOST_AGENTS = 4, 40
+_MOST_PER_AGENT = 1000
+_MOST_VEHICLES = 100_000
+_LEAST_SIDE, _MOST_SIDE = 32, 16_384
+
+_SCENARIO = """
+name = "scale"
+seed = {seed}
+time_scale = 2             # 10 m/s on cells of 20 m: 1 cell a second on open ground
+
+[terrain]
+source = "synthetic"
+rows = {side}
+cols = {side}
+resolution_m = 20
+relief_m = 400
+roads = {roads}
+rivers = {rivers}
+
+[terrain.hidden]
+closed_roads = {closed_roads}
+rubble_fields = {rubble_fields}
+flooded_share = 0.005
+
+[cost]
+max_slope_deg = 25
+
+[[targets]]
+name = "t"
+count = {targets}
+walk = "waypoints"
+speed_m_per_s = 3
+
+[[groups]]
+name = "all"
+vehicles = {vehicles}
+start = "spread"
+
+[vehicles]
+per_agent = {per_agent}
+tick_hz = {tick_hz:g}
+sense_range_m = 100
+capture_range_m = 60
+route_cells = 64
+
+[planner]
+tick_hz = {planner_hz:g}
+cpu_budget = 0.05
+
+[map]
+interest = "near"
+interest_m = 1500
+"""
+_PLACES = """
+[network]
+listen = ["{endpoint}"]
+connect = ["{endpoint}"]
+
+[monitor]
+grpc_port = 0
+web_port = 0
+"""
+
+
+class Size(msgspec.Struct, frozen=True, kw_only=True):
+    """A swarm of one size.
+
+    agents     processes that host the vehicles; see `agents_of`
+    per_agent  vehicles of each, the last may have fewer
+    side       cells a side of the square map
+    tick_hz    of agents and planners
+    """
+
+    vehicles: int
+    targets: int
+    agents: int
+    per_agent: int
+    side: int
+    tick_hz: float
+    seed: int
+
+
+def size_of(
+    vehicles: int,
+    targets: int = 10,
+    *,
+    agents: int | None = None,
+    per_agent: int | None = None,
+    side: int | None = None,
+    tick_hz: float = 5.0,
+    seed: int = 5,
+) -> Size:
+    """The size with everything that is not given. Raises ConfigError, which names the option.
+
+    agents, per_agent  at most one of them; by default an agent for each hundred vehicles, at least 4 and at most 40
+    side               by default as many cells a vehicle as `thousand` has
+    """
+    _between("--vehicles", vehicles, 1, _MOST_VEHICLES)
+    _between("--targets", targets, 1, MOST_TARGETS)
+    if agents is not None and per_agent is not None:
+        raise ConfigError("--agents and --per-agent: give at most one of them")
+    if agents is not None and not 1 <= agents <= vehicles:
+        raise ConfigError(f"--agents is {agents}, expected 1 to {vehicles}: each of them hosts a vehicle at least")
+    if per_agent is None:
+        usual = min(max(-(-vehicles // _VEHICLES_AN_AGENT), _FEWEST_AGENTS), _MOST_AGENTS)
+        many = agents or max(usual, -(-vehicles // _MOST_PER_AGENT))
+        per_agent = -(-vehicles // many)
+        if per_agent > _MOST_PER_AGENT:
+            raise ConfigError(f"--agents is {many}, expected {-(-vehicles // _MOST_PER_AGENT)} or more: an agent "
+                              f"hosts at most {_MOST_PER_AGENT} vehicles, and there are {vehicles}")  # fmt: skip
+    _between("--per-agent", per_agent, 1, _MOST_PER_AGENT)
+    if side is None:
+        side = max(round(math.sqrt(CELLS_PER_VEHICLE * vehicles)), _LEAST_SIDE)
+    _between("--size", side, _LEAST_SIDE, _MOST_SIDE)
+    if side * side < 4 * vehicles:
+        raise ConfigError(
+            f"--size is {side}, expected {math.isqrt(4 * vehicles) + 1} or more for {vehicles} vehicles"
+        )
+    if not 0.1 <= tick_hz <= 100:
+        raise ConfigError(f"--tick-hz is {tick_hz:g}, expected 0.1 to 100")
+    return Size(
+        vehicles=vehicles,
+        targets=targets,
+        agents=-(-vehicles // per_agent),
+        per_agent=per_agent,
+        side=side,
+        tick_hz=tick_hz,
+        seed=seed,
+    )
+
+
+def scenario_text(size: Size, endpoint: str | None = None) -> str:
+    """The scenario as a file. What lies on the map keeps its density too: roads and rivers by length, obstacles by
+    area.
+
+    endpoint  of the router; the live view then takes free ports
+    """
+    lengths, areas = size.side / 512, (size.side / 512) ** 2
+    text = _SCENARIO.format(
+        **msgspec.structs.asdict(size),
+        planner_hz=size.tick_hz,
+        roads=min(max(round(24 * lengths), 2), 200),
+        rivers=min(max(round(2 * lengths), 1), 50),
+        closed_roads=min(round(20 * areas), 1000),
+        rubble_fields=min(round(30 * areas), 10_000),
+    )
+    return text if endpoint is None else text + _PLACES.format(endpoint=endpoint)
+
+
+def scenario_of(size: Size) -> Scenario:
+    return parse_scenario(scenario_text(size))
+
+
+def _between(option: str, value: int, least: int, most: int) -> None:
+    if not least <= value <= most:
+        raise ConfigError(f"{option} is {value}, expected {least} to {most}")
