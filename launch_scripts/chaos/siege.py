@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from launch_scripts.chaos.blows import BLOWS, Blow, blows
 from launch_scripts.chaos.hostile import KINDS, Hostile
 from launch_scripts.chaos.lies import NAMES, Lies
@@ -81,7 +79,7 @@ class Siege:
         scenario = with_port(find_scenario(options.scenario), 0)
         self._scenario: Scenario = scenario
         terrain = build_terrain(scenario)
-        self._referee = Referee(np.isfinite(build_truth(scenario, terrain)))
+        self._referee = Referee(build_truth(scenario, terrain))
         vehicles = [id for plan in plan_agents(scenario) for id in plan.vehicle_ids]
         self._recovery = Recovery(vehicles)
         self._names = [spec.name for spec in processes_of(scenario)]

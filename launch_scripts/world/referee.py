@@ -6,6 +6,7 @@ A report of a vehicle holds from its stamp until the vehicle's next report. Wher
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -60,10 +61,13 @@ class _Vehicle:
 
 
 class Referee:
-    """Turns reports into broken laws. Repeated and late reports change nothing."""
+    """Turns reports into broken laws. Repeated and late reports change nothing.
 
-    def __init__(self, passable: NDArray[np.bool_]) -> None:
-        self._passable = passable.ravel()
+    truth_s_per_m  float32 (rows, cols); inf is lethal
+    """
+
+    def __init__(self, truth_s_per_m: NDArray[np.float32]) -> None:
+        self._truth_s_per_m = truth_s_per_m.reshape(-1)
         self._vehicles: dict[str, _Vehicle] = {}
         self._stays: dict[int, list[_Stay]] = {}
         self._encounters: dict[tuple[str, str], int] = {}
@@ -78,7 +82,7 @@ class Referee:
         """Returns the laws that a report proves broken. Cells outside the grid are ignored."""
         broken: list[Collision | LethalEntry] = []
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
-            if cell < len(self._passable):
+            if cell < len(self._truth_s_per_m):
                 broken.extend(self._report(id, cell, fleet))
         if fleet.stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(fleet.stamp_ns)
@@ -104,7 +108,7 @@ class Referee:
             self._vehicles[id] = _Vehicle(entered, fleet.author, fleet.seq, stamp_ns)
         else:
             known.stay = entered
-        if not self._passable[cell]:
+        if not self._truth_s_per_m.item(cell) < math.inf:
             yield LethalEntry(id, cell, stamp_ns)
 
     def _meetings(self, stay: _Stay) -> Iterator[Collision]:

@@ -93,7 +93,7 @@ class TargetWorld:
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
         self._terrain = TrueTerrain(terrain.grid, pace)
-        self._referee = Referee(np.isfinite(truth_s_per_m))
+        self._referee = Referee(truth_s_per_m)
         self._own_incarnation = self._incarnation = incarnation
         # Of the poses of simulated targets that others tell: which are news, and the highest incarnation.
         self._poses = Newest(silence_ns=POSE_SILENCE_NS)

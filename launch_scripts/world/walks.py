@@ -38,13 +38,13 @@ class TrueTerrain:
     def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32]) -> None:
         self.grid = grid
         self.pace_s_per_m = pace_s_per_m
-        self.passable: NDArray[np.bool_] = np.isfinite(pace_s_per_m)
-        if not self.passable.any():
+        passable = np.isfinite(pace_s_per_m)
+        if not passable.any():
             raise TerrainError("every cell of the terrain is lethal: no target could stand on it")
         # A diagonal step has passable cells beside it, so what is connected by eight-neighbour steps is exactly
         # what is connected by four-neighbour steps.
         regions: NDArray[np.signedinteger[Any]]
-        regions, _ = label(self.passable)
+        regions, _ = label(passable)
         sizes = np.bincount(regions.ravel())
         sizes[0] = 0
         self._home = CellsOf(regions == int(sizes.argmax()))
@@ -55,7 +55,10 @@ class TrueTerrain:
         return np.flatnonzero(self._home.mask)
 
     def lethal(self, cell: int) -> bool:
-        return not self.passable.flat[cell]
+        return not self._passable(*divmod(cell, self.grid.cols))
+
+    def _passable(self, row: int, col: int) -> bool:
+        return self.pace_s_per_m.item(row, col) < math.inf
 
     def random_home(self, chance: random.Random) -> int:
         return self._home.cell(chance.randrange(len(self._home)))
@@ -65,9 +68,9 @@ class TrueTerrain:
         row, col = divmod(cell, self.grid.cols)
         d_row, d_col = STEP_ROW[direction], STEP_COL[direction]
         to_row, to_col = row + d_row, col + d_col
-        if not self.grid.inside(to_row, to_col) or not self.passable[to_row, to_col]:
+        if not self.grid.inside(to_row, to_col) or not self._passable(to_row, to_col):
             return None
-        if d_row and d_col and not (self.passable[row, to_col] and self.passable[to_row, col]):
+        if d_row and d_col and not (self._passable(row, to_col) and self._passable(to_row, col)):
             return None
         return to_row * self.grid.cols + to_col
 

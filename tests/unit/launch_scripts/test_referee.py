@@ -15,8 +15,8 @@ from launch_scripts.world.referee import Collision, LethalEntry, Referee
 from swarm.wire.messages.vehicles import Fleet
 
 
-def judged(*reports: Fleet, passable: NDArray[np.bool_] | None = None) -> list[Collision | LethalEntry]:
-    referee = Referee(np.ones(100, np.bool_) if passable is None else passable)
+def judged(*reports: Fleet, truth: NDArray[np.float32] | None = None) -> list[Collision | LethalEntry]:
+    referee = Referee(np.ones(100, np.float32) if truth is None else truth)
     return [broken for report in reports for broken in referee.hear(report)]
 
 
@@ -74,10 +74,10 @@ def test_repeated_and_late_reports_change_nothing(moves: list[tuple[str, int]], 
 
 
 def test_coming_onto_lethal_ground_counts_once_per_entry() -> None:
-    passable = np.ones(100, np.bool_)
-    passable[7] = False
+    truth = np.ones(100, np.float32)
+    truth[7] = np.inf
     reports = [a(100 * n, cell) for n, cell in enumerate([6, 7, 7, 7, 6, 7], start=1)]
-    entries = judged(*reports, passable=passable)
+    entries = judged(*reports, truth=truth)
     assert entries == [LethalEntry("a", 7, 200_000_000), LethalEntry("a", 7, 600_000_000)]
 
 
