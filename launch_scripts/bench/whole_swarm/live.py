@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +35,7 @@ ROUTED_WITHIN_S = 60.0
 SETTLE_S = 3.0
 _MARGIN_S = 120.0
 _TURN_S = 0.2
+_JOINED_WITHIN_S = 30.0
 _ANSWER_S = 10.0
 """How long after the window the client may still wait for an answer."""
 _ANSWERED = frozenset({VehicleState.FOLLOWING, VehicleState.ARRIVED, VehicleState.STRANDED})
@@ -56,13 +58,17 @@ def measure_live(size: Size, seconds: float, tell: Tell) -> dict[str, Any]:
         file = run_dir.parent / "scale.toml"
         text = scenario_text(size, endpoint)
         file.write_text(text, encoding="utf-8")
-        began_s = time.monotonic()
-        launcher = UpProcess(str(file), run_dir, UP_WITHIN_S + ROUTED_WITHIN_S + seconds + _MARGIN_S)
-        run = _Run(size, parse_scenario(text), seconds, launcher, began_s, tell)
-        try:
-            figures = run.measure()
-        finally:
-            left_behind = launcher.end()
+        scenario = parse_scenario(text)
+        # These start before the swarm, which leaves a busy machine no time to import anything, and join after it.
+        with Far(scenario.network) as far:
+            helpers = [far.start(raw_answerer), far.start(route_client)]
+            began_s = time.monotonic()
+            launcher = UpProcess(str(file), run_dir, UP_WITHIN_S + ROUTED_WITHIN_S + seconds + _MARGIN_S)
+            run = _Run(size, scenario, seconds, launcher, began_s, helpers, tell)
+            try:
+                figures = run.measure()
+            finally:
+                left_behind = launcher.end()
         return {**figures, **run.at_end(left_behind)}
 
 
@@ -78,12 +84,21 @@ class _Run:
     """One measured run."""
 
     def __init__(
-        self, size: Size, scenario: Scenario, seconds: float, launcher: UpProcess, began_s: float, tell: Tell
+        self,
+        size: Size,
+        scenario: Scenario,
+        seconds: float,
+        launcher: UpProcess,
+        began_s: float,
+        helpers: list[Connection],
+        tell: Tell,
     ) -> None:
         self._size = size
         self._seconds = seconds
         self._launcher = launcher
         self._began_s = began_s
+        self._helpers = helpers
+        """To the processes that measure routes: the one that answers raw queries, and the client."""
         self._tell = tell
         self._scenario = scenario
         self._network = scenario.network
@@ -96,24 +111,24 @@ class _Run:
 
     def measure(self) -> dict[str, Any]:
         self._until_listening()
-        with open_bus(self._network) as bus, Far(self._network) as far:
+        with open_bus(self._network) as bus:
             bus.subscribe(STATS, self._inbox.post)
             routed_s = self._until_routed(bus)
-            far.start(raw_answerer)
-            client = far.start(route_client)
+            asks = self._join_helpers() and bool(self._cells)
+            client = self._helpers[1]
             self._listen(SETTLE_S)
             cells, route_cells = sorted(self._cells.values()), self._scenario.vehicles.route_cells
             question = (self._scenario.target_ids, cells, route_cells, self._seconds, self._size.seed)
             self._tell(f"measuring for {self._seconds:g} s")
             self._window.begin()
             before = self._cpu()
-            if cells:
+            if asks:
                 client.send(question)
             self._listen(self._seconds)
             self._launcher.check()
             after = self._cpu()
             memory = self._memory()
-            route = client.recv() if cells and client.poll(_ANSWER_S) else None
+            route = client.recv() if asks and client.poll(_ANSWER_S) else None
         figures = {
             "routed_s": routed_s,
             "routed_share": len(self._answered) / self._size.vehicles,
@@ -181,6 +196,19 @@ class _Run:
             )
         bus.unsubscribe(FLEET)
         return routed_s
+
+    def _join_helpers(self) -> bool:
+        """Whether those who measure routes have joined in time."""
+        until_s = time.monotonic() + _JOINED_WITHIN_S
+        for helper in self._helpers:
+            helper.send("join")
+        for helper in self._helpers:
+            while not helper.poll():
+                if time.monotonic() > until_s:
+                    return False
+                self._listen(_TURN_S)
+            helper.recv()
+        return True
 
     def _check_time(self, what: str) -> None:
         if time.monotonic() - self._began_s > UP_WITHIN_S:

@@ -24,7 +24,10 @@ _KEY = f"{RAW}/swarm-route"
 
 
 def raw_answerer(network: NetworkConfig, pipe: Connection) -> None:
-    """Answers raw queries with as many bytes as each asks for, until told to end."""
+    """Joins when asked to; then answers raw queries with as many bytes as each asks for, until told to end."""
+    pipe.send("ready")
+    if pipe.recv() == "end":
+        return
 
     def answer(query: zenoh.Query) -> None:
         query.payload.to_bytes()  # type: ignore[union-attr]
@@ -33,16 +36,22 @@ def raw_answerer(network: NetworkConfig, pipe: Connection) -> None:
 
     with open_bus(network) as bus:
         kept = read_on_thread(bus.session.declare_queryable(_KEY, zenoh.handlers.FifoChannel(64)), answer)
-        pipe.send("ready")
+        pipe.send("joined")
         pipe.recv()
         del kept
 
 
 def route_client(network: NetworkConfig, pipe: Connection) -> None:
-    """Asks for routes, and raw, in turn. Answers (targets, cells, route_cells, seconds, seed) with `_summary`."""
+    """Joins when asked to; then asks for routes, and raw, in turn.
+
+    Answers (targets, cells, route_cells, seconds, seed) with `_summary`.
+    """
+    pipe.send("ready")
+    if pipe.recv() == "end":
+        return
     with open_bus(network) as bus:
         inbox = Inbox()
-        pipe.send("ready")
+        pipe.send("joined")
         while (question := pipe.recv()) != "end":
             pipe.send(_ask_for(bus, inbox, *question))
 
