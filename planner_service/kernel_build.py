@@ -193,7 +193,7 @@ class KernelLoader:
     def _load_rest(self) -> None:
         while self._missing:
             self._have_built()
-            time.sleep(2 * _POLL_S)
+            time.sleep(5 * _POLL_S)
             self._missing = tuple(missing(self._missing))
 
     def _have_built(self) -> None:

@@ -8,18 +8,19 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from shared_map.arrays import CellsOf
 from swarm.config.scenario import CostConfig, TargetConfig, Walk
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 STANDING: frozenset[Walk] = frozenset(("still", "external"))
 """Walks by which a simulated target takes no step."""
@@ -86,6 +87,9 @@ class TrueTerrain:
     def way(self, start: int, chance: random.Random) -> list[int]:
         """The cheapest way to a random place that can be reached inside the window around `start`, without `start`
         itself; empty if there is none."""
+        # Imported here: it takes 0.2 s, for which the start of all other processes would wait.
+        from scipy.sparse.csgraph import dijkstra
+
         window = self.grid.around(start, WAY_HALF_CELLS)
         rows, cols = window.row1 - window.row0, window.col1 - window.col0
         graph = _steps_graph(self.pace_s_per_m[window.row0 : window.row1, window.col0 : window.col1])
@@ -112,6 +116,8 @@ class TrueTerrain:
 
 def _steps_graph(pace: NDArray[np.float32]) -> csr_array[np.float64]:
     """Graph of all possible steps of a window of pace; an edge costs what entering its end costs."""
+    from scipy.sparse import csr_array
+
     rows, cols = pace.shape
     padded = np.full((rows + 2, cols + 2), np.inf)
     padded[1:-1, 1:-1] = pace

@@ -110,7 +110,8 @@ def is_loaded(compiled: Any) -> bool:
 
 def is_on_disk(compiled: Any) -> bool:
     """Whether some process has compiled the kernel for this machine."""
-    if not isinstance(compiled._cache, _FolderCache):
+    # Planners ask many times a second until it is: the rest takes a hundred times as long as this.
+    if not isinstance(compiled._cache, _FolderCache) or not Path(compiled._cache._cache_file._index_path).exists():
         return False
     argument_types, _ = sigutils.normalize_signature(compiled.declared)
     cache = compiled._cache
