@@ -13,10 +13,13 @@ from swarm.runtime.membership import NO_RUN
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo
-from swarm.wire.topics import RUN
+from swarm.wire.messages.vehicles import Followed
+from swarm.wire.topics import FOLLOWED, RUN
 
 _TAG = "launcher-run"
 _ASK_TIMEOUT_S = 1.0
+_READ_S = 0.1
+"""Longest time for which the launcher reads at once: it has processes to look after."""
 
 
 class Watcher:
@@ -36,15 +39,17 @@ class Watcher:
     def begin(self) -> None:
         for topic, every_s in RECORDED.items():
             self._bus.subscribe(topic, self._inbox.post, every_s=every_s)
+        # The first tells that routes are served, sooner than any figures do.
+        self._bus.subscribe(FOLLOWED, self._inbox.post)
         self._bus.watch_alive(self._inbox.post)
 
     def listen(self, for_s: float) -> None:
         """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
         time.sleep(for_s)
-        until_s = time.monotonic() + for_s
+        until_s = time.monotonic() + _READ_S
         while (event := self._inbox.take(0.0)) is not None:
             self._take(event)
-            if time.monotonic() >= until_s:  # what comes faster than it is read must not keep the launcher here
+            if time.monotonic() >= until_s:
                 return
 
     def now_ns(self) -> int:
@@ -62,6 +67,9 @@ class Watcher:
                 match message:
                     case Note():
                         self._note(message)
+                    case Followed():
+                        self.routes_served = True
+                        self._bus.unsubscribe(FOLLOWED)
                     case PlannerStatus(routes_served=served) if served:
                         self.routes_served = True
                 self.recorder.heard(message, fields, now_ns)
