@@ -23,12 +23,15 @@ from planner_service.kernels.parents import point_to_parents
 from planner_service.kernels.repair import repair
 from planner_service.tree.corridors import INNER, CorridorGraph
 from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
-from planner_service.tree.growth import FINE, grow_tree
+from planner_service.tree.growth import FINE, KeptScratch, grow_tree
 from shared_map.arrays import Floats
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
 
 NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
+
+_SMALL = 1 << 16
+"""Padded cells of a small window."""
 
 
 class CostToGoTree:
@@ -56,6 +59,8 @@ class CostToGoTree:
         self.window_bound: WindowBound | None = None
         """What the last window proves, as long as its root is the tree's. `move` sets it, a growth resets it, and
         so does the owner (to None) when a cell gets cheaper: it bounds from below."""
+        self._kept: KeptScratch = {}
+        """Scratch of the last small window."""
         self._stamps: NDArray[np.uint8] | None = None
         """uint8, padded: `_now` or `_now + 1` where a cost was recomputed since ways changed last. None until
         needed."""
@@ -135,7 +140,7 @@ class CostToGoTree:
         bits = cut_window(grid.cell_cost.view(np.int32), grid.stride, box, part.view(np.int32))
         cost = np.empty_like(part)
         padded: PaddedGrid = part, step_offsets(width), width, grid.rule, grid.corners
-        grow_tree(padded, *floats_of_bits(bits), start, cost, None)
+        grow_tree(padded, *floats_of_bits(bits), start, cost, None, self._kept if part.size <= _SMALL else None)
         way = float(cost[old])
         if not way < math.inf:
             return 0

@@ -22,13 +22,24 @@ FINE = float(1 << 20)
 """While no cost exceeds so many lowest cell costs, float32 tells any cell's cost from its parent's."""
 
 
+KeptScratch = dict[tuple[int, int], bucket_queue.Scratch]
+"""By padded cells and buckets: one at most, of one thread and one rule."""
+
+
 def grow_tree(
-    padded: PaddedGrid, lowest: float, highest: float, root: int, cost: Floats, parent: NDArray[np.uint8] | None
+    padded: PaddedGrid,
+    lowest: float,
+    highest: float,
+    root: int,
+    cost: Floats,
+    parent: NDArray[np.uint8] | None,
+    kept: KeptScratch | None = None,
 ) -> float:
     """Grow the exact tree of a padded, passable root. Returns a bound, s, that no cost exceeds.
 
     lowest, highest  bounds of the finite cell costs, s
     cost, parent     padded, written whole; None where parents are not wanted
+    kept             scratch of the last growth, for one of the same size: small ones feel what it takes to make it
     """
     cell_cost, _, stride, rule, _ = padded
     size = cell_cost.size
@@ -37,7 +48,11 @@ def grow_tree(
     if longest <= min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)) * lowest:
         width = np.float32(lowest * 0.98)
         count = 1 << max(2, math.ceil(math.log2(longest / float(width) + 3)))
-        scratch = bucket_queue.make_scratch(size, rule, count)
+        kept = {} if kept is None else kept
+        if (size, count) not in kept:
+            kept.clear()
+            kept[size, count] = bucket_queue.make_scratch(size, rule, count)
+        scratch = kept[size, count]
         last = bucket_queue.grow_by_buckets(padded, cost, root, (float(width), count), scratch)
         if last != TOO_FINE:
             if parent is not None:
