@@ -54,7 +54,7 @@ def test_of_two_lives_of_one_agent_the_older_stops_until_the_younger_is_gone_and
     simulation.nodes["agent-a1.2"].crash()  # for good: the older one takes over again
     simulation.run_until(25)
     before = {id: vehicle.cell for id, vehicle in older.agent.vehicles.items()}
-    simulation.run_until(30)
+    simulation.run_until(34)  # some stand in a knot with others for several seconds
     assert len(before) == 4
     assert sum(older.agent.vehicles[id].cell != cell for id, cell in before.items()) >= 2
     assert laws.collisions == []
@@ -72,8 +72,11 @@ def test_an_agent_that_starts_again_with_another_clock_is_like_any_other(skew_s)
     assert isinstance(service, AgentService)
     before = {id: vehicle.cell for id, vehicle in service.agent.vehicles.items()}
     assert len(before) == 4
-    simulation.run_until(12)
-    assert all(vehicle.cell != before[id] for id, vehicle in service.agent.vehicles.items())
+    moved: set[str] = set()  # one may be back where it was, after its target was given to another
+    while simulation.now_s < 14:
+        simulation.run_until(simulation.now_s + 0.5)
+        moved |= {id for id, vehicle in service.agent.vehicles.items() if vehicle.cell != before[id]}
+    assert moved == set(before)
     assert laws.collisions == []
 
 
