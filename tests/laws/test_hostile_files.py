@@ -29,13 +29,14 @@ from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.grid import GridSpec
 
 COMMAND = """
-import resource, sys
+import re, sys
 from launch_scripts.cli import main
 try:
     code = main()
 except SystemExit as end:
     code = end.code or 0
-print("PEAK", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10)
+# Not `ru_maxrss`: that counts what the process was forked from.
+print("PEAK", int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1]) >> 10)
 sys.exit(code)
 """
 MOST_MB = 400
