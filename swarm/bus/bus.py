@@ -22,9 +22,9 @@ Bugs        Unknown fields, missing fields, a wildcard where one value is meant:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from swarm.liveness import Peer
 from swarm.wire.messages.base import Message
@@ -185,6 +185,22 @@ def check_subscription(topic: Topic, together: bool, every_s: float) -> None:
         raise TypeError(f"topic {topic.name} cannot be sampled: each of its messages counts")
 
 
+S = TypeVar("S")
+
+
+def newest_of(topic: Topic, waiting: Iterable[tuple[str, S]], hear: Callable[[S], Heard | None]) -> list[Heard]:
+    """The events of samples that waited, given with their keys: of a topic of which only the newest value counts,
+    that of each key. A sample that is rejected hides none that came before it.
+
+    hear  makes the event of a sample; None if it is rejected
+    """
+    by_key: dict[str | int, list[S]] = {}
+    for number, (key, sample) in enumerate(waiting):
+        by_key.setdefault(key if topic.newest else number, []).append(sample)
+    newest = (next(filter(None, map(hear, reversed(samples))), None) for samples in by_key.values())
+    return [event for event in newest if event is not None]
+
+
 def new_counts() -> dict[str, int]:
     """What a bus counts: messages and the bytes of their payloads, and payloads which it dropped. Keys, codes and
     what the network adds are not in the bytes."""
@@ -222,13 +238,12 @@ class Bus(Protocol):
         ...
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        """Keep samples from now on until `collected`: of topics of which only the newest value counts
-        (`Topic.newest`), that of each key, else all, at most `Topic.buffer`. For what is acted on at ticks only:
+        """Keep samples from now on until `collected`, the newest `Topic.buffer`. For what is acted on at ticks only:
         a sample that wakes no thread costs a fifth."""
         ...
 
     def collected(self, topic: Topic) -> list[Heard]:
-        """What has been kept on a topic since the last call, in the order of arrival within a subscription."""
+        """What has been kept on a topic since the last call, as `newest_of` says."""
         ...
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:

@@ -7,6 +7,7 @@ run. Nothing is buffered but what is collected: a handler takes no simulated tim
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -21,6 +22,7 @@ from swarm.bus.bus import (
     Post,
     check_subscription,
     new_counts,
+    newest_of,
 )
 from swarm.bus.memory_declarations import (
     Declaration,
@@ -160,8 +162,8 @@ class MemoryBus:
         """Topic -> what is served, in order; subscriptions are the network's."""
         self.watchers: list[_Watcher] = []
         self.link_watchers: list[Post] = []
-        self._kept: dict[str, dict[tuple[str | int, ...], _Sample]] = {}
-        """Topic -> what waits for `collected`, the newest of each key."""
+        self._kept: dict[str, deque[_Sample]] = {}
+        """Topic -> what waits for `collected`."""
         self.tokens: list[Peer] = []
         """Raised with `declare_alive`; visible to others while the bus is open and connected."""
 
@@ -195,21 +197,18 @@ class MemoryBus:
         subscriptions.add(declare(self, topic, fields, None))
 
     def collected(self, topic: Topic) -> list[Heard]:
-        kept = self._kept.pop(topic.name, {})
-        heard: list[Heard] = []
-        post = checking_key(heard.append, self.counts)  # type: ignore[arg-type]
-        for sample in kept.values():
-            self.hear(sample, post)
-        return heard
+        def hear(sample: _Sample) -> Heard | None:
+            heard: list[Event] = []
+            self.hear(sample, checking_key(heard.append, self.counts))
+            return heard[0] if heard and isinstance(heard[0], Heard) else None
+
+        kept = self._kept.pop(topic.name, ())
+        return newest_of(topic, ((topic.below(sample.fields), sample) for sample in kept), hear)
 
     def keep(self, sample: _Sample) -> None:
         """Keep a sample for `collected`."""
         topic = sample.topic
-        key = tuple(sample.fields.values()) if topic.newest else (self.counts["messages_in"],)
-        kept = self._kept.setdefault(topic.name, {})
-        kept[key] = sample
-        if len(kept) > topic.buffer:
-            del kept[next(iter(kept))]
+        self._kept.setdefault(topic.name, deque(maxlen=topic.buffer)).append(sample)
 
     def hear(self, sample: _Sample, post: Post) -> None:
         """Post the event of a sample. A payload that does not parse is counted and dropped."""

@@ -29,11 +29,12 @@ from swarm.bus.bus import (
     Replied,
     check_subscription,
     new_counts,
+    newest_of,
 )
 from swarm.bus.endpoints import listening, wait_for_router
 from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
-from swarm.bus.zenoh_threads import attached, guarded, newest_in, taken_from, timeout_of, waiting_in
+from swarm.bus.zenoh_threads import attached, guarded, taken_after, taken_from, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
@@ -184,12 +185,16 @@ class ZenohBus:
             if heard:
                 post(HeardMany(topic, heard))
 
+        def arrive_sampled(samples: list[zenoh.Sample]) -> None:
+            for heard in self._newest(topic, samples):
+                post(heard)
+
         subscriber = self._subscriber(topic, fields)
         name = f"sub-{topic.name}"
         if together:
             self._read(subscriber, arrive_together, name, lambda channel: [waiting_in(channel)])
         elif every_s:
-            self._read(subscriber, arrive, name, lambda channel: newest_in(channel, self._closing, every_s))
+            self._read(subscriber, arrive_sampled, name, lambda ch: [taken_after(ch, self._closing, every_s)])
         else:
             self._read(subscriber, arrive, name)
 
@@ -199,18 +204,17 @@ class ZenohBus:
         self._collecting.setdefault(topic.name, []).append(subscriber)
 
     def collected(self, topic: Topic) -> list[Heard]:
-        heard = []
+        heard: list[Heard] = []
         for subscriber in self._collecting.get(topic.name, ()):
-            samples = taken_from(subscriber.handler, topic.buffer)
-            payloads = [sample.payload.to_bytes() for sample in samples]
-            if samples:
-                self._received(*payloads)
-            waiting = list(zip(samples, payloads, strict=True))
-            if topic.newest and len(waiting) > 1:
-                waiting = list({str(each[0].key_expr): each for each in waiting}.values())
-            events = (self._heard(topic, sample, payload) for sample, payload in waiting)
-            heard += [event for event in events if event is not None]
+            heard += self._newest(topic, taken_from(subscriber.handler, topic.buffer))
         return heard
+
+    def _newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:
+        payloads = [sample.payload.to_bytes() for sample in samples]
+        if samples:
+            self._received(*payloads)
+        keyed = ((str(each[0].key_expr), each) for each in zip(samples, payloads, strict=True))
+        return newest_of(topic, keyed, lambda waited: self._heard(topic, *waited))
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         subscribers = self._subscribers.pop(topic.expression(self._namespace, **fields), ())

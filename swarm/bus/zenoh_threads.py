@@ -33,14 +33,10 @@ def taken_from(channel: Any, most: int) -> list[Any]:
     return items
 
 
-def newest_in(channel: Any, closing: threading.Event, wait_s: float) -> list[Any]:
-    """The newest item of each key in a channel, `wait_s` after the first that came; none once it is closing."""
-    newest = {str((item := channel.recv()).key_expr): item}
-    if closing.wait(wait_s):
-        return []
-    while (item := channel.try_recv()) is not None:
-        newest[str(item.key_expr)] = item
-    return list(newest.values())
+def taken_after(channel: Any, closing: threading.Event, wait_s: float) -> list[Any]:
+    """The items in a channel, `wait_s` after the first that came; none once it is closing."""
+    first = channel.recv()
+    return [] if closing.wait(wait_s) else [first, *taken_from(channel, MOST_TOGETHER)]
 
 
 def guarded(callback: Callable[..., None]) -> Callable[..., None]:
