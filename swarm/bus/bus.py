@@ -238,8 +238,8 @@ class Bus(Protocol):
         ...
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        """Keep samples from now on until `collected`, the newest `Topic.buffer`. For what is acted on at ticks only:
-        a sample that wakes no thread costs a fifth."""
+        """Keep samples from now on until `collected`, the newest `Topic.buffer`. For what is acted on at ticks: a
+        sample that wakes no thread costs a fifth."""
         ...
 
     def collected(self, topic: Topic) -> list[Heard]:

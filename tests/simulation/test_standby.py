@@ -157,7 +157,7 @@ def test_the_targets_go_on_from_where_they_are_and_captures_count_on(seed: int) 
             assert grid.distance_cells(before[1].cell, after[1].cell) <= 3
         last = max(heard, key=lambda each: (each[1].incarnation, each[1].seq))[1]
         assert last.captures >= after[1].captures >= before[1].captures
-        assert len([each for each in heard if each[0] > 12]) > 100
+        assert len([each for each in heard if each[0] > 12]) > 10
     simulation.finish()
     told = sum(max(pose.captures for _, pose in heard) for heard in poses.heard.values())
     assert told > 0

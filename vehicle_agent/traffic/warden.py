@@ -82,6 +82,8 @@ class Warden:
         self._plot = table.plot
         self._me = me
         self._fleets = fleets
+        cols = plots.grid.cols
+        self._steps = (-cols - 1, -cols, 1 - cols, -1, 1, cols - 1, cols, cols + 1)
         self._lives = dict(table.hosts)  # agent -> (life, seq) of the newest standing that counts
         self._grants: dict[str, tuple[list[int], Stamp]] = {
             vehicle: (list(grant.cells), grant.stamp) for vehicle, grant in table.grants.items()
@@ -218,8 +220,9 @@ class Warden:
                 continue
             life, heard = table.hosts.get(name, (0, 0))
             grants = by_host[name]
-            wanted = {cell for stand in host.standing.vehicles for cell in stand.wants}
-            occupied = sorted(cell for cell in wanted if cell in holders and holders[cell] not in grants)
+            # Also around those under way: what they want once they come to rest depends on who is there.
+            near = {stand.end + step for stand in host.standing.vehicles for step in self._steps}
+            occupied = sorted(cell for cell in near & holders.keys() if holders[cell] not in grants)
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             leaves = not host.standing.vehicles
             says = (life, grants, pushed, occupied, heard if leaves else 0)

@@ -117,7 +117,7 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted")):
     life, heard  the newest standing of the host that counts in the table; 0 if none does
     grants       vehicle of the host -> its cells, in driving order
     pushed       vehicle of the host -> the age with which it is to make way into another plot
-    occupied     of the cells that vehicles of the host at rest could go to, those that others hold
+    occupied     of the cells around where vehicles of the host end, those that others hold
     """
 
     plot: Plot

@@ -253,12 +253,12 @@ def hear(holdings: Holdings, table: Table, now_ns: int = 0) -> None:
 
 def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() -> None:
     fleets = {"a0": ["a0-00"], "a1": ["a1-00"]}
-    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[20]), fleets, 0)
+    member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0)
     member.hear_standing(standing("a0", [9], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     assert isinstance(claim, Save)
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
-    wants = [Stand("a0-00", 9, 9, [9], [], [20, 10], 2, 0)]
+    wants = [Stand("a0-00", 9, 9, [9], [], [18, 10], 2, 0)]
     member.hear_standing(standing("a0", [9], seq=2, vehicles=wants), 2 * S)
     (_, table) = member.tick(2 * S)
     assert isinstance(table, Table)
@@ -268,7 +268,7 @@ def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() 
     (granted,) = member.hear_stored(stored, 2 * S)  # only a0 has spoken
     assert isinstance(granted, Granted)
     assert (granted.host, granted.stamp, granted.heard) == ("a0", table.stamp, 2)
-    assert (granted.grants, granted.occupied) == ({"a0-00": [9, 10]}, [20])
+    assert (granted.grants, granted.occupied) == ({"a0-00": [9, 10]}, [18])
     assert member.hear_stored(stored, 2 * S) == []  # told just now
     assert [type(each) for each in member.hear_stored(stored, 2 * S + BEAT_NS)] == [Granted]
 
