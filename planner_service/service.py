@@ -168,6 +168,9 @@ class PlannerService:
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()
+        for _, event in self._held:
+            event.refuse(f"{event.topic.name}: the planner ends")
+            event.end()
         if self._planner.leads:
             self._bus.publish(STATUS, self._planner.status(now_ns), target=self._target)
         self._member.publish_stats(now_ns)

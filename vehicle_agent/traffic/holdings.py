@@ -8,10 +8,11 @@ from itertools import takewhile
 
 from swarm.wire.messages.traffic import Granted, Stamp, Stand, Standing
 from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.warden import BEAT_NS
+from vehicle_agent.traffic.warden import BEAT_NS, FURTHEST_EPOCH
 
 _UNHEARD_NS = 5 * BEAT_NS // 2
 """A host that has not heard a plot's warden for so long speaks to all members of the plot."""
+_FURTHEST_SEQ = 1 << 32
 _BEFORE_ALL: Stamp = (0, 0)
 
 
@@ -82,11 +83,13 @@ class Holdings:
     plots     those that concern the host now: it speaks to their members and listens to their tables
     replaced  a later life of this host has spoken: this one must end
     newest    the greatest life of this host that a table in use names
+    refused   sentences about what cannot be true; whoever tells them clears them
     """
 
     def __init__(self, plots: Plots, agent: str, vehicles: Collection[str]) -> None:
         self._plots = plots
         self._agent = agent
+        self.refused: list[str] = []
         self._vehicles = frozenset(vehicles)
         self.end()
 
@@ -150,6 +153,10 @@ class Holdings:
         """The vehicles that hold cells of a plot, as far as its table in use tells."""
         return list(self._views[plot].seen) if plot in self._views else []
 
+    def heard_ns(self, plot: int) -> int:
+        """When a plot's warden was heard last; 0 if none was."""
+        return self._views[plot].heard_ns if plot in self._views else 0
+
     # --- what wardens say -----------------------------------------------------------------------------------
 
     def watch(self, plots: Collection[int]) -> None:
@@ -165,6 +172,9 @@ class Holdings:
         place  tells on which of the cells that it was granted a vehicle stands
         """
         view = self._views.setdefault(granted.plot, _View())
+        if granted.epoch > view.knows[0] + FURTHEST_EPOCH or granted.seq > _FURTHEST_SEQ:
+            self.refused.append(f"{granted.agent} names a table that is implausibly far ahead: {granted.stamp}")
+            return []
         if granted.agent != self._plots.warden(granted.plot, granted.epoch) or granted.stamp < view.knows:
             return []
         view.warden, view.heard_ns = granted.agent, now_ns

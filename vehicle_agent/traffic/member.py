@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from swarm.clock import NS_PER_S
 from swarm.wire.messages.traffic import Granted, Standing, Stored, Table
 from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.warden import BEAT_NS, Warden
+from vehicle_agent.traffic.warden import BEAT_NS, FURTHEST_EPOCH, Warden
 
 LEASE_NS = 3 * BEAT_NS
 """A warden that is silent for so long may be replaced. Until then its members refuse every claim."""
@@ -20,7 +20,6 @@ _RANK_NS = NS_PER_S // 5
 _START_NS = 3 * NS_PER_S // 10
 _WANTED_NS = NS_PER_S
 """Where no host has spoken for so long, nobody needs a warden."""
-_FURTHEST_EPOCH = 3 << 20
 _TABLES_KEPT = 16
 
 
@@ -119,7 +118,7 @@ class Member:
         if table.epoch < self.promised:
             # A claim of ours or of another came to nothing: let the warden claim again, so that we can follow it.
             return [Stored(plot=self.plot, agent=self._me, epoch=self.promised, seq=0)]
-        if table.epoch > self.promised + _FURTHEST_EPOCH:
+        if table.epoch > self.promised + FURTHEST_EPOCH:
             return [Refused(f"{table.agent} names an epoch that is implausibly far ahead: {table.epoch}")]
         if self.warden is not None and table.epoch > self.warden.epoch:
             self.warden = None
@@ -155,7 +154,7 @@ class Member:
         led = now_ns < self._led_until_ns and claimant != self._leader
         if epoch <= self.promised or self.warden is not None or led:
             return []
-        if epoch > self.promised + _FURTHEST_EPOCH:
+        if epoch > self.promised + FURTHEST_EPOCH:
             return [Refused(f"a claim names an epoch that is implausibly far ahead: {epoch}")]
         self._promise(epoch)
         self._led(now_ns, claimant)  # time for the claimant to begin
@@ -176,7 +175,7 @@ class Member:
         if stored.epoch == self.warden.epoch:
             self._acked_ns = now_ns
             return self._on_file(self.warden, stored.seq, now_ns)
-        if self.promised < stored.epoch <= self.promised + _FURTHEST_EPOCH:
+        if self.promised < stored.epoch <= self.promised + FURTHEST_EPOCH:
             self._claim_above = stored.epoch
         return []
 

@@ -17,7 +17,7 @@ from swarm.config.agents import agent_of
 from swarm.liveness import Peer, Roster
 from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Standing, Stored, Table
 from vehicle_agent.traffic.holdings import Holdings, Tell, Wish
-from vehicle_agent.traffic.member import Member, MemberAction
+from vehicle_agent.traffic.member import Member, MemberAction, Refused
 from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.warden import first_life, is_far_ahead
 
@@ -198,8 +198,10 @@ class RightOfWay:
         """A warden's word to us. Returns the vehicles that have found their place."""
         if not self.holdings.life or granted.plot not in self.holdings.plots:
             return []
-        self._led_ns[granted.plot] = now_ns
-        return self.holdings.hear_granted(granted, self._place, now_ns)
+        placed = self.holdings.hear_granted(granted, self._place, now_ns)
+        if self.holdings.heard_ns(granted.plot) == now_ns:
+            self._led_ns[granted.plot] = now_ns
+        return placed
 
     def hear_claim(self, plot: int, epoch: int, now_ns: int) -> list[Action]:
         """Another member asks for our promise: `Save`, then the table to answer with; or nothing."""
@@ -215,7 +217,8 @@ class RightOfWay:
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
         """What our members and our vehicles have to say now."""
-        actions: list[Action] = []
+        actions: list[Action] = [Refused(text) for text in self.holdings.refused]
+        self.holdings.refused.clear()
         for member in () if self.silent else self._members.values():
             actions += member.tick(now_ns)
         if self.holdings.replaced:

@@ -28,6 +28,8 @@ _TOLD_AGAIN_NS = 3 * BEAT_NS // 4
 """A host is told the same again after so long: somewhat less than a beat, so that a beat tells it."""
 _LIFE_BITS = 32
 _FURTHEST_LIFE = 1 << 16
+FURTHEST_EPOCH = 3 << 20
+"""No run gets so many epochs further while somebody does not hear of it."""
 
 
 def _turn(stand: Stand) -> tuple[int, int, str]:
@@ -54,14 +56,16 @@ def is_far_ahead(life: int, known: int) -> bool:
 
 @dataclass(slots=True)
 class _Host:
-    """What was heard of a host: its newest standing of its newest life; when any came of any of its lives.
+    """What was heard of a host.
 
-    told  what was granted to it last, and when
+    standing  the newest of its newest life, and when it came; None if none counts
+    spoke_ns  when anything came, of any of its lives: one that is replaced is told so
+    told      what was granted to it last, and when
     """
 
-    standing: Standing
-    heard_ns: int
     spoke_ns: int
+    standing: Standing | None = None
+    heard_ns: int = 0
     told: object = None
     told_ns: int = 0
 
@@ -106,8 +110,8 @@ class Warden:
 
     def hear(self, standing: Standing, now_ns: int) -> None:
         host = standing.agent
-        if host in self._hosts:
-            self._hosts[host].spoke_ns = now_ns
+        known = self._hosts.setdefault(host, _Host(now_ns))
+        known.spoke_ns = now_ns
         for dead in standing.dead:
             if self._shut.pop((host, dead), None) is not None:
                 self._granted = True
@@ -123,16 +127,12 @@ class Warden:
         if standing.life != life:
             self._succeed(host, life)
         self._lives[host] = (standing.life, standing.seq)
-        if not standing.vehicles and (host not in self._hosts or self._hosts[host].standing.vehicles):
+        if not standing.vehicles and (known.standing is None or known.standing.vehicles):
             self._changed = True  # it leaves the plot as soon as a table counts this
         holds = {stand.vehicle: stand.holds for stand in standing.vehicles}
         for vehicle in self._granted_to(host):
             self._free(vehicle, holds.get(vehicle, []), standing.knows)
-        known = self._hosts.get(host)
-        if known is None:
-            self._hosts[host] = _Host(standing, now_ns, now_ns)
-        else:
-            known.standing, known.heard_ns = standing, now_ns
+        known.standing, known.heard_ns = standing, now_ns
 
     def _granted_to(self, host: str) -> list[str]:
         """The vehicles of a host that are granted cells."""
@@ -159,7 +159,7 @@ class Warden:
             self._shut[host, before] = [cell for vehicle in mine for cell in self._grants[vehicle][0]]
         for vehicle in mine:
             self._grants[vehicle] = (self._grants[vehicle][0], self._next_stamp)
-        self._hosts.pop(host, None)
+        self._hosts[host].standing = self._hosts[host].told = None
         self._granted = True
 
     def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
@@ -221,11 +221,11 @@ class Warden:
             life, heard = table.hosts.get(name, (0, 0))
             grants = by_host[name]
             # Also around those under way: what they want once they come to rest depends on who is there.
-            near = {stand.end + step for stand in host.standing.vehicles for step in self._steps}
+            stands = () if host.standing is None else host.standing.vehicles
+            near = {stand.end + step for stand in stands for step in self._steps}
             occupied = sorted(cell for cell in near & holders.keys() if holders[cell] not in grants)
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
-            leaves = not host.standing.vehicles
-            says = (life, grants, pushed, occupied, heard if leaves else 0)
+            says = (life, grants, pushed, occupied, 0 if stands else heard)
             if says == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
                 continue
             host.told, host.told_ns = says, now_ns
@@ -281,7 +281,7 @@ class Warden:
         stands = [
             stand
             for name, host in self._hosts.items()
-            if now_ns - host.heard_ns <= SILENT_NS
+            if host.standing is not None and now_ns - host.heard_ns <= SILENT_NS
             for stand in host.standing.vehicles
             if stand.vehicle in self._fleets.get(name, ())
         ]

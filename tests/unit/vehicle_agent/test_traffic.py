@@ -15,6 +15,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
+from swarm.wire.topics import STANDING
 from vehicle_agent.traffic.holdings import Holdings, Tell, Wish
 from vehicle_agent.traffic.member import Member, Refused, Save
 from vehicle_agent.traffic.pibt import Mover, Round
@@ -127,6 +128,40 @@ def test_what_an_older_life_may_stand_on_stays_shut_until_it_has_stopped_or_is_p
         assert table.grants["a1-00"].cells == [9, 10]
         warden.hear(end, 0)
         assert all(shut.life != 1 for shut in warden.tick(S).shut)  # type: ignore[union-attr]
+
+
+def test_an_older_life_is_told_that_it_is_replaced_by_a_warden_that_never_heard_the_younger() -> None:
+    """The younger has died, and the warden knows of it by the table only."""
+    table = table_of(1, 1, a1=[9])
+    table.hosts["a1"] = (2 << 32, 7)
+    warden = Warden(PLOTS, "a0", 3, table, {"a1": ["a1-00"]})
+    for late in (standing("a1", [9], seq=50), standing("a1", [9], seq=51, ended=True)):
+        warden.hear(late, S)
+        told = warden.tick(S)
+        (granted,) = warden.granted(table if told is None else told, S)
+        assert (granted.host, granted.life) == ("a1", 2 << 32)
+        warden = Warden(PLOTS, "a0", 3, table, {"a1": ["a1-00"]})
+    older = Holdings(PLOTS, "a1", ["a1-00"])
+    older.begin(1, [])
+    older.watch([0])
+    older.hear_granted(granted, lambda vehicle, cells: cells[0], S)
+    assert older.replaced
+
+
+def test_no_word_of_one_life_hides_that_of_another() -> None:
+    """Both are heard under one key; what says that an older one has ended is said by no other."""
+    assert not STANDING.newest
+
+
+def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
+    holdings = holdings_of()
+    far = 3 * ((1 << 40) + 1)
+    for lie in (table_of(far, 1, a0=[9]), table_of(1, 1 << 40, a0=[9])):
+        hear(holdings, lie, S)
+        assert "implausibly far ahead" in holdings.refused.pop()
+        assert holdings.heard_ns(0) == 0
+    hear(holdings, table_of(1, 1, a0=[9]), 2 * S)
+    assert (list(holdings.path("a0-00")), holdings.heard_ns(0)) == ([9], 2 * S)
 
 
 def test_a_life_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
