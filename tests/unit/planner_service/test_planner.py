@@ -66,7 +66,7 @@ def test_a_tracker_whose_clock_was_put_back_is_followed_after_the_lease(ready: W
 
 def test_no_single_pose_misleads_a_planner_for_longer_than_the_lease(ready: World) -> None:
     ready.pose(1, 1, seq=(1 << 62) - 1, incarnation=(1 << 62) - 1)
-    for seq in range(2, 14):
+    for seq in range(2, 26):  # at ten a second, longer than the silence that ends a lie
         ready.pose(10, 20, seq=seq)
         ready.tick()
     assert ready.tree.target_cell == GRID.cell(10, 20)
