@@ -15,6 +15,8 @@ TILE_CELLS = 32
 """Side of a tile, in cells. The marks of one author on one tile travel as one message."""
 REGION_TILES = 8
 """Side of a region, in tiles. Processes subscribe to positions and marks by region."""
+REGION_CELLS = REGION_TILES * TILE_CELLS
+"""Side of a region, in cells."""
 
 MAX_CELLS = 16384 * 16384
 """A larger grid is refused wherever one comes from outside."""

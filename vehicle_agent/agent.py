@@ -129,7 +129,6 @@ class Agent:
             cell = self.holdings.path(id)[0]
             self.vehicles[id] = Vehicle(id, self._map.grid, cell)
             self._look_from[cell] = None
-            self._wished.pop(id, None)
             self._unassigned = True
 
     def stand_down(self) -> None:

@@ -19,10 +19,9 @@ from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import Terrain, finished
 from swarm.config.scenario import CostConfig
 from swarm.errors import ProtocolError, TerrainError
-from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec, Window
+from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap, BaseMapTile
 
-REGION_CELLS = REGION_TILES * TILE_CELLS
 _LEVEL = 1  # a third smaller than the raw bytes as with level 6, in half the time
 
 

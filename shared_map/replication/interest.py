@@ -10,7 +10,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
+from swarm.grid import REGION_CELLS, GridSpec
 
 
 class Interest:
@@ -29,7 +29,7 @@ class Interest:
         grid: GridSpec,
         enter_cells: int,
         leave_cells: int | None = None,
-        square_cells: int = REGION_TILES * TILE_CELLS,
+        square_cells: int = REGION_CELLS,
     ) -> None:
         self._grid = grid
         self._side = square_cells

@@ -19,10 +19,7 @@ def waiting_in(channel: Any) -> list[Any]:
     `try_recv` keeps the interpreter's lock, `recv` releases it: taking it back for each item costs hundreds of
     times more while another thread is busy.
     """
-    items = [channel.recv()]
-    while len(items) < MOST_TOGETHER and (item := channel.try_recv()) is not None:
-        items.append(item)
-    return items
+    return [channel.recv(), *taken_from(channel, MOST_TOGETHER - 1)]
 
 
 def taken_from(channel: Any, most: int) -> list[Any]:

@@ -3,14 +3,13 @@ inbox."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import queue
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Protocol
 
 from swarm.bus.bus import Event, Post, WorkDone
@@ -20,7 +19,6 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.stats import Counters
 
 log = logging.getLogger(__name__)
-
 
 _WORKER_NICE = 5
 """By how much less urgent jobs of a worker are than their process."""
@@ -77,7 +75,7 @@ class ThreadWorker:
     def _work(self) -> None:
         # Where the processor is short, whoever has to answer or drive in time goes first.
         thread = threading.get_native_id()
-        with contextlib.suppress(OSError):  # not every system gives threads a priority of their own
+        with suppress(OSError):  # not every system gives threads a priority of their own
             nice = os.getpriority(os.PRIO_PROCESS, thread) + _WORKER_NICE
             os.setpriority(os.PRIO_PROCESS, thread, min(nice, 19))
         while (run := self._jobs.get()) is not None and not self._closed:

@@ -7,10 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
+from swarm.grid import REGION_CELLS, GridSpec
 from vehicle_agent.driving.vehicle import Vehicle
-
-_SIDE = TILE_CELLS * REGION_TILES
 
 
 class Places:
@@ -35,7 +33,7 @@ class Places:
         self.east_m: NDArray[np.float64] = (_between(cols, share) + 0.5) * grid.resolution_m
         self.south_m: NDArray[np.float64] = (_between(rows, share) + 0.5) * grid.resolution_m
         self.heading_rad: NDArray[np.float64] = np.array([motion.heading_rad for motion in motions], np.float64)
-        self.regions: NDArray[np.int64] = row // _SIDE * grid.region_cols + col // _SIDE
+        self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS
 
 
 def _between(ends: NDArray[np.int64], share: NDArray[np.float64]) -> NDArray[np.float64]:

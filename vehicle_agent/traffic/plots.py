@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from hashlib import blake2s
 
-from swarm.grid import REGION_TILES, TILE_CELLS, GridSpec
+from swarm.grid import REGION_CELLS, GridSpec
 
-PLOT_CELLS = REGION_TILES * TILE_CELLS
+PLOT_CELLS = REGION_CELLS
 """Side of a plot: that of a region. Messages go by plot, so that smaller ones cost more of them."""
 _MEMBERS = 3
 
