@@ -149,7 +149,7 @@ def _crs_name(grid: GridSpec) -> str:
         return grid.crs
     import rasterio
 
-    from shared_map.terrain.importers.rasters import crs_name
+    from shared_map.terrain.importers.georeference import crs_name
 
     return crs_name(rasterio.CRS.from_user_input(grid.crs))
 
