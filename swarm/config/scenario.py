@@ -88,8 +88,8 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     height_scale   metres per unit of height, where the file does not say it (.png)
     nodata         voids are lethal, or filled from their surroundings
     nodata_values  heights, as they are stored in the source, that stand for no height beside those that it declares
-    level_is       what level ground of a file is taken for where no photo shows it: elevation models are levelled on
-                   lakes and the sea
+    level_is       what level ground of a file is taken for where no photo shows it: elevation models are levelled
+                   on lakes and the sea
     water_below_m  ground of a file lower than this is water where no photo shows it; 0 for a coast
     roads          how many roads to lay between seeded places, as there is no map of them
     rows           synthetic: cells from north to south

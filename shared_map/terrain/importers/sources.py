@@ -281,6 +281,11 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
 FILE_KINDS = ", ".join(_READERS)
 
 
+def is_terrain(path: Path) -> bool:
+    """Whether a file is named as one that holds a terrain."""
+    return path.suffix.lower() in _READERS
+
+
 # --- onto the grid ------------------------------------------------------------------------------------------
 
 
