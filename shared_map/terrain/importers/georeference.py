@@ -17,6 +17,9 @@ from swarm.grid import MAX_CELLS, GridSpec
 _SHOWN = ("lat_0", "lat_ts", "lon_0", "zone")
 MAX_SPAN_DEG = 12.0
 """Beyond this, a local projection stretches by more than half a percent at its borders."""
+MOST_STRETCH = 0.02
+"""Mercator's metres, and those of maps in equal degrees, are true on one line only."""
+_EARTH_M = 6_371_000.0
 HIGHEST_DEG = 85.0
 """Degrees nearer to a pole than this are not put on metres."""
 
@@ -52,23 +55,80 @@ def crs_of(found: Any, given: str | None, what: str) -> Any:
 
 
 def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) -> Any:
-    """The same system if its unit is a true metre, else a local one: equidistant cylindrical while its scale is
-    right within 1 % (no voids at the corners), transverse Mercator beyond.
+    """The same system if its metres are true within `MOST_STRETCH`, else a local one: equidistant cylindrical while
+    its scale is right within 1 % (no voids at the corners), transverse Mercator beyond.
 
     `lon_deg`, `lat_deg` are the middle of the terrain; `lat_span_deg` is its extent from south to north.
     """
     import rasterio
 
-    if crs.is_projected and crs.to_dict().get("proj", "") not in ("merc", "webmerc"):
+    if is_local(crs):
+        return crs
+    local = rasterio.CRS.from_proj4(
+        f"+proj=tmerc +lat_0={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
+    )
+    if crs.is_projected and abs(_scale(crs, local) - 1.0) < MOST_STRETCH:
         _, metres = crs.linear_units_factor
         if abs(metres - 1.0) < 1e-9:
             return crs
     stretch = math.radians(lat_span_deg / 2) * abs(math.tan(math.radians(lat_deg)))
     if crs.is_geographic and stretch < 0.01:
-        text = f"+proj=eqc +lat_ts={lat_deg:.6f} +lon_0={lon_deg:.6f} +datum=WGS84 +units=m +no_defs"
-    else:
-        text = f"+proj=tmerc +lat_0={lat_deg:.6f} +lon_0={lon_deg:.6f} +datum=WGS84 +units=m +no_defs"
-    return rasterio.CRS.from_proj4(text)
+        text = f"+proj=eqc +lat_ts={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
+        return rasterio.CRS.from_proj4(text)
+    return local
+
+
+def _scale(crs: Any, local: Any) -> float:
+    """What a true metre is in a system, in the direction in which it is furthest from one.
+
+    local  a system that is true around its origin
+    """
+    from rasterio.warp import transform as to_crs
+
+    xs, ys = to_crs(local, crs, [0.0, 1000.0, 0.0], [0.0, 0.0, 1000.0])
+    sides = [math.hypot(xs[n] - xs[0], ys[n] - ys[0]) / 1000.0 for n in (1, 2)]
+    return max(sides, key=lambda side: abs(math.log(side)) if 0 < side < math.inf else math.inf)
+
+
+def is_local(crs: Any) -> bool:
+    """Whether a system is metres from anywhere, as surveys of sites and arenas use."""
+    if crs.is_geographic or crs.is_projected:
+        return False
+    known = crs.to_dict(projjson=True)
+    axes = known.get("coordinate_system", {}).get("axis", [])
+    return (
+        known.get("type") == "EngineeringCRS" and bool(axes) and all(axis.get("unit") == "metre" for axis in axes)
+    )
+
+
+def _shape_of(crs: Any) -> str:
+    """The body that a system lies on, for PROJ: the Earth, or the ellipsoid of another planet or moon."""
+    ellipsoid = _ellipsoid_of(crs.to_dict(projjson=True)) or {}
+    radius_m = _metres(ellipsoid.get("radius", ellipsoid.get("semi_major_axis")))
+    if radius_m is None or abs(radius_m - _EARTH_M) < 0.01 * _EARTH_M:
+        return "+datum=WGS84"
+    polar_m = _metres(ellipsoid.get("semi_minor_axis"))
+    flat = ellipsoid.get("inverse_flattening", 0.0)
+    if polar_m is None:
+        polar_m = radius_m * (1 - 1 / flat) if flat else radius_m
+    return f"+a={radius_m!r} +b={polar_m!r}"
+
+
+def _ellipsoid_of(node: Any) -> Any:
+    """The first ellipsoid in PROJ's description of a system."""
+    children = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    if isinstance(node, dict) and "ellipsoid" in node:
+        return node["ellipsoid"]
+    return next((found for child in children if (found := _ellipsoid_of(child)) is not None), None)
+
+
+def _metres(value: Any) -> float | None:
+    """A length of PROJ's: a number, or a number with a unit that is no metre."""
+    if isinstance(value, dict):
+        unit = value.get("unit")
+        factor = unit.get("conversion_factor", 1.0) if isinstance(unit, dict) else 1.0
+        return float(value["value"]) * float(factor)
+    return None if value is None else float(value)
 
 
 def crs_name(crs: Any) -> str:
@@ -156,12 +216,12 @@ def plan_grid(
         raise TerrainError(
             f"{what} has pixels without a size ({tuple(transform)[:6]}); its georeference is damaged"
         )
-    if not crs.is_geographic and not crs.is_projected:
+    if not crs.is_geographic and not crs.is_projected and not is_local(crs):
         raise TerrainError(
             f"{what} is in a coordinate system without metres or degrees ({crs_name(crs)});"
             " reproject it (gdalwarp -t_srs EPSG:...) or set terrain.crs"
         )
-    degrees = rasterio.CRS.from_epsg(4326)
+    degrees = crs if is_local(crs) else rasterio.CRS.from_proj4(f"+proj=longlat {_shape_of(crs)} +no_defs")
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees, what)
     if crs.is_geographic and not -90.000001 <= south <= north <= 90.000001:
         raise TerrainError(f"{what} reaches from latitude {south:.4g} to {north:.4g}; its georeference is damaged")
@@ -184,10 +244,11 @@ def plan_grid(
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
     if not north_up:
         notes.append("the file is rotated or upside down; resampled north-up, so that its corners may be voids")
-    square = abs(width - height) < 1e-6 * width
-    if target == crs and north_up and square and (resolution_m is None or abs(resolution_m - width) < 1e-6 * width):
+    # Where no cell would move by more than half of one, a resampling would only blur.
+    off = max(abs((resolution_m or width) - width), abs((resolution_m or width) - height)) * max(rows, cols)
+    if target == crs and north_up and off <= width / 2:
         check_size(rows, cols, what)
-        grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), crs.to_string())
+        grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))
         return grid, None, notes
     resolution = resolution_m or float(f"{math.sqrt(width * height):.4g}")
     west, south, east, north = bounds_in(transform, rows, cols, crs, target, what)
@@ -198,7 +259,11 @@ def plan_grid(
         )
     check_size(high, wide, what)
     notes.append(f"resampled to {high} x {wide} cells of {resolution:g} m in {crs_name(target)}")
-    return GridSpec(high, wide, resolution, west, north, target.to_string()), target, notes
+    return GridSpec(high, wide, resolution, west, north, _system(target)), target, notes
+
+
+def _system(crs: Any) -> str:
+    return "local" if is_local(crs) else str(crs.to_string())
 
 
 def check_size(rows: int, cols: int, what: str) -> None:

@@ -44,7 +44,17 @@ _MAX_PIXELS = 16 * MAX_CELLS
 _MAX_BLOCK_BYTES = 512 << 20
 """A block is what has to be unpacked at once."""
 _MAX_BANDS = 256
-_FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937, "ftus": 1200 / 3937}
+_LONGEST_REASON = 200
+_UNITS_M = {
+    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
+    **dict.fromkeys(("us survey foot", "us-ft", "ftus", "ft us"), 1200 / 3937),
+    **dict.fromkeys(("dm", "decimetre", "decimeter"), 0.1),
+    **dict.fromkeys(("cm", "centimetre", "centimeter", "centimetres", "centimeters"), 0.01),
+    **dict.fromkeys(("mm", "millimetre", "millimeter"), 0.001),
+    **dict.fromkeys(("km", "kilometre", "kilometer"), 1000.0),
+    **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
+}
+"""What a file may call the unit of its heights, in metres."""
 _READ_ROWS = 512
 _MOST_SAMPLED = 1 << 24
 """Cells of a file in which voids and level ground are looked for."""
@@ -95,7 +105,7 @@ def opened(path: Path, what: str) -> Iterator[Any]:
                 _check_length(path, dataset, what)
                 yield dataset
     except (RasterioError, CPLE_BaseError) as error:
-        reason = str(error.__cause__ or error).strip().splitlines()[0]
+        reason = str(error.__cause__ or error).strip().splitlines()[0][:_LONGEST_REASON]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
     except OSError as error:
         raise TerrainError(f"cannot read {what} {path}: {error.strerror or error}") from error
@@ -181,9 +191,20 @@ def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_pr
                 f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied"
             )
         unit = (dataset.units[0] or "").lower()
-        if unit in _FEET:
-            factor, offset = factor * _FEET[unit], offset * _FEET[unit]
-            notes.append("heights are in feet, put into metres")
+        unit_m = _UNITS_M.get(unit, 1.0)
+        if unit_m != 1.0:
+            factor, offset = factor * unit_m, offset * unit_m
+            notes.append(f"heights are in {unit}, put into metres")
+        elif unit not in _UNITS_M and config.height_scale is None:
+            notes.append(
+                f"heights are in {unit[:40]!r}, which is unknown, and taken for metres: terrain.height_scale"
+            )
+        elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
+            name, metres = crs.linear_units_factor
+            notes.append(
+                f"distances are in {name}, and heights, of which the file says nothing, are taken for metres; if"
+                f" they are not, terrain.height_scale = {metres:.6g}"
+            )
         if config.height_scale is not None:
             factor, offset = factor * config.height_scale, offset * config.height_scale
         if dataset.count == 2:

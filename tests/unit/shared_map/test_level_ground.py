@@ -179,3 +179,58 @@ def test_a_text_grid_is_looked_at_alike(tmp_path: Path) -> None:
     source = load(tmp_path / "a.asc", resolution_m=30.0)
     assert np.isnan(source.elevation_m[0]).all()
     assert is_water(source).mean() == pytest.approx((ground == 0).mean(), abs=0.03)
+
+
+# --- what else must not be silently wrong -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("system", "step"),
+    [
+        ("+proj=longlat +R=1737400 +no_defs", 0.01),
+        ("+proj=stere +lat_0=-90 +lon_0=0 +R=3376200 +units=m +no_defs", 300.0),
+        ("IAU_2015:30100", 0.01),
+    ],
+)
+def test_other_planets_have_metres_of_their_own(tmp_path: Path, system: str, step: float) -> None:
+    from rasterio.transform import from_origin
+
+    path = written(tmp_path / "moon.tif", hills(1, 500), crs=system, transform=from_origin(0, 1, step, step))
+    source = load(path)
+    expected_m = step if step > 1 else step * np.pi / 180 * 1_737_400
+    assert source.grid.resolution_m == pytest.approx(expected_m, rel=0.02)
+    assert not np.isnan(source.elevation_m).any()
+
+
+def test_a_local_system_in_metres_is_as_good_as_any(tmp_path: Path) -> None:
+    source = load(written(tmp_path / "site.tif", hills(1, 50), crs='LOCAL_CS["site",UNIT["metre",1]]'))
+    assert (source.grid.crs, source.grid.resolution_m) == ("local", 20.0)
+
+
+def test_a_map_whose_metres_are_not_true_is_put_on_true_ones(tmp_path: Path) -> None:
+    from rasterio.transform import from_origin
+
+    place = from_origin(0, 6_700_000, 100, 100)  # latitude 60: a metre of the map to the east is half a true one
+    system = "+proj=eqc +lat_ts=0 +lon_0=0 +datum=WGS84 +units=m"
+    source = load(written(tmp_path / "a.tif", hills(1, 500), crs=system, transform=place))
+    assert source.grid.cols * source.grid.resolution_m == pytest.approx(SIDE * 50, rel=0.03)
+
+
+def test_pixels_that_are_square_but_for_a_rounding_are_not_resampled(tmp_path: Path) -> None:
+    from rasterio.transform import Affine
+
+    ground = hills(2, 500)
+    place = Affine(20, 0, 500_000, 0, -20.00001, 5_000_000)
+    source = load(written(tmp_path / "a.tif", ground, transform=place))
+    np.testing.assert_array_equal(source.elevation_m, ground)
+
+
+def test_heights_in_centimetres_and_what_a_map_in_feet_does_not_say(tmp_path: Path) -> None:
+    import rasterio
+
+    path = written(tmp_path / "cm.tif", hills(2, 500) * 100)
+    with rasterio.open(path, "r+") as file:
+        file.units = ("cm",)
+    assert load(path).elevation_m.max() == pytest.approx(500, rel=1e-3)
+    notes = load(written(tmp_path / "ft.tif", hills(2, 500), crs="EPSG:2264")).notes
+    assert any("terrain.height_scale = 0.3048" in note for note in notes)
