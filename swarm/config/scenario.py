@@ -79,8 +79,8 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Where elevation and photo come from.
 
-    source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .hgt, .vrt, .asc, .npz, .png, .map
-                   (MovingAI), .yaml or .yml (ROS)
+    source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2,
+                   .nc, .vrt, one of these in a .zip, .asc, .npz, .png, .map (MovingAI), .yaml or .yml (ROS)
     photo          a colour GeoTIFF on the same ground, or nothing
     labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
     resolution_m   cell size to bring everything to; the source's own if not given
