@@ -384,10 +384,9 @@ def quantiles(histogram: Histogram) -> dict[str, float | None]:
 def _expected(scenario: Scenario) -> list[tuple[str, str]]:
     """(role, id) of the processes that a complete run has; "" stands for any id."""
     targets = scenario.target_ids
-    driven = any(target.is_simulated for target in scenario.targets)
     return [
         ("keeper", ""),
-        *([("targets", "")] if driven else []),
+        ("targets", ""),
         *(("planner", ranked_id(id, rank)) for rank in range(scenario.standbys.planner + 1) for id in targets),
         *(("agent", plan.id) for plan in plan_agents(scenario)),
     ]
