@@ -25,7 +25,7 @@ _MOST_NAMED = 256
 class TargetWatch:
     """What a planner knows of where its target is.
 
-    Each oddity of a tracker is counted every time, and told once in its life: one sentence for people.
+    Each oddity of a tracker is counted every time, and told once: one sentence for people.
 
     time_scale  seconds on the terrain per second
 
@@ -44,8 +44,10 @@ class TargetWatch:
         self._handed_over = False
         self._tracker = ""
         """The name of the last owner, in words; empty before the first."""
-        self._refused: dict[tuple[str | None, int], int] = {}
-        self._named: set[tuple[str, str | None, int]] = set()
+        self._refused: dict[str | int, int] = {}
+        """Tracker, or incarnation of one without a name -> its poses that were refused."""
+        self._named: set[tuple[str, str | int]] = set()
+        """(kind of oddity, tracker), told before."""
         self._to_tell: list[Tell] = []
         for name in COUNTS:
             counters.count(name, 0)
@@ -119,15 +121,15 @@ class TargetWatch:
             why = f"{self._tracker} has handed it over, and nobody else tracks it"
         else:
             why = f"{self._tracker} has been silent for longer than its lease of {pose.lease_s:g} s"
-        self._tell("tracker-lost", f"{why}; routes lead to where it was last", pose.cell)
+        self._tell("tracker-lost", f"{why}; routes lead to where it was", pose.cell)
 
     def _refuse(self, pose: TargetPose) -> None:
         self._count("poses_refused")
-        life, owner = (pose.tracker, pose.incarnation), self._tracking.pose
-        if life not in self._refused and len(self._refused) >= _MOST_NAMED:
+        tracker, owner = _key(pose), self._tracking.pose
+        if tracker not in self._refused and len(self._refused) >= _MOST_NAMED:
             return
-        self._refused[life] = self._refused.get(life, 0) + 1
-        if self._refused[life] < _REFUSED_OFTEN or owner is None:
+        self._refused[tracker] = self._refused.get(tracker, 0) + 1
+        if self._refused[tracker] < _REFUSED_OFTEN or owner is None:
             return
         if pose.tracker is not None and pose.tracker == owner.tracker:
             why = f"two trackers call themselves {pose.tracker}; only that of the later incarnation counts"
@@ -159,13 +161,17 @@ class TargetWatch:
             self._counters.count(name)
 
     def _name_once(self, kind: str, pose: TargetPose, text: str, cell: int | None = None) -> None:
-        told = (kind, pose.tracker, pose.incarnation)
+        told = (kind, _key(pose))
         if told not in self._named and len(self._named) < _MOST_NAMED:
             self._named.add(told)
             self._tell(kind, text, cell)
 
     def _tell(self, kind: str, text: str, cell: int | None = None) -> None:
         self._to_tell.append(Tell(kind, f"target {self.target}: {text}", cell))
+
+
+def _key(pose: TargetPose) -> str | int:
+    return pose.incarnation if pose.tracker is None else pose.tracker
 
 
 def _name(pose: TargetPose) -> str:
