@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
-from planner_service.actions import Action, FindCorridors, GrowTree, Refusal
+from planner_service.actions import Action, FindCorridors, GrowTree, Refusal, Tell
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
@@ -85,6 +85,7 @@ class PlannerService:
             newest_mark_ns=self._replica.take_newest_stamp_ns,
             shelf=prepared,
             leads=False,
+            time_scale=scenario.time_scale,
         )
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
@@ -114,12 +115,12 @@ class PlannerService:
             case Heard(message=Sighted() as sighted):
                 if self._sightings.hear(sighted, now_ns):
                     for seen in self._sightings.best(now_ns).values():
-                        self._planner.set_pose(pose_of(seen))
+                        self._planner.set_pose(pose_of(seen), now_ns)
             case Asked(request=RouteRequest() | CostRequest()):
                 self._held.append((now_ns, event))
                 self._answer(now_ns)
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag == _GROW:
-                self._perform(self._planner.adopt(grown, took_ns, now_ns))
+                self._perform(self._planner.adopt(grown, took_ns, now_ns), now_ns)
                 self._answer(now_ns)
             case WorkDone(tag=tag, result=CorridorSearch() as search) if tag == _SEARCH:
                 self._searching = False
@@ -139,7 +140,7 @@ class PlannerService:
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)
-        self._perform(self._planner.tick(now_ns))
+        self._perform(self._planner.tick(now_ns), now_ns)
         self._answer(now_ns)
         if self._search is not None and not self._searching:
             self._searching = True
@@ -188,7 +189,7 @@ class PlannerService:
                 self._bus.unserve(topic, target=self._target)
         self._candidacy.tell(self._member, now_ns)
 
-    def _perform(self, actions: list[Action]) -> None:
+    def _perform(self, actions: list[Action], now_ns: int) -> None:
         for action in actions:
             match action:
                 case GrowTree(job):
@@ -199,3 +200,6 @@ class PlannerService:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
                 case PlannerStatus() as status:
                     self._bus.publish(STATUS, status, target=self._target)
+                case Tell(kind, text, cell):
+                    log.info("%s: %s", kind, text)
+                    self._member.note(now_ns, kind, text, cell)

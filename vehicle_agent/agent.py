@@ -17,7 +17,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec, Window, walk
-from swarm.liveness import POSE_SILENCE_NS, Newest
+from swarm.runtime.tracking import Trackings, Verdict
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
@@ -105,7 +105,7 @@ class Agent:
         self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
-        self._newest_poses = Newest(silence_ns=POSE_SILENCE_NS)
+        self._trackings = Trackings(local_map.grid.cells)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
@@ -232,7 +232,10 @@ class Agent:
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0
+        lost = self._trackings.lost(now_ns)
         for vehicle in self.vehicles.values():
+            if vehicle.tracked == (vehicle.target in lost):
+                vehicle.set_tracked(not vehicle.tracked)
             self._check_reach(vehicle)
             path = self.holdings.path(vehicle.id)
             ask = vehicle.route_request(now_ns, path[-1])
@@ -289,16 +292,20 @@ class Agent:
 
     # --- what is heard --------------------------------------------------------------------------------------
 
-    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Where the tracker of a target says it is. Poses off the grid, and those that are no news, are ignored."""
-        inside = 0 <= pose.cell < self._map.grid.cells
-        if inside and self._newest_poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
-            self.set_pose(pose, now_ns)
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> bool:
+        """Where a tracker of a target says it is; False unless the pose counts."""
+        counts = self._trackings.hear(pose, now_ns) is Verdict.COUNTS
+        if counts:
+            self._moved(pose, now_ns)
+        return counts
 
-    def set_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Where a target is, by its tracker or by the best sighting of it. A pose outside the grid is ignored."""
-        if not 0 <= pose.cell < self._map.grid.cells:
-            return
+    def see_target(self, pose: TargetPose, now_ns: int) -> None:
+        """Where a target without a tracker is, by the best sighting of it. A pose outside the grid is ignored."""
+        if 0 <= pose.cell < self._map.grid.cells:
+            self._trackings.place(pose, now_ns)
+            self._moved(pose, now_ns)
+
+    def _moved(self, pose: TargetPose, now_ns: int) -> None:
         known = self._poses.get(pose.target)
         self._poses[pose.target] = pose
         if known is not None and pose.jumps != known.jumps:

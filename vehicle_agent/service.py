@@ -227,14 +227,15 @@ class AgentService:
     def _hear_pose(self, heard: Heard, now_ns: int) -> None:
         pose = heard.message
         assert isinstance(pose, TargetPose)
-        self._detector.set_truth(pose, now_ns)
-        if heard.topic is POSE and pose.target not in self._untracked.targets:
-            self._agent.hear_pose(pose, now_ns)
+        # A tracker's pose is the truth for the simulated sensor of targets only if it counts.
+        tracked = pose.target not in self._untracked.targets
+        if heard.topic is TRUE_POSE or (tracked and self._agent.hear_pose(pose, now_ns)):
+            self._detector.set_truth(pose, now_ns)
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
         pose = self._untracked.hear(sighted, now_ns)
         if pose is not None:
-            self._agent.set_pose(pose, now_ns)
+            self._agent.see_target(pose, now_ns)
 
     def _planners(self) -> dict[str, int]:
         """Target -> incarnation of its living planner, or of the first of its standbys that lives."""

@@ -295,9 +295,11 @@ class _Run:
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 began_s = now_s
-                self._terminal.say(
-                    f"all processes are alive and routes are served, {self._startup_s:.1f} s after launch"
-                )
+                if watcher.routes_served or not self._all_external:
+                    so_far = "all processes are alive and routes are served"
+                else:
+                    so_far = "all processes are alive, and targets wait for their trackers"
+                self._terminal.say(f"{so_far}, {self._startup_s:.1f} s after launch")
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
             if now_s - began_s >= limit_s:
@@ -308,7 +310,12 @@ class _Run:
         if self._missing(watcher):
             return False
         planners = "planner" in self._options.roles
-        return not planners or watcher.routes_served
+        return not planners or watcher.routes_served or self._all_external
+
+    @property
+    def _all_external(self) -> bool:
+        """Whether no route is served before a tracker from outside tells where its target is."""
+        return not any(target.is_simulated for target in self._scenario.targets)
 
     def _missing(self, watcher: Watcher) -> list[str]:
         specs = [running.spec for running in self._swarm.running]

@@ -20,7 +20,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
-from swarm.liveness import POSE_SILENCE_NS, Newest
+from swarm.runtime.tracking import Trackings, Verdict
 from swarm.wire.fields import column
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
@@ -33,6 +33,8 @@ PATIENCE_NS = 5 * NS_PER_S
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
+TRACKER = "targets"
+"""The name under which this process and its standbys tell poses: a later life takes over at once."""
 _MOST_COUNTED = 1 << 32
 """Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
 
@@ -95,8 +97,8 @@ class TargetWorld:
         self._terrain = TrueTerrain(terrain.grid, pace)
         self._referee = Referee(truth_s_per_m)
         self._own_incarnation = self._incarnation = incarnation
-        # Of the poses of simulated targets that others tell: which are news, and the highest incarnation.
-        self._poses = Newest(silence_ns=POSE_SILENCE_NS)
+        # Who tracks external targets, and for a standby who leads; and the highest incarnation of a leader.
+        self._trackings = Trackings(terrain.grid.cells)
         self._others_incarnation = 0
         self._capture_range_m = scenario.vehicles.capture_range_m
         self._time_scale = scenario.time_scale
@@ -160,12 +162,12 @@ class TargetWorld:
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Takes the pose of an external target; as a standby also where whoever leads has moved one of ours."""
         target = self._targets.get(pose.target)
-        if target is None or not 0 <= pose.cell < self._grid.cells:
+        if target is None or (target.config.is_simulated and self.leads):
+            return
+        if self._trackings.hear(pose, now_ns) is not Verdict.COUNTS:
             return
         if target.config.is_simulated:
-            number = (pose.incarnation, pose.seq)
-            lethal = self._terrain.lethal(pose.cell)
-            if self.leads or lethal or not self._poses.is_news(pose.target, number, now_ns):
+            if self._terrain.lethal(pose.cell):
                 return
             self._others_incarnation = max(self._others_incarnation, pose.incarnation)
             if pose.captures > target.captures:
@@ -181,7 +183,7 @@ class TargetWorld:
         actions: list[Action] = list(self._referee.hear(fleet))
         if not self.leads:
             return []
-        for index, vehicle in self._catchers(fleet):
+        for index, vehicle in self._catchers(fleet, now_ns):
             id = fleet.target_ids[index]
             actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
         return actions
@@ -213,6 +215,7 @@ class TargetWorld:
         target.seq += 1
         return TargetPose(
             target=id,
+            tracker=TRACKER,
             incarnation=self._incarnation,
             seq=target.seq,
             stamp_ns=now_ns,
@@ -223,8 +226,9 @@ class TargetWorld:
             jumps=target.jumps,
         )
 
-    def _catchers(self, fleet: Fleet) -> list[tuple[int, str]]:
-        """(target's index, first vehicle within reach of it) of the targets that a report says are chased.
+    def _catchers(self, fleet: Fleet, now_ns: int) -> list[tuple[int, str]]:
+        """(target's index, first vehicle within reach of it) of the targets that a report says are chased. A target
+        whose tracker is lost may be anywhere: nobody captures it.
 
         A vehicle that says ARRIVED is believed at twice the range: it compares cells, and the target may have moved
         on since it looked.
@@ -234,8 +238,8 @@ class TargetWorld:
         if not len(chasing):
             return []
         chased = chased[chasing]
-        # inf for targets of others and those which are not placed yet: no vehicle is near.
-        known = [self._targets.get(id) for id in fleet.target_ids]
+        # inf for targets of others, those which are not placed yet and lost ones: no vehicle is near.
+        known = [None if self._lost(id, now_ns) else self._targets.get(id) for id in fleet.target_ids]
         places = [(t.x_m, t.y_m) if t is not None and t.placed else (math.inf, math.inf) for t in known]
         x_m, y_m = np.array(places).T
         east_m = column(fleet.east_m, "<f4")[chasing] - (x_m[chased] - self._grid.west_m)
@@ -248,6 +252,11 @@ class TargetWorld:
         for index, vehicle in zip(chased[near].tolist(), chasing[near].tolist(), strict=True):
             caught.setdefault(index, fleet.ids[vehicle])
         return list(caught.items())
+
+    def _lost(self, id: str, now_ns: int) -> bool:
+        target, tracking = self._targets.get(id), self._trackings.of(id)
+        simulated = target is not None and target.config.is_simulated
+        return not simulated and tracking is not None and tracking.lost(now_ns)
 
     def _reached(self, id: str, target: _Target, vehicle: str, now_ns: int) -> list[Action]:
         calm = now_ns >= target.calm_until_ns

@@ -15,6 +15,7 @@ import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
+from types import NoneType
 from typing import Annotated, Any
 
 import msgspec
@@ -89,6 +90,12 @@ Millis = Annotated[float, Meta(ge=0, le=1e12)]
 """What something took, in ms."""
 AgeMillis = Annotated[float, Meta(ge=0), OR_INFINITE]
 """How old something is, in ms; inf while it is not there yet."""
+LONGEST_LEASE_S = 60.0
+"""For so long a single lie may stand."""
+LeaseSeconds = Annotated[float, Meta(ge=0, le=LONGEST_LEASE_S)]
+"""For how long a sender counts as alive after each message."""
+AgeSeconds = Annotated[float, Meta(ge=0, le=1e10)]
+"""How long ago something was heard."""
 Gap = Annotated[float, Meta(ge=0), OR_INFINITE]
 """Cost over optimum or lower bound: 1 but for rounding, or more; inf is nothing proven."""
 Gauge = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
@@ -209,7 +216,7 @@ def _rules_of(struct: type[Bounded]) -> tuple[Rule, ...]:
         if any(isinstance(note, Characters) for note in notes):
             ids.append(name)
         if any(isinstance(note, Characters) for note in parts):
-            rules.append(_all_ids(name))
+            rules.append(_id_or_none(name) if NoneType in typing.get_args(bare) else _all_ids(name))
         rules.extend(_column_rule(name, note) for note in notes if isinstance(note, Column) and note.checked)
         rules.extend(_columns_rule(name, note) for note in parts if isinstance(note, Column))
     if ids:
@@ -238,6 +245,17 @@ def _each_id(names: list[str]) -> Rule:
         if not _KNOWN_IDS.issuperset(get(struct)):
             for name in names:
                 check_id(name, getattr(struct, name))
+
+    return rule
+
+
+def _id_or_none(name: str) -> Rule:
+    get = attrgetter(name)
+
+    def rule(struct: Any) -> None:
+        value = get(struct)
+        if value is not None and value not in _KNOWN_IDS:
+            check_id(name, value)
 
     return rule
 

@@ -223,8 +223,10 @@ PUSHED_ROUTE = Topic(
     access(put="planner", hear="agent:agent"),
 )  # fmt: skip
 POSE = Topic(
-    "pose", "target/{target}/pose", TargetPose, "where a target is", "per quarter of a cell, at least 2 Hz",
-    access(put="targets tracker:target", hear="agent planner targets monitor"),
+    "pose", "target/{target}/pose", TargetPose,
+    "where a target is, by a tracker of it; each counts, as one tracker must not hide another's words",
+    "per quarter of a cell, at least 2 Hz",
+    access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
 )  # fmt: skip
 TRUE_POSE = Topic(
     "true-pose", "world/target/{target}/pose", TargetPose,
@@ -248,7 +250,7 @@ COST = Topic(
 )  # fmt: skip
 STATUS = Topic(
     "status", "target/{target}/status", PlannerStatus, "how a planner is doing", "2 Hz",
-    access(put="planner:target", hear="targets monitor"),
+    access(put="planner:target", hear="targets monitor tracker:target"),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 LEAD = Topic(

@@ -12,7 +12,7 @@ from swarm.liveness import Peer
 from swarm.wire.codec import encode
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import MarksRequest
-from swarm.wire.topics import MARKS, NOTE, POSE, RUN
+from swarm.wire.topics import MARKS, NOTE, RUN, TRUE_POSE
 
 # --- publish and subscribe ----------------------------------------------------------------------------------
 
@@ -20,11 +20,11 @@ from swarm.wire.topics import MARKS, NOTE, POSE, RUN
 def test_a_subscriber_hears_the_message_and_the_fields_of_its_key(world: World):
     a, b = world.bus("a"), world.bus("b")
     box = Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
-    a.publish(POSE, pose(), target="t0")
+    a.publish(TRUE_POSE, pose(), target="t0")
     world.until(lambda: box)
-    assert box == [Heard(POSE, {"target": "t0"}, pose())]
+    assert box == [Heard(TRUE_POSE, {"target": "t0"}, pose())]
     assert a.counts["messages_out"] == 1
     assert b.counts["messages_in"] == 1
     assert a.counts["bytes_out"] == b.counts["bytes_in"] == len(encode(pose()))
@@ -32,9 +32,9 @@ def test_a_subscriber_hears_the_message_and_the_fields_of_its_key(world: World):
 
 def test_a_process_hears_itself(world: World):
     a, box = world.bus("a"), Box()
-    a.subscribe(POSE, box)
+    a.subscribe(TRUE_POSE, box)
     world.settle()
-    a.publish(POSE, pose(), target="t0")
+    a.publish(TRUE_POSE, pose(), target="t0")
     world.until(lambda: box)
     assert [event.message for event in box] == [pose()]
 
@@ -57,17 +57,19 @@ def test_samples_that_wait_are_heard_together_in_order_with_their_keys_and_witho
 
 def test_what_is_collected_waits_and_of_each_key_the_newest_is_left(world: World):
     a, b = world.bus("a"), world.bus("b")
-    b.collect(POSE)
+    b.collect(TRUE_POSE)
     box = Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
     for seq in range(5):
         for target in ("t0", "t1"):
-            a.publish(POSE, pose(target, seq=seq), target=target)
-        world.put_bytes(a, POSE, b"garbage", target="t1")
+            a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
+        world.put_bytes(a, TRUE_POSE, b"garbage", target="t1")
     world.until(lambda: len(box) == 10 and b.counts["payloads_dropped"] == 5)
-    assert b.collected(POSE) == [Heard(POSE, {"target": each}, pose(each, seq=4)) for each in ("t0", "t1")]
-    assert b.collected(POSE) == []
+    assert b.collected(TRUE_POSE) == [
+        Heard(TRUE_POSE, {"target": each}, pose(each, seq=4)) for each in ("t0", "t1")
+    ]
+    assert b.collected(TRUE_POSE) == []
     assert b.counts["payloads_dropped"] == 6  # each that was heard; of those collected the one after the newest
 
 
@@ -94,19 +96,19 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
 
 def test_a_slow_reader_gets_the_newest_of_each_key_at_its_own_pace(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box, every_s=0.5)
+    b.subscribe(TRUE_POSE, box, every_s=0.5)
     world.settle()
     for seq in range(1, 21):
         for target in ("t0", "t1"):
-            a.publish(POSE, pose(target, seq=seq), target=target)
-    world.put_bytes(a, POSE, b"garbage", target="t2")
+            a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
+    world.put_bytes(a, TRUE_POSE, b"garbage", target="t2")
     world.until(lambda: len(box) == 2)
     assert {(event.fields["target"], event.message.seq) for event in box} == {("t0", 20), ("t1", 20)}
     world.until(lambda: b.counts["payloads_dropped"] == 1)
-    a.publish(POSE, pose("t0", seq=21), target="t0")
+    a.publish(TRUE_POSE, pose("t0", seq=21), target="t0")
     world.until(lambda: len(box) == 3)
     assert box[2].message.seq == 21
-    b.unsubscribe(POSE)
+    b.unsubscribe(TRUE_POSE)
     world.settle()
     with pytest.raises(TypeError, match="each of its messages counts"):
         b.subscribe(NOTE, box, every_s=0.5)
@@ -125,31 +127,31 @@ def test_an_answer_may_carry_many_values_where_the_topic_says_so(world: World):
 def test_an_ended_subscription_hears_nothing_more_and_the_others_go_on(world: World):
     a, b = world.bus("a"), world.bus("b")
     one, every = Box(), Box()
-    b.subscribe(POSE, one, target="t0")
-    b.subscribe(POSE, every)
+    b.subscribe(TRUE_POSE, one, target="t0")
+    b.subscribe(TRUE_POSE, every)
     world.settle()
-    a.publish(POSE, pose("t0", seq=1), target="t0")
+    a.publish(TRUE_POSE, pose("t0", seq=1), target="t0")
     world.until(lambda: one and every)
-    b.unsubscribe(POSE, target="t0")
-    b.unsubscribe(POSE, target="t7")  # of what never was there is nothing to end
+    b.unsubscribe(TRUE_POSE, target="t0")
+    b.unsubscribe(TRUE_POSE, target="t7")  # of what never was there is nothing to end
     world.settle()
-    a.publish(POSE, pose("t0", seq=2), target="t0")
+    a.publish(TRUE_POSE, pose("t0", seq=2), target="t0")
     world.until(lambda: len(every) == 2)
     assert len(one) == 1
-    b.subscribe(POSE, one, target="t0")
+    b.subscribe(TRUE_POSE, one, target="t0")
     world.settle()
-    a.publish(POSE, pose("t0", seq=3), target="t0")
+    a.publish(TRUE_POSE, pose("t0", seq=3), target="t0")
     world.until(lambda: len(one) == 2)
 
 
 def test_a_subscription_with_a_field_hears_only_that_key(world: World):
     a, b = world.bus("a"), world.bus("b")
     one, every = Box(), Box()
-    b.subscribe(POSE, one, target="t1")
-    b.subscribe(POSE, every)
+    b.subscribe(TRUE_POSE, one, target="t1")
+    b.subscribe(TRUE_POSE, every)
     world.settle()
     for target in ("t0", "t1", "t10"):
-        a.publish(POSE, pose(target), target=target)
+        a.publish(TRUE_POSE, pose(target), target=target)
     world.until(lambda: len(every) == 3 and one)
     assert [event.fields["target"] for event in every] == ["t0", "t1", "t10"]
     assert [event.fields["target"] for event in one] == ["t1"]
@@ -173,10 +175,10 @@ def test_what_is_served_no_more_is_not_asked_and_may_be_served_again(world: Worl
 
 def test_samples_of_one_sender_come_in_order(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
     for seq in range(200):
-        a.publish(POSE, pose(seq=seq), target="t0")
+        a.publish(TRUE_POSE, pose(seq=seq), target="t0")
     world.until(lambda: len(box) == 200)
     assert [event.message.seq for event in box] == list(range(200))
 
@@ -196,11 +198,11 @@ def test_two_namespaces_do_not_hear_each_other(world: World):
 
 def test_garbage_is_counted_and_dropped_and_what_follows_is_heard(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
     for payload in (b"", b"\xc1", b"garbage", b"\x81\xa6schema\xa6pose/9"):
-        world.put_bytes(a, POSE, payload, target="t0")
-    a.publish(POSE, pose(), target="t0")
+        world.put_bytes(a, TRUE_POSE, payload, target="t0")
+    a.publish(TRUE_POSE, pose(), target="t0")
     world.until(lambda: box)
     assert len(box) == 1
     assert b.counts["payloads_dropped"] == 4
@@ -208,10 +210,10 @@ def test_garbage_is_counted_and_dropped_and_what_follows_is_heard(world: World):
 
 def test_what_says_that_it_is_anothers_than_its_key_says_is_dropped(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
-    a.publish(POSE, pose("t1"), target="t0")
-    a.publish(POSE, pose("t0"), target="t0")
+    a.publish(TRUE_POSE, pose("t1"), target="t0")
+    a.publish(TRUE_POSE, pose("t0"), target="t0")
     world.until(lambda: box)
     assert [event.message for event in box] == [pose("t0")]
     assert b.counts["payloads_dropped"] == 1
@@ -220,11 +222,11 @@ def test_what_says_that_it_is_anothers_than_its_key_says_is_dropped(world: World
 def test_a_key_that_is_not_one_value_is_a_bug_that_raises(world: World):
     a = world.bus("a")
     with pytest.raises(TypeError, match="needs the field target"):
-        a.publish(POSE, pose())
+        a.publish(TRUE_POSE, pose())
     with pytest.raises(ValueError, match="part of a key"):
-        a.publish(POSE, pose(), target="t/0")
+        a.publish(TRUE_POSE, pose(), target="t/0")
     with pytest.raises(TypeError, match="not a queryable"):
-        a.serve(POSE, Box())
+        a.serve(TRUE_POSE, Box())
 
 
 # --- tokens and links ---------------------------------------------------------------------------------------

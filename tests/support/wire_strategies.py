@@ -218,8 +218,8 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         lower_bound_s=finite_costs,
     ),
     TargetPose: st.builds(
-        TargetPose, target=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, cell=cells, x_m=metres,
-        y_m=metres, captures=counts, jumps=counts,
+        TargetPose, target=ids, tracker=st.none() | ids, incarnation=naturals, seq=naturals, stamp_ns=naturals,
+        lease_s=st.floats(0, 60), cell=cells, x_m=metres, y_m=metres, captures=counts, jumps=counts,
     ),
     Sighted: st.builds(
         Sighted, author=ids, group=ids, target=ids, seq=naturals, stamp_ns=naturals, until_ns=naturals, cell=cells,
@@ -230,6 +230,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         RouteReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=counts,
         tree_age_ms=ages, rows=sides, cols=sides,
         routes=st.lists(routes, max_size=3).map(lambda some: RouteBatch.of(some).columns()),
+        pose_age_s=st.none() | st.floats(0, 1e10), tracker_lost=st.booleans(),
     ),
     PushedRoute: st.builds(
         PushedRoute, vehicle=ids, target=ids, incarnation=naturals, target_cell=cells, map_version=counts,
@@ -240,12 +241,15 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         CostReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=counts,
         tree_age_ms=ages,
         cost_to_go_s=st.lists(st.floats(0, width=32), max_size=5).map(lambda column: pack_column(column, "<f4")),
+        pose_age_s=st.none() | st.floats(0, 1e10), tracker_lost=st.booleans(),
     ),
     PlannerStatus: st.builds(
         PlannerStatus, target=ids, incarnation=naturals, stamp_ns=naturals, strategy=texts,
         target_cell=optional_cells, map_version=counts, tree_age_ms=ages,
         window=st.sampled_from([[], [0, 0, 8, 8]]), growths=counts, window_growths=counts, growth_ms=millis,
-        routes_served=counts, following=counts, gap_mean=gaps, gap_p95=gaps, gap_max=gaps,
+        routes_served=counts, following=counts, tracker=st.none() | ids,
+        pose_age_s=st.none() | st.floats(0, 1e10), tracker_lost=st.booleans(),
+        gap_mean=gaps, gap_p95=gaps, gap_max=gaps,
     ),
     Stats: st.builds(
         Stats, role=ids, id=ids, incarnation=naturals, stamp_ns=naturals,
