@@ -61,7 +61,7 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES, rank: int |
         "keeper": ["0"],
         "monitor": ["0"],
         "planner": scenario.target_ids,
-        "targets": ["0"] if any(target.is_simulated for target in scenario.targets) else [],
+        "targets": ["0"] if scenario.rovers or any(target.is_simulated for target in scenario.targets) else [],
         "agent": [plan.id for plan in plan_agents(scenario)],
     }
     standbys = {"planner": scenario.standbys.planner, "targets": scenario.standbys.targets}

@@ -240,8 +240,10 @@ SIGHTED = Topic(
 BODY = Topic(
     "body", "body/{id}", Body,
     "where something is that vehicles must not drive into, though it speaks no right of way: an outside vehicle, "
-    "a person", "10 Hz while it moves, else before its lease ends",
-    access(put="rover:id targets", hear="agent rover targets monitor"), priority=Priority.INTERACTIVE,
+    "a person; each counts, as two senders under one id must not hide each other",
+    "10 Hz while it moves, else before its lease ends",
+    access(put="rover:id targets", hear="agent rover targets monitor"), newest=False,
+    priority=Priority.INTERACTIVE,
 )  # fmt: skip
 ROUTE = Topic(
     "route", "target/{target}/route", RouteReply, "routes from cells to the target", "asked",
