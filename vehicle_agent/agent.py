@@ -26,6 +26,7 @@ from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.route_follower import route_cells
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
+from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.steering import Steering
 
@@ -110,6 +111,7 @@ class Agent:
         self._steering = Steering(
             grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied, self.bodies
         )
+        self.detours = Detours(grid, pace, self._steering.steps, self.bodies)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._newest_poses = Newest(silence_ns=POSE_SILENCE_NS)
@@ -254,6 +256,7 @@ class Agent:
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0
+        self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         for vehicle in self.vehicles.values():
             self._check_reach(vehicle)
             path = self.holdings.path(vehicle.id)

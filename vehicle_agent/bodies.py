@@ -96,6 +96,8 @@ class Bodies:
         self._margin_m = margin_m
         self._known: dict[tuple[str, int], _Known] = {}
         """(id, incarnation) -> its newest report."""
+        self._senders: dict[str, dict[int, None]] = {}
+        """Id -> the incarnations under which it is known."""
         self._closed: Counter[int] = Counter()
         """Cell -> by how many reports it is closed."""
         self._charged = 0
@@ -138,8 +140,7 @@ class Bodies:
         if wrong is not None:
             self._complain("refused", report.id, f"is not avoided: {wrong}")
             return
-        if known is None:
-            self._meet_namesake(report)
+        self._meet_namesake(report, known)
         x_m, y_m = report.x_m, report.y_m
         self._standing = None
         made = _Known(report, now_ns, now_ns + int(report.lease_s * NS_PER_S), charge, (x_m, y_m), now_ns)
@@ -187,11 +188,17 @@ class Bodies:
         far_m = slack_m + 2.0 * speed * (passed_ns / NS_PER_S + REACTION_S)
         return math.hypot(report.x_m - before.x_m, report.y_m - before.y_m) > far_m
 
-    def _meet_namesake(self, report: Body) -> None:
-        for id, incarnation in self._known:
-            if id == report.id and incarnation != report.incarnation:
+    def _meet_namesake(self, report: Body, known: _Known | None) -> None:
+        """Tell if two senders take turns under one id; one that was started again does not return."""
+        senders = self._senders.setdefault(report.id, {})
+        senders[report.incarnation] = None
+        if known is None or len(senders) == 1:
+            return
+        for incarnation in senders:
+            namesake = self._known.get((report.id, incarnation))
+            if namesake is not None and namesake is not known and namesake.heard_ns > known.heard_ns:
                 both = f"{incarnation} and {report.incarnation}"
-                self._complain("twice", id, f"has two senders, of incarnations {both}: both places are closed")
+                self._complain("twice", report.id, f"has two senders, of incarnations {both}: both places are closed")
                 return
 
     def _complain(self, kind: str, id: str, text: str) -> None:
@@ -229,6 +236,10 @@ class Bodies:
     def _forget(self, key: tuple[str, int]) -> None:
         self._standing = None
         known = self._known.pop(key)
+        senders = self._senders[key[0]]
+        senders.pop(key[1], None)
+        if not senders:
+            del self._senders[key[0]]
         for each in (known, *known.ghosts):
             self._open(each)
 

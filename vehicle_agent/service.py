@@ -245,6 +245,7 @@ class AgentService:
             bodies.hear(heard.message, now_ns)
         self._agent.bodies_moved()
         self.counters.counts["bodies_refused"] = bodies.refused
+        self.counters.counts["detours"] = self._agent.detours.found
         for text in bodies.complaints:
             self._warn("body", text)
         bodies.complaints.clear()

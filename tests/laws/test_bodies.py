@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import math
+import random
 from dataclasses import dataclass, field
 
+import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from swarm.clock import NS_PER_S
+from swarm.config.agents import plan_agents
+from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.traffic import Granted
+from vehicle_agent.agent import Agent, LocalMap
 from vehicle_agent.bodies import REACTION_S, Bodies
 from vehicle_agent.discs import Capsule
+from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.traffic.holdings import Holdings
+from vehicle_agent.traffic.plots import Plots
+from vehicle_agent.traffic.steering import Steering
 
 GRID = GridSpec(9, 11, 5.0, west_m=100.0, north_m=900.0)
 MARGIN_M = 0.5
@@ -167,3 +178,120 @@ def test_what_a_moved_disc_touches_is_what_its_slow_twin_touches(x_m, y_m, headi
     window = capsule.window(GRID)
     assert all(window.contains(*divmod(cell, GRID.cols)) for cell in found)
     assert all(capsule.depth(GRID, cell) > 0.0 for cell in touched(x_m, y_m, heading, ahead_m, radius_m))
+
+
+# --- vehicles -----------------------------------------------------------------------------------------------
+
+SCENARIO = parse_scenario("""
+time_scale = 4
+[[groups]]
+vehicles = 3
+[vehicles]
+per_agent = 3
+reserve_cells = 4
+""")
+LEVEL = np.full((GRID.rows, GRID.cols), 0.1, np.float32)
+PLOTS = Plots(GRID, ["a0"])
+
+
+def agent_at(cells: list[int]) -> Agent:
+    plan = plan_agents(SCENARIO)[0]
+    holdings = Holdings(PLOTS, plan.id, plan.vehicle_ids)
+    holdings.begin(1, [])
+    local = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
+    agent = Agent(plan, SCENARIO, local, TruthSensor(GRID, LEVEL, 20.0), holdings, Bodies(GRID, MARGIN_M))
+    grant(agent, 1, dict(zip(plan.vehicle_ids, ([cell] for cell in cells), strict=True)))
+    return agent
+
+
+def grant(agent: Agent, seq: int, cells: dict[str, list[int]]) -> None:
+    warden = PLOTS.warden(0, 1)
+    granted = Granted(plot=0, host="a0", agent=warden, epoch=1, seq=seq, life=1, heard=seq, grants=cells)
+    agent.place(agent.holdings.hear_granted(granted, lambda vehicle, found: found[0], seq))
+
+
+@dataclass
+class Driven:
+    """What became of a random drive among random bodies."""
+
+    steps: int = 0
+    avoided: int = 0
+    """Ticks in which a body stood where a vehicle was about to go."""
+    into: list[tuple[str, int]] = field(default_factory=list)
+
+
+def drive(seed: int, ticks: int = 60) -> Driven:
+    """Vehicles that are granted any cells whatever, in every state of their steps, among bodies that say anything."""
+    chance, twin, driven, seq, now_ns = random.Random(seed), Twin(), Driven(), 1, 10**18
+    agent = agent_at(chance.sample(range(GRID.cells), 3))
+    vehicles = agent.vehicles
+    for number in range(ticks):
+        passed_ns = chance.choice((TICK_NS, TICK_NS, TICK_NS, TICK_NS // 3, 3 * TICK_NS))
+        now_ns += passed_ns
+        for each in twin.heard:
+            each.awake_ns += min(passed_ns, NS_PER_S // 4)
+        agent.bodies.tick(now_ns)
+        for id in ("r1", "r2"):
+            if chance.random() < 0.4:
+                report = body(
+                    id=id,
+                    seq=number,
+                    x_m=GRID.west_m + chance.uniform(0, EAST_M),
+                    y_m=GRID.north_m - chance.uniform(0, SOUTH_M),
+                    heading_rad=chance.choice((None, chance.uniform(0, math.tau))),
+                    speed_m_per_s=chance.choice((0.0, 0.0, 4.0, 20.0)),
+                    radius_m=chance.uniform(0.0, 6.0),
+                    lease_s=chance.choice((0.1, 0.5, 2.0)),
+                )
+                agent.bodies.hear(report, now_ns)
+                twin.heard = [each for each in twin.heard if each.report.id != id]
+                twin.heard.append(Heard(report, now_ns))
+        closed = twin.must()
+        seq += 1
+        grants = {}
+        for id in vehicles:
+            path = list(agent.holdings.path(id))
+            while len(path) < 4 and chance.random() < 0.7:
+                beside = [cell for _, cell in GRID.neighbours(path[-1]) if cell not in path]
+                if not beside:
+                    break
+                path.append(chance.choice(beside))
+            grants[id] = path
+        if chance.random() < 0.6:
+            grant(agent, seq, grants)
+        driven.avoided += any(set(agent.holdings.path(id)[1:]) & closed for id in vehicles)
+        agent.bodies_moved()
+        agent.begin_drive(now_ns)
+        before = {id: vehicle.cell for id, vehicle in vehicles.items()}
+        while agent.drive() is not None:
+            for id, vehicle in vehicles.items():
+                if vehicle.cell != before[id]:
+                    driven.steps += 1
+                    driven.into += [(id, vehicle.cell)] if vehicle.cell in closed else []
+                before[id] = vehicle.cell
+    return driven
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 10**9))
+def test_no_vehicle_enters_a_cell_that_a_body_closes_whatever_is_granted(seed) -> None:
+    assert drive(seed).into == []
+
+
+def test_bodies_do_stand_in_the_way_of_these_drives() -> None:
+    drives = [drive(seed) for seed in range(5)]
+    assert sum(each.avoided for each in drives) > 20
+    assert sum(each.steps for each in drives) > 100
+
+
+@pytest.mark.parametrize("rule", ["closed", "turn back", "reaction", "leases"])
+def test_without_any_one_rule_a_vehicle_drives_into_a_body(rule, monkeypatch) -> None:
+    if rule == "closed":
+        monkeypatch.setattr(Steering, "closed", lambda self, cell: False)
+    elif rule == "turn back":
+        monkeypatch.setattr(Agent, "_end_path", lambda self, vehicle: None)
+    elif rule == "reaction":
+        monkeypatch.setattr("vehicle_agent.bodies.REACTION_S", 0.0)
+    else:
+        monkeypatch.setattr("vehicle_agent.bodies.NS_PER_S", NS_PER_S // 4)
+    assert any(drive(seed).into for seed in range(40))
