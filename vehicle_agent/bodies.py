@@ -198,7 +198,9 @@ class Bodies:
             namesake = self._known.get((report.id, incarnation))
             if namesake is not None and namesake is not known and namesake.heard_ns > known.heard_ns:
                 both = f"{incarnation} and {report.incarnation}"
-                self._complain("twice", report.id, f"has two senders, of incarnations {both}: both places are closed")
+                self._complain(
+                    "twice", report.id, f"has two senders, of incarnations {both}: both places are closed"
+                )
                 return
 
     def _complain(self, kind: str, id: str, text: str) -> None:
@@ -299,6 +301,7 @@ class Bodies:
             self._standing = {cell for each in known for cell in each.cells}
         return self._standing
 
-    def names(self, cells: Container[int]) -> list[str]:
-        """The ids of the bodies that close any of these cells."""
-        return sorted({id for (id, _), known in self._known.items() if any(cell in cells for cell in known.cells)})
+    @property
+    def reports(self) -> list[Body]:
+        """The newest report of each body, by each of its senders."""
+        return [known.report for known in self._known.values()]

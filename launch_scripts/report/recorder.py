@@ -282,6 +282,8 @@ class Recorder:
             "captures": total("captures"),
             "collisions": total("collisions"),
             "lethal_entries": total("lethal_entries"),
+            "driven_into": total("driven_into"),
+            "hit_by_bodies": total("hit_by_bodies"),
             "stranded": _whole(observed.gauge("stranded")),
             "lost": _whole(observed.gauge("lost")),
             "states_at_end": _by_state(observed.vehicles().count_states()),

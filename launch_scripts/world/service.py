@@ -127,8 +127,7 @@ class TargetsService:
                     self._bus.publish(BODY, action, id=action.id)
                 case BodyHit(cell=cell, by_vehicle=by_vehicle):
                     self.counters.count("driven_into" if by_vehicle else "hit_by_bodies")
-                    kind = "drove-into-body" if by_vehicle else "hit-by-body"
-                    self._member.note(now_ns, kind, action.sentence, cell)
+                    self._member.note(now_ns, "body-collision", action.sentence, cell)
                 case LethalEntry(vehicle, cell):
                     self.counters.count("lethal_entries")
                     self._member.note(now_ns, "lethal-entry", f"{vehicle} entered a lethal cell", cell)

@@ -221,7 +221,7 @@ class Driven:
 
 
 def drive(seed: int, ticks: int = 60) -> Driven:
-    """Vehicles that are granted any cells whatever, in every state of their steps, among bodies that say anything."""
+    """Vehicles that are granted any cells whatever, in every state of their steps, among any bodies."""
     chance, twin, driven, seq, now_ns = random.Random(seed), Twin(), Driven(), 1, 10**18
     agent = agent_at(chance.sample(range(GRID.cells), 3))
     vehicles = agent.vehicles

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 
@@ -65,7 +66,12 @@ def test_a_moving_body_closes_the_way_that_it_may_have_gone_since_it_was_heard(b
 
 def test_without_a_heading_it_may_go_any_way(bodies: Bodies) -> None:
     bodies.hear(body(5.5, 5.5, speed_m_per_s=10.0), NOW)
-    assert closed(bodies) == {(row, col) for row in (4, 5, 6) for col in (4, 5, 6)} - {(4, 4), (4, 6), (6, 4), (6, 6)}
+    assert closed(bodies) == {(row, col) for row in (4, 5, 6) for col in (4, 5, 6)} - {
+        (4, 4),
+        (4, 6),
+        (6, 4),
+        (6, 6),
+    }
 
 
 def test_a_body_that_says_that_it_leaves_opens_its_cells_at_once(bodies: Bodies) -> None:
@@ -89,7 +95,8 @@ def test_a_report_that_cannot_be_taken_in_is_named_once_and_counted(bodies: Bodi
         bodies.hear(body(5.5, 5.5, seq=seq, **said), NOW)
     assert closed(bodies) == {(5, 5)}, "what was known before lasts until its lease ends"
     (text,) = bodies.complaints
-    assert text.startswith("body r1 is not avoided: ") and why in text
+    assert text.startswith("body r1 is not avoided: ")
+    assert why in text
     assert bodies.refused == 4
 
 
@@ -136,7 +143,8 @@ def test_too_many_bodies_and_too_many_cells_are_refused_and_those_before_stay(bo
     for tick in range(1, 21):
         bodies.tick(NOW + tick * TICK)
         fine.tick(NOW + tick * TICK)
-    assert not bodies.any and not fine.any
+    assert not bodies.any
+    assert not fine.any
     fine.hear(body(20.0, 20.0, radius_m=95.0), NOW + 2 * NS_PER_S)
     assert fine.any, "what was given back can be used again"
 
@@ -145,7 +153,8 @@ def test_a_stopped_process_forgets_no_body_in_the_time_in_which_it_did_not_liste
     bodies.hear(body(5.5, 5.5, lease_s=1.0), NOW)
     bodies.tick(NOW + 60 * NS_PER_S)
     assert closed(bodies) == {(5, 5)}
-    assert bodies.was_deaf(60.0) and not bodies.was_deaf(0.2)
+    assert bodies.was_deaf(60.0)
+    assert not bodies.was_deaf(0.2)
 
 
 # --- what vehicles make of it -------------------------------------------------------------------------------
@@ -186,7 +195,7 @@ def test_a_body_that_stands_on_a_route_is_driven_around_by_the_cheapest_way(bodi
     assert detours.found == 1
     assert cells[-1] == GRID.cell(20, 34)
     assert not any(cell in bodies.closed for cell in cells)
-    assert all(GRID.distance_cells(a, b) == 1 for a, b in zip(cells, cells[1:], strict=False))
+    assert all(GRID.distance_cells(a, b) == 1 for a, b in itertools.pairwise(cells))
     assert len(cells) == 30, "diagonal steps aside cost no cell"
 
 
@@ -212,7 +221,7 @@ def test_where_there_is_no_way_around_it_is_seldom_looked_for(bodies: Bodies) ->
 
 def test_a_body_that_drives_on_is_waited_for(bodies: Bodies) -> None:
     bodies.hear(body(20.5, 20.5, radius_m=5.0, heading_rad=0.0, speed_m_per_s=1.0), NOW)
-    vehicle, detours = drive_around(bodies, np.full((40, 40), 0.1, np.float32), ticks=1)
+    _vehicle, detours = drive_around(bodies, np.full((40, 40), 0.1, np.float32), ticks=1)
     assert detours.found == 0
 
 
