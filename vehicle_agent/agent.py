@@ -22,8 +22,10 @@ from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.assignment import AskCosts, Assignment
+from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
+from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.steering import Steering
 
@@ -77,6 +79,7 @@ class Agent:
     plan       which vehicles, of which group
     local_map  the agent's map
     holdings   the cells that the vehicles may stand on and enter
+    bodies     what they must not drive into, though it speaks no right of way
 
     wishes     what to ask of wardens, as of the last `decide`
     """
@@ -88,6 +91,7 @@ class Agent:
         local_map: LocalMap,
         sensor: Sensor,
         holdings: Holdings,
+        bodies: Bodies | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
@@ -98,11 +102,15 @@ class Agent:
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = local_map
+        self.bodies = bodies or Bodies(local_map.grid)
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
-        self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied)
+        self._steering = Steering(
+            grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied, self.bodies
+        )
+        self.detours = Detours(grid, pace, self._steering.steps, self.bodies)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._trackings = Trackings(local_map.grid.cells)
@@ -146,6 +154,8 @@ class Agent:
     def begin_drive(self, now_ns: int) -> None:
         """Give every vehicle the time that has passed since it was last driven."""
         elapsed_s = 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / NS_PER_S
+        if self.bodies.any and self.bodies.was_deaf(elapsed_s):
+            elapsed_s = 0.0  # what bodies have said meanwhile may not have been read yet
         self._driven_ns = now_ns
         seconds = min(elapsed_s, _LONGEST_STEP_S) * self._time_scale
         self._left_s = dict.fromkeys(self.vehicles, seconds)
@@ -211,6 +221,19 @@ class Agent:
             if look:
                 self._look_from[vehicle.cell] = None
 
+    def bodies_moved(self) -> None:
+        """Let vehicles stop before cells that bodies close, or turn back. Called before they drive: what was
+        granted since the last time may lie on closed cells, too."""
+        changed = self.bodies.take_changed()
+        if not self.vehicles or not (changed or self.bodies.any):
+            return
+        vehicles = list(self.vehicles.values())
+        for vehicle in vehicles:
+            self._end_path(vehicle)
+        cells = np.array([divmod(vehicle.cell, self._map.grid.cols) for vehicle in vehicles], np.int64)
+        for index in np.flatnonzero(_meet(np.hstack((cells, cells)), changed, self._sight_cells)):
+            self._wished.pop(vehicles[index].id, None)
+
     def _end_path(self, vehicle: Vehicle) -> None:
         """Give back what lies behind a step that the map does not allow any more."""
         path = self.holdings.path(vehicle.id)
@@ -233,6 +256,7 @@ class Agent:
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0
         lost = self._trackings.lost(now_ns)
+        self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         for vehicle in self.vehicles.values():
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)

@@ -23,10 +23,12 @@ from swarm.ranks import job_of
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
 from swarm.wire.topics import (
+    BODY,
     CHASERS,
     COST,
     FLEET,
@@ -39,6 +41,7 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
+from vehicle_agent.bodies import Bodies
 from vehicle_agent.chasers import ChasersReport
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
@@ -104,7 +107,8 @@ class AgentService:
             scenario.vehicles.sense_range_m,
         )
         self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
-        self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings)
+        bodies = Bodies(grid, scenario.cost.vehicle_radius_m)
+        self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings, bodies)
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
@@ -123,6 +127,7 @@ class AgentService:
         self._member.join()
         self._sync.start(now_ns)
         self._bus.collect(POSE)
+        self._bus.collect(BODY)
         if self._untracked.targets:
             self._bus.collect(TRUE_POSE)
             for target in sorted(self._untracked.targets):
@@ -174,6 +179,7 @@ class AgentService:
         agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
         if agent.places:
             self._sync.enter(self._near_marks.update(agent.places))
+        self._hear_bodies(now_ns)
         agent.begin_drive(now_ns)
         while (findings := agent.drive()) is not None:
             if len(findings):
@@ -231,6 +237,19 @@ class AgentService:
         tracked = pose.target not in self._untracked.targets
         if heard.topic is TRUE_POSE or (tracked and self._agent.hear_pose(pose, now_ns)):
             self._detector.set_truth(pose, now_ns)
+
+    def _hear_bodies(self, now_ns: int) -> None:
+        bodies = self._agent.bodies
+        bodies.tick(now_ns)
+        for heard in self._bus.collected(BODY):
+            assert isinstance(heard.message, Body)
+            bodies.hear(heard.message, now_ns)
+        self._agent.bodies_moved()
+        self.counters.counts["bodies_refused"] = bodies.refused
+        self.counters.counts["detours"] = self._agent.detours.found
+        for text in bodies.complaints:
+            self._warn("body", text)
+        bodies.complaints.clear()
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
         pose = self._untracked.hear(sighted, now_ns)

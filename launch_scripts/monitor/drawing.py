@@ -138,6 +138,14 @@ class Drawing:
         balls = rr.Points3D(points.positions, colors=points.colours, radii=within_m, labels=points.ids)
         self._rec.log("world/targets/sighted", balls)
 
+    def bodies(self, points: Points, radii_m: Floats) -> None:
+        """Logs balls as large as the bodies."""
+        labels = points.ids if len(points.ids) <= _NAMES_SHOWN else None
+        balls = rr.Points3D(
+            points.positions, colors=points.colours, radii=radii_m, labels=labels, show_labels=False
+        )
+        self._rec.log("world/bodies", balls)
+
     def trails(self, who: str, strips: Floats) -> None:
         """Logs the newest piece of each trail; the view shows those of the last seconds together."""
         if len(strips):

@@ -7,7 +7,7 @@ stretched so that gentle land still looks like land.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -45,6 +46,7 @@ _STATE_COLOURS = np.array([STATE_COLOURS[state] for state in VehicleState], np.u
 TARGET_COLOUR = (255, 46, 46)
 LOST_TARGET_COLOUR = (120, 120, 120)
 SIGHTED_COLOUR = (255, 170, 150)
+BODY_COLOUR = (110, 160, 255)
 LETHAL_MARK = (86, 22, 150)
 SLOW_MARK = (235, 150, 0)
 FAST_MARK = (90, 200, 250)
@@ -244,6 +246,17 @@ def sighting_points(mesh: TerrainMesh, seen: Mapping[str, Sighted]) -> tuple[Poi
     positions = mesh.place(east_m, south_m, 0.3 * mesh.scale_m)
     colours = np.tile(np.array(SIGHTED_COLOUR, np.uint8), (len(positions), 1))
     return Points(list(seen), positions, colours), np.array([s.uncertainty_m for s in seen.values()], np.float32)
+
+
+def body_points(mesh: TerrainMesh, bodies: Sequence[Body]) -> tuple[Points, Floats]:
+    """Where bodies are, and their radii in metres, float32 (n,)."""
+    grid = mesh.grid
+    east_m = np.array([each.x_m - grid.west_m for each in bodies], np.float32)
+    south_m = np.array([grid.north_m - each.y_m for each in bodies], np.float32)
+    positions = mesh.place(east_m, south_m, 0.2 * mesh.scale_m)
+    colours = np.tile(np.array(BODY_COLOUR, np.uint8), (len(positions), 1))
+    radii = np.array([max(each.radius_m, 0.25 * grid.resolution_m) for each in bodies], np.float32)
+    return Points([each.id for each in bodies], positions, colours), radii
 
 
 def label_places(mesh: TerrainMesh, targets: Points) -> Floats:

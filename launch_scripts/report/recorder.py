@@ -315,6 +315,8 @@ class Recorder:
                 "lost_at_end": sorted(self.lost_targets(self.last_ns or 0)),
                 **{name: total(name) for name in ODD_POSES},
             },
+            "driven_into": total("driven_into"),
+            "hit_by_bodies": total("hit_by_bodies"),
             "stranded": _whole(observed.gauge("stranded")),
             "lost": _whole(observed.gauge("lost")),
             "states_at_end": _by_state(observed.vehicles().count_states()),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.world.referee import Collision, LethalEntry
+from launch_scripts.world.referee import BodyHit, Collision, LethalEntry
+from launch_scripts.world.rovers import Rovers
 from launch_scripts.world.targets import Action, Captured, Publish, TargetWorld
 from launch_scripts.world.telling import Telling
 from shared_map.terrain.terrain import Terrain
@@ -17,10 +18,11 @@ from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
+from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
 
 TICK_HZ = 10.0
 _ASK_NS = NS_PER_S // 2
@@ -28,7 +30,8 @@ _ASK = "where"
 
 
 class TargetsService:
-    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`."""
+    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`; `driven_into`, bodies
+    that vehicles drove into, and `hit_by_bodies`, the other way round."""
 
     def __init__(
         self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
@@ -43,12 +46,21 @@ class TargetsService:
         self._telling = Telling(terrain.grid.resolution_m)
         self._planners = Roster()
         self.counters = self._member.counters
-        for name in ("captures", "collisions", "lethal_entries", "poses"):
+        for name in ("captures", "collisions", "driven_into", "hit_by_bodies", "lethal_entries", "poses"):
             self.counters.count(name, 0)
+
+    @property
+    def leads(self) -> bool:
+        return self._world.leads
+
+    @property
+    def rovers(self) -> Rovers:
+        return self._world.rovers
 
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._bus.subscribe(FLEET, self._post)
+        self._bus.subscribe(BODY, self._post)
         self._bus.subscribe(STATUS, self._post)
         self._bus.watch_alive(self._post, role="planner")
         for target in self._scenario.targets:
@@ -63,6 +75,8 @@ class TargetsService:
         match event:
             case Heard(message=Fleet() as fleet):
                 self._perform(self._world.hear_fleet(fleet, now_ns), now_ns)
+            case Heard(message=Body() as body):
+                self._world.hear_body(body, now_ns)
             case Heard(message=PlannerStatus() as status):
                 self._world.hear_planner(status.target, status.target_cell)
             case Replied(message=CostReply() as reply):
@@ -109,6 +123,11 @@ class TargetsService:
                 case Collision(first, second, cell):
                     self.counters.count("collisions")
                     self._member.note(now_ns, "collision", f"{first} and {second} on one cell", cell)
+                case Body():
+                    self._bus.publish(BODY, action, id=action.id)
+                case BodyHit(cell=cell, by_vehicle=by_vehicle):
+                    self.counters.count("driven_into" if by_vehicle else "hit_by_bodies")
+                    self._member.note(now_ns, "body-collision", action.sentence, cell)
                 case LethalEntry(vehicle, cell):
                     self.counters.count("lethal_entries")
                     self._member.note(now_ns, "lethal-entry", f"{vehicle} entered a lethal cell", cell)

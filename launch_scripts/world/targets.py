@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.world.referee import Collision, LethalEntry, Referee
+from launch_scripts.world.referee import BodyHit, Collision, LethalEntry, Referee
+from launch_scripts.world.rovers import Rovers
 from launch_scripts.world.walks import Budget, TrueTerrain, Walker, far_place, slowness_of
 from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
@@ -22,6 +23,7 @@ from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.runtime.tracking import Trackings, Verdict
 from swarm.wire.fields import column
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 
@@ -51,7 +53,7 @@ class Captured:
     cell: int
 
 
-Action = Publish | Captured | Collision | LethalEntry
+Action = Publish | Captured | Collision | LethalEntry | BodyHit | Body
 
 
 @dataclass(eq=False)
@@ -95,7 +97,8 @@ class TargetWorld:
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
         self._terrain = TrueTerrain(terrain.grid, pace)
-        self._referee = Referee(truth_s_per_m)
+        self._referee = Referee(truth_s_per_m, terrain.grid)
+        self.rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
         # Who tracks external targets, and for a standby who leads; and the highest incarnation of a leader.
         self._trackings = Trackings(terrain.grid.cells)
@@ -179,6 +182,12 @@ class TargetWorld:
         target.x_m, target.y_m = pose.x_m, pose.y_m
         target.placed = True
 
+    def hear_body(self, body: Body, now_ns: int) -> None:
+        """Takes where a body is: of anybody's for the referee, of a rover that another leader moves for itself."""
+        if not self.leads:
+            self.rovers.hear(body)
+        self._referee.hear_body(body, now_ns)
+
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
         actions: list[Action] = list(self._referee.hear(fleet))
         if not self.leads:
@@ -199,7 +208,7 @@ class TargetWorld:
         waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells
         budget = Budget()
-        actions: list[Action] = []
+        actions: list[Action] = [*self.rovers.tick(now_ns)]
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):

@@ -18,6 +18,7 @@ from swarm.config.scenario import (
     Scenario,
     TlsConfig,
     ZoneConfig,
+    ids_of,
 )
 from swarm.errors import ConfigError
 from swarm.ranks import split_rank
@@ -48,6 +49,9 @@ def _check(scenario: Scenario, source: str) -> None:
     doubled = sorted(id for id, times in Counter(ids).items() if times > 1)
     if doubled:
         raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    rovers = Counter(id for rover in scenario.rovers for id in ids_of(rover))
+    if rovers and rovers.most_common(1)[0][1] > 1:
+        raise ConfigError(f"{source}: rovers: two rovers are called {rovers.most_common(1)[0][0]!r}; rename one")
     for id in ids:
         if split_rank(id)[1]:  # planner and standby of two targets would share an id
             raise ConfigError(f"{source}: targets: {id!r} is what a standby of another target is called; rename it")

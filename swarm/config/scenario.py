@@ -176,6 +176,22 @@ class TargetConfig(Section, frozen=True, kw_only=True):
         return self.walk != "external"
 
 
+class RoverConfig(Section, frozen=True, kw_only=True):
+    """A simulated outside vehicle, or `count` alike: it says where it is, speaks no right of way and looks out for
+    nobody. Ids as those of targets.
+
+    name           id of the rover, or what the ids begin with
+    count          how many rovers
+    speed_m_per_s  its speed, on any ground
+    radius_m       what vehicles keep away from, around its middle
+    """
+
+    name: Name = "r"
+    count: Annotated[int, Meta(ge=1, le=256)] = 1
+    speed_m_per_s: NotNegative = 2.0
+    radius_m: Annotated[float, Meta(ge=0, le=100)] = 1.0
+
+
 class GroupConfig(Section, frozen=True, kw_only=True):
     """Vehicles that belong together.
 
@@ -303,7 +319,7 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
                        not answer; while no router listens, processes wait
     tls                certificates, for endpoints beyond loopback
     admit              names in certificates that a router lets take part, beside those of the scenario's processes:
-                       router.north, keeper.east, operator.anna
+                       router.north, keeper.east, operator.anna, rover.r1
     revoked            names in certificates that a router denies everything
     """
 
@@ -342,6 +358,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     cost        how terrain becomes pace
     targets     what is chased
     groups      which vehicles there are
+    rovers      simulated outside vehicles that the swarm's must not drive into
     vehicles    how vehicles behave
     planner     how a planner keeps its tree
     standbys    which processes stand by
@@ -358,6 +375,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     cost: CostConfig = CostConfig()
     targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1, max_length=MOST_TARGETS)] = (TargetConfig(),)
     groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1, max_length=256)] = (GroupConfig(),)
+    rovers: Annotated[tuple[RoverConfig, ...], Meta(max_length=256)] = ()
     vehicles: VehicleConfig = VehicleConfig()
     planner: PlannerConfig = PlannerConfig()
     standbys: StandbyConfig = StandbyConfig()
@@ -379,8 +397,8 @@ class Scenario(Section, frozen=True, kw_only=True):
         return sum(group.vehicles for group in self.groups)
 
 
-def ids_of(target: TargetConfig) -> list[str]:
-    """Ids of a target: `name` for one, `name0, name1, ...` for several."""
-    if target.count == 1:
-        return [target.name]
-    return [f"{target.name}{n}" for n in range(target.count)]
+def ids_of(some: TargetConfig | RoverConfig) -> list[str]:
+    """Ids of a target or rover: `name` for one, `name0, name1, ...` for several."""
+    if some.count == 1:
+        return [some.name]
+    return [f"{some.name}{n}" for n in range(some.count)]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
+from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.traffic.holdings import Wish
 
@@ -37,6 +38,7 @@ class Steering:
     pace         float32 (rows, cols), s/m; inf is lethal; read at each call
     reserve      cells ahead of itself that a vehicle may be granted
     occupied     whether another vehicle holds a cell
+    bodies       what speaks no right of way: its cells are passed as lethal ones are, but by routes
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class Steering:
         reserve: int,
         chance: random.Random,
         occupied: Callable[[int], bool],
+        bodies: Bodies,
     ) -> None:
         self._grid = grid
         self._pace = pace.reshape(-1)
@@ -55,14 +58,16 @@ class Steering:
         self._reserve = reserve
         self._chance = chance
         self._occupied = occupied
+        self._bodies = bodies
+        self._shut = bodies.closed
         self._since_ns: dict[str, int] = {}
         """Vehicle -> since when it has been on its way to a target."""
         self._stood_ns: dict[str, tuple[int, int]] = {}
         """Vehicle -> the cell on which it waits, and since when."""
 
     def closed(self, cell: int) -> bool:
-        """Whether a cell is lethal."""
-        return not math.isfinite(self._pace[cell])
+        """Whether a cell is lethal, or a body closes it."""
+        return cell in self._shut or not math.isfinite(self._pace[cell])
 
     def passable(self, tail: int, head: int) -> bool:
         """Whether the map allows the step between two neighbours; a diagonal also needs the cells beside it."""
@@ -75,7 +80,8 @@ class Steering:
         return not (self.closed(tail + col) or self.closed(tail + rows * cols))
 
     def passable_steps(self, cells: Sequence[int]) -> int:
-        """How many steps along some cells, each next to the one before, the map allows."""
+        """How many steps along some cells, each next to the one before, the map allows. Bodies count for none: they
+        may be gone before the vehicle is there."""
         if len(cells) < 2:
             return 0
         at = np.array(cells, np.int64)
@@ -99,8 +105,17 @@ class Steering:
         if vehicle.in_reach or vehicle.target is None:
             self._since_ns[vehicle.id] = now_ns
             steps = self.steps(path[0]) if still else []
+            flees = still and self.threatened(path[0])
+            if flees:
+                pushed_ms = _OLDEST_MS
             wants = sorted(
-                steps, key=lambda cell: (not in_reach(cell), self._occupied(cell), self._chance.random())
+                steps,
+                key=lambda cell: (
+                    self._bodies.danger(cell) if flees else 0.0,
+                    not in_reach(cell),
+                    self._occupied(cell),
+                    self._chance.random(),
+                ),
             )
             return Wish((), wants, len(wants) if pushed_ms else 0, pushed_ms)
         age_ms = (now_ns - self._since_ns.setdefault(vehicle.id, now_ns)) // _MS
@@ -110,10 +125,17 @@ class Steering:
             return Wish(ahead, (), 0, age_ms)
         near = self._places(vehicle.route.near(_NEAR_CELLS))
         cost = {cell: self._cost(cell, near) + _OCCUPIED * self._occupied(cell) for cell in self.steps(path[0])}
+        if self.threatened(path[0]):
+            wants = sorted(cost, key=lambda cell: (self._bodies.danger(cell), cost[cell], self._chance.random()))
+            return Wish(ahead, wants, len(wants), _OLDEST_MS)
         wants = sorted(cost, key=lambda cell: (cost[cell], self._chance.random()))
         here = self._cost(path[0], near)
         better = len(wants) if pushed_ms else sum(each < here for each in cost.values())
         return Wish(ahead, wants, better, age_ms)
+
+    def threatened(self, cell: int) -> bool:
+        """Whether a body is on a cell or comes to it: who stands there makes way before all others."""
+        return self._bodies.any and (cell in self._shut or self._bodies.danger(cell) > 0.0)
 
     def blocked(self, vehicle: Vehicle, path: Sequence[int], now_ns: int) -> bool:
         """Whether it stands though its route goes on. Asks for another route after a while."""
