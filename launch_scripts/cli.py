@@ -332,6 +332,7 @@ _mount(
 )
 _mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swarm terrain --help`.")
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
+_mount("zone", "launch_scripts.commands.zone", "Close areas while the swarm runs. See `swarm zone --help`.")
 _mount(
     "deploy",
     "launch_scripts.commands.deploy",

@@ -189,6 +189,11 @@ class Planner:
         """Whether there is nothing to answer from now, and will be once the growth under way is adopted."""
         return not self.tree.ready and self._growing_since_ns is not None
 
+    @property
+    def knows_map(self) -> bool:
+        """Whether routes go by the map as it is now."""
+        return self._told is None or self._told[1] == self._cost_map.version
+
     # --- the tree -----------------------------------------------------------------------------------------------
 
     def _keep_up(self, now_ns: int) -> list[Action]:

@@ -24,7 +24,9 @@ from swarm.config.agents import agent_of
 from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
+from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Chasers
@@ -85,6 +87,8 @@ class PlannerService:
             shelf=prepared,
             leads=False,
         )
+        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._now_ns = 0
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
@@ -101,13 +105,14 @@ class PlannerService:
         else:
             self._bus.collect(POSE, target=self._target)
         self._bus.collect(CHASERS, target=self._target)
+        self._obedience.start()
         self._candidacy.start()
         self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if self._candidacy.handle(event, now_ns):
+        if self._candidacy.handle(event, now_ns) or self._obedience.handle(event):
             return
         match event:
             case Heard(message=Sighted() as sighted):
@@ -139,6 +144,8 @@ class PlannerService:
         self._sightings.expire(now_ns)
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)
         self._perform(self._planner.tick(now_ns))
+        self._now_ns = now_ns
+        self._obedience.tick()
         self._answer(now_ns)
         if self._search is not None and not self._searching:
             self._searching = True
@@ -165,6 +172,9 @@ class PlannerService:
             else:
                 event.answer(reply, target=self._target)
             event.end()
+
+    def _obeys(self, order: Obey) -> bool:
+        return self._sync.holds(order.author, order.sets, self._now_ns) and self._planner.knows_map
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()

@@ -137,6 +137,10 @@ class Agent:
         self.wishes.clear()
         self._wished.clear()
 
+    def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
+        """Cells that only an operator's zone closes, and how many steps it is from each out of it."""
+        self._steering.ways_out = ways_out
+
     @property
     def places(self) -> list[int]:
         """The cells that our vehicles hold."""

@@ -15,6 +15,7 @@ from swarm.wire.codec import prime
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.orders import Obey, Obeyed, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
@@ -257,6 +258,16 @@ LEAD = Topic(
     access(put="planner:role,id targets:role,id", hear="planner targets monitor"),
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
+ZONES = Topic(
+    "zones", "order/{keeper}/zones", Zones, "adds, removes and lists zones: areas that operators close",
+    "asked by people", access(serve="keeper:keeper"),
+    request=ZoneOrder, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+OBEYED = Topic(
+    "obeyed", "obeyed/{role}/{id}", Obeyed, "that a process obeys an order, as soon as it does",
+    "asked after each order", access(serve="agent:role,id planner:role,id"),
+    request=Obey, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz",
     access(put=MEMBERS_OWN, hear="monitor"),
@@ -270,7 +281,8 @@ NOTE = Topic(
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, FOLLOWED,
-    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, LEAD, STATS, NOTE,
+    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, LEAD, ZONES, OBEYED, STATS,
+    NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
