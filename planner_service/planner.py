@@ -119,6 +119,11 @@ class Planner:
         if leads:
             self.followers.forget_routes()
 
+    def set_pace(self, cpu_budget: float, push_s: float) -> None:
+        """Share of a core that this planner may use, and how often it may push a vehicle newer routes."""
+        self._push_ns = int(push_s * NS_PER_S)
+        self.tree.set_budget(cpu_budget)
+
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where the target's tracker says it is, if that is news. The next tick takes it in."""
         if pose.target == self.target and self._poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):

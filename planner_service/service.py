@@ -59,6 +59,7 @@ class PlannerService:
     ) -> None:
         scenario = setup.scenario
         self._target = job_of(setup.id)
+        self._scenario = scenario
         self._bus = bus
         self._post = post
         self._worker = worker
@@ -88,6 +89,9 @@ class PlannerService:
             leads=False,
         )
         self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obeyed_version = 0
+        self._removed = False
+        """Whether its target was removed: then it serves nobody."""
         self._now_ns = 0
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
@@ -105,14 +109,14 @@ class PlannerService:
         else:
             self._bus.collect(POSE, target=self._target)
         self._bus.collect(CHASERS, target=self._target)
-        self._obedience.start()
+        self._obedience.start(now_ns)
         self._candidacy.start()
         self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if self._candidacy.handle(event, now_ns) or self._obedience.handle(event):
+        if self._candidacy.handle(event, now_ns) or self._obedience.handle(event, now_ns):
             return
         match event:
             case Heard(message=Sighted() as sighted):
@@ -142,10 +146,11 @@ class PlannerService:
             self._planner.hear_chasers(heard.message, now_ns)
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
-        self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)
+        self._obey()
+        self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns) and not self._removed, now_ns)
         self._perform(self._planner.tick(now_ns))
         self._now_ns = now_ns
-        self._obedience.tick()
+        self._obedience.tick(now_ns)
         self._answer(now_ns)
         if self._search is not None and not self._searching:
             self._searching = True
@@ -173,7 +178,21 @@ class PlannerService:
                 event.answer(reply, target=self._target)
             event.end()
 
+    def _obey(self) -> None:
+        """Go by what is ordered."""
+        book, scenario = self._obedience.book, self._scenario
+        if book.version == self._obeyed_version:
+            return
+        self._obeyed_version = book.version
+        self._removed = self._target not in book.targets(scenario)
+        self._planner.set_pace(
+            book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
+            book.setting("planner.push_s", scenario.planner.push_s),
+        )
+
     def _obeys(self, order: Obey) -> bool:
+        if order.subject is not None:
+            return True
         return self._sync.holds(order.author, order.sets, self._now_ns) and self._planner.knows_map
 
     def stop(self, now_ns: int) -> None:

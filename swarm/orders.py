@@ -13,11 +13,12 @@ from swarm.bus.bus import AskEnded, Bus, Replied
 from swarm.errors import BusError, ConfigError
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.base import Message, Nothing
-from swarm.wire.messages.orders import Obey, Obeyed, ZoneOrder, Zones
+from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, ZoneOrder, Zones
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import OBEYED, RUN, ZONES, Topic
+from swarm.wire.topics import GIVE_ORDER, OBEYED, ORDERS, RUN, ZONES, Topic
 
-OBEYING_ROLES = ("agent", "planner")
+_OBEY_ZONES = frozenset({"agent", "planner"})
+_OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
 _FIND_S = 1.0
 _ORDER_S = 5.0
 _OBEY_S = 3.0
@@ -59,6 +60,28 @@ class Operator:
         author = f"operator.{zones.changed}"
         return zones, self._obeyed(Obey(author=author, sets=zones.sets), members)
 
+    def orders(self) -> Orders:
+        """What is ordered. Raises BusError without a keeper."""
+        keeper = self._keeper()
+        replies, _ = self._ask(ORDERS, Nothing(), _ORDER_S, role="keeper", id=keeper)
+        for reply in replies:
+            if isinstance(reply, Orders):
+                return reply
+        raise BusError(f"keeper {keeper} does not answer")
+
+    def give(self, order: GiveOrder) -> tuple[Order, Acknowledged]:
+        """Pause, stop, say whom to chase, add targets, change settings, or take that back; wait until all obey.
+
+        Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
+        """
+        members = self._members()
+        reply = self._order(GIVE_ORDER, order, self._keeper(members))
+        assert isinstance(reply, Orders)
+        given = reply.given
+        assert given is not None
+        obey = Obey(subject=given.subject, name=given.name, stamp_ns=given.stamp_ns)
+        return given, self._obeyed(obey, members)
+
     # --- asking ---------------------------------------------------------------------------------------------
 
     def _members(self) -> list[RunInfo]:
@@ -88,7 +111,8 @@ class Operator:
         raise BusError(f"keeper {keeper} does not answer: it is not known whether the order counts; give it again")
 
     def _obeyed(self, order: Obey, members: list[RunInfo]) -> Acknowledged:
-        concerned = {f"{each.role}-{each.id}" for each in members if each.role in OBEYING_ROLES}
+        roles = _OBEY_ZONES if order.subject is None else _OBEY_ORDERS
+        concerned = {f"{each.role}-{each.id}" for each in members if each.role in roles}
         inbox = Inbox()
         began_s = time.monotonic()
         obeyed: dict[str, float] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -31,6 +31,7 @@ from vehicle_agent.traffic.steering import Steering
 _LONGEST_STEP_S = 0.5
 _WISH_LASTS_NS = NS_PER_S
 """A wish that has not changed is made anew so often, as it tells the vehicle's age."""
+_STAYS = Wish()
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
@@ -80,6 +81,7 @@ class Agent:
     holdings   the cells that the vehicles may stand on and enter
 
     wishes     what to ask of wardens, as of the last `decide`
+    stopped    whether an operator wants a vehicle to stand
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class Agent:
         self.holdings = holdings
         self.wishes: dict[str, Wish] = {}
         self.blocked_ticks = 0
+        self.stopped: Callable[[str], bool] = lambda vehicle: False
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = local_map
@@ -120,6 +123,25 @@ class Agent:
         self._look_from: dict[int, None] = {}
         self._wished: dict[str, tuple[object, ...]] = {}
         """Vehicle under way -> what its wish was made of."""
+
+    # --- what operators order ---------------------------------------------------------------------------------
+
+    def set_targets(self, targets: Sequence[str], now_ns: int) -> None:
+        """The targets that the vehicles may go for from now on. Those that go for another get one of these."""
+        if list(targets) == self.targets:
+            return
+        self.targets = list(targets)
+        self._assignment.set_targets(self.targets)
+        for vehicle in self.vehicles.values():
+            if vehicle.target is not None and vehicle.target not in self.targets:
+                vehicle.release()
+                self._stop_soon(vehicle)
+        self._assignment.ask_soon(now_ns)
+
+    def set_pace(self, time_scale: float, reassign_s: float) -> None:
+        """Seconds on the terrain per second, and how often vehicles ask which target is the cheapest."""
+        self._time_scale = time_scale
+        self._assignment.set_period(reassign_s)
 
     # --- where vehicles start -------------------------------------------------------------------------------
 
@@ -177,6 +199,8 @@ class Agent:
         physics = self._map.physics.reshape(-1)
         while left_s > 0.0:
             if motion.at_rest:
+                if self.stopped(vehicle.id):
+                    return 0.0
                 path = self.holdings.path(vehicle.id)
                 if len(path) < 2 or not self._steering.passable(path[0], path[1]):
                     return 0.0
@@ -239,10 +263,17 @@ class Agent:
         self.blocked_ticks = 0
         for vehicle in self.vehicles.values():
             self._check_reach(vehicle)
+            stopped = self.stopped(vehicle.id)
+            if stopped:
+                self._stop_soon(vehicle)
             path = self.holdings.path(vehicle.id)
             ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)
+            if stopped:
+                self.wishes[vehicle.id] = _STAYS
+                self._wished.pop(vehicle.id, None)
+                continue
             self._wish(vehicle, path, now_ns)
             self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
         for (target_id, force), batch in asks.items():

@@ -114,6 +114,7 @@ class AgentService:
         self._zones = ZonesAround(self._replica, self._cost_map)
         self._obedience = Obedience(setup, bus, post, self._obeys)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
+        self._obeyed_version = 0
         self._roster = Roster()
         self._now_ns = 0
         self._fleet = FleetReport(self._author, group)
@@ -127,7 +128,7 @@ class AgentService:
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
         self._sync.start(now_ns)
-        self._obedience.start()
+        self._obedience.start(now_ns)
         self._bus.collect(POSE)
         if self._untracked.targets:
             self._bus.collect(TRUE_POSE)
@@ -139,7 +140,7 @@ class AgentService:
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if self._right_of_way.handle(event, now_ns) or self._obedience.handle(event):
+        if self._right_of_way.handle(event, now_ns) or self._obedience.handle(event, now_ns):
             return
         agent = self._agent
         match event:
@@ -179,8 +180,8 @@ class AgentService:
             self._stand_down(now_ns)
         self._zones.update(agent.places, now_ns)
         agent.set_ways_out(self._zones.ways_out)
+        self._obey(now_ns)
         agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
-        self._obedience.tick()
         if agent.places:
             self._sync.enter(self._near_marks.update(agent.places))
         agent.begin_drive(now_ns)
@@ -205,8 +206,22 @@ class AgentService:
     def stop(self, now_ns: int) -> None:
         self._member.publish_stats(now_ns)
 
+    def _obey(self, now_ns: int) -> None:
+        """Go by what is ordered."""
+        orders, agent = self._obedience, self._agent
+        agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
+        if self._obeyed_version != orders.book.version:
+            self._obeyed_version = orders.book.version
+            scenario, book = self._setup.scenario, orders.book
+            agent.set_targets(book.targets_of(agent.plan.group.name, scenario), now_ns)
+            agent.set_pace(
+                book.setting("time_scale", scenario.time_scale),
+                book.setting("vehicles.reassign_s", scenario.vehicles.reassign_s),
+            )
+        orders.tick(now_ns)
+
     def _obeys(self, order: Obey) -> bool:
-        return self._sync.holds(order.author, order.sets, self._now_ns)
+        return order.subject is not None or self._sync.holds(order.author, order.sets, self._now_ns)
 
     # --- places ---------------------------------------------------------------------------------------------
 

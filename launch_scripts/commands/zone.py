@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch_scripts.commands.order_options import checked, print_obeyed
 from launch_scripts.commands.query import Where
 from launch_scripts.commands.shared_options import AsJson, Tls, spread
 
@@ -59,7 +60,7 @@ def add(
     fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _seconds(until)}
     fields["polygon"] = _corners("--polygon", polygon)
     fields["polygon_m"] = _corners("--polygon-m", polygon_m)
-    _give(_checked(ZoneOrder, fields), where, tls, as_json)
+    _give(checked(ZoneOrder, fields), where, tls, as_json)
 
 
 @app.command()
@@ -70,7 +71,7 @@ def remove(
     """Open a zone again."""
     from swarm.wire.messages.orders import ZoneOrder
 
-    _give(_checked(ZoneOrder, {"action": "remove", "name": name}), where, tls, as_json)
+    _give(checked(ZoneOrder, {"action": "remove", "name": name}), where, tls, as_json)
 
 
 @app.command(name="list")
@@ -116,15 +117,6 @@ def _print(zones: Zones, acknowledged: Acknowledged | None, as_json: bool) -> No
     stands = [zone for zone in zones.zones if zone.name == zones.changed]
     typer.echo(_line(stands[0]) if stands else f"zone {zones.changed} is removed")
     print_obeyed(acknowledged)
-
-
-def print_obeyed(acknowledged: Acknowledged) -> None:
-    """Who obeys an order, and who has not said so."""
-    took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3
-    typer.echo(f"{len(acknowledged.obeyed)} processes obey, the last after {took_ms:.0f} ms")
-    if acknowledged.silent:
-        names = ", ".join(acknowledged.silent)
-        typer.echo(f"no answer yet from {names}: they obey as soon as they hear a keeper", err=True)
 
 
 def _line(zone: Zone) -> str:
@@ -177,16 +169,3 @@ def _corners(option: str, text: str | None) -> list[tuple[float, float]]:
     if text is not None and not corners:
         raise ConfigError(f"{option}: there is no corner in {text!r}, expected at least three such as 40,200")
     return corners
-
-
-def _checked(kind: type, fields: dict[str, object]) -> object:
-    import msgspec
-
-    from swarm.errors import ConfigError
-    from swarm.wire.codec import schema_of_type
-
-    try:
-        given = {name: value for name, value in fields.items() if value is not None}
-        return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
-    except (msgspec.ValidationError, ValueError) as error:
-        raise ConfigError(f"the order is not possible: {error}") from None

@@ -9,6 +9,7 @@ import msgspec
 
 from shared_map.keeper.base_map_transfer import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
+from shared_map.keeper.orders import KeptOrders
 from shared_map.keeper.store import Keeper, KeeperStore
 from shared_map.keeper.zones import free_name, rows_of, zone_sets, zones_of
 from shared_map.replication.marks import is_zone, standing
@@ -19,10 +20,11 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
+from swarm.order_book import described
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.marks import Digest, MarkSet
-from swarm.wire.messages.orders import ZoneOrder, Zones
+from swarm.wire.messages.orders import Order, ZoneOrder, Zones
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.topics import SIGHTED, ZONES
 
@@ -55,6 +57,7 @@ class KeeperService:
         self._terrain = terrain
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
+        self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
         self._keeper = Keeper()
         self.replica = MapReplica(terrain.grid)
         self._sync = MapSync(
@@ -72,7 +75,7 @@ class KeeperService:
         self._compact_after_ns = int(config.compact_after_s * NS_PER_S)
         self._plan = CompactionPlan(self._compact_after_ns, 0)
         self._compact_due_ns = 0
-        for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged"):
+        for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged", "orders_refused"):
             self.counters.count(name, 0)
         self._save_due_ns = 0
         self._sightings = Sightings(self.replica.filter)
@@ -91,6 +94,7 @@ class KeeperService:
         self._sync.start(now_ns)
         self._bus.subscribe(SIGHTED, self._post)
         self._bus.serve(ZONES, self._post, keeper=self._id)
+        self._orders.start(now_ns)
         log.info("keeper started: %d tiles in store %s", len(self.replica.held.tiles), self._store.path)
 
     def handle(self, event: Event, now_ns: int) -> None:
@@ -99,6 +103,13 @@ class KeeperService:
             return
         if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
             self._order_zone(event, event.request, now_ns)
+            return
+        ordered = self._orders.handle(event, now_ns)
+        if ordered is not False:
+            if isinstance(ordered, Order):
+                self._member.note(now_ns, "order", described(ordered))
+            elif isinstance(ordered, str):
+                self.counters.count("orders_refused")
             return
         if isinstance(event, Heard) and isinstance(event.message, Digest):
             self._plan.heard(event.message.author, now_ns)
@@ -114,6 +125,7 @@ class KeeperService:
         if now_ns >= self._sightings_due_ns:
             self._save_sightings(now_ns)
         self._sync.tick(now_ns)
+        self._orders.tick(now_ns)
         self._name_throttled(now_ns)
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]

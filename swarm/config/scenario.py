@@ -170,6 +170,11 @@ class TargetConfig(Section, frozen=True, kw_only=True):
         """Whether the run moves it; the pose of an external target comes from another process."""
         return self.walk != "external"
 
+    @property
+    def ids(self) -> list[str]:
+        """`name` for one, `name0, name1, ...` for several."""
+        return [self.name] if self.count == 1 else [f"{self.name}{n}" for n in range(self.count)]
+
 
 class GroupConfig(Section, frozen=True, kw_only=True):
     """Vehicles that belong together.
@@ -376,6 +381,4 @@ class Scenario(Section, frozen=True, kw_only=True):
 
 def ids_of(target: TargetConfig) -> list[str]:
     """Ids of a target: `name` for one, `name0, name1, ...` for several."""
-    if target.count == 1:
-        return [target.name]
-    return [f"{target.name}{n}" for n in range(target.count)]
+    return target.ids

@@ -8,10 +8,13 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from swarm.wire.fields import (
+    IDS,
     Bounded,
+    Cell,
     CellIndex,
     Column,
     Count,
+    Gauge,
     Id,
     Incarnation,
     Metres,
@@ -99,14 +102,99 @@ class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):
     sets: _Rows = b""
 
 
+Subject = Literal["pause", "vehicle", "group", "target", "set"]
+SimulatedWalk = Literal["still", "random", "waypoints", "evade"]
+_Name = Annotated[str, Meta(max_length=64)]
+"""Empty of a pause, else an id or the key of a setting."""
+_Speed = Annotated[float, Meta(ge=0, le=1e4)]
+_Targets = Annotated[list[Id], IDS]
+_WALK: SimulatedWalk = "waypoints"
+_SPEED_M_PER_S = 4.0
+
+
+class Order(Bounded, frozen=True, kw_only=True):
+    """What was ordered last about one subject.
+
+    name      of the vehicle, group, target or setting
+    stamp_ns  of two orders about one subject the later counts
+    off       taken back: a pause ended, a vehicle goes, a group chases what the scenario says, a target is removed,
+              a setting is the scenario's
+    targets   whom a group chases; all if empty
+    value     of a setting
+    cell      where a target was put
+    added     the target walks as this says, not as the scenario does
+    """
+
+    subject: Subject
+    name: _Name
+    stamp_ns: StampNs
+    off: bool = False
+    targets: _Targets = []
+    value: Gauge | None = None
+    cell: CellIndex | None = None
+    walk: SimulatedWalk = _WALK
+    speed_m_per_s: _Speed = _SPEED_M_PER_S
+    added: bool = False
+
+    def relate(self) -> None:
+        if self.name:
+            check_id("name", self.name)
+
+
+class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order")):
+    """Asks a keeper to enter an order into its book. Fields as in `Order`.
+
+    row, col  instead of a cell
+    new       the target must not be there yet; otherwise it must
+    """
+
+    subject: Subject
+    name: _Name = ""
+    off: bool = False
+    targets: _Targets = []
+    value: Gauge | None = None
+    cell: CellIndex | None = None
+    row: Cell | None = None
+    col: Cell | None = None
+    walk: SimulatedWalk = _WALK
+    speed_m_per_s: _Speed = _SPEED_M_PER_S
+    new: bool = False
+
+    def relate(self) -> None:
+        if self.name:
+            check_id("name", self.name)
+        elif self.subject != "pause":
+            raise ValueError(f"name is missing: which {self.subject} is it about?")
+        if (self.row is None) != (self.col is None) or (self.row is not None and self.cell is not None):
+            raise ValueError("give either cell, or row and col")
+        if self.subject == "target" and not self.off and self.cell is None and self.row is None:
+            raise ValueError("give the target's place: cell, or row and col")
+
+
+class Orders(Message, frozen=True, kw_only=True, tag=schema_of("orders")):
+    """All orders that a process knows: of a keeper, those on its disk.
+
+    given  the order that this answers, if it answers one
+    """
+
+    role: Id
+    id: Id
+    orders: Annotated[list[Order], Meta(max_length=2000)]
+    given: Order | None = None
+
+
 class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
     """Asks a process to answer as soon as it obeys: what it does and plans from then on goes by the order.
 
-    author, sets    a zone: its author, and its sets as rows of a digest
+    author, sets             a zone: its author, and its sets as rows of a digest
+    subject, name, stamp_ns  any other order
     """
 
     author: Word = ""
     sets: _Rows = b""
+    subject: Subject | None = None
+    name: _Name = ""
+    stamp_ns: StampNs = 0
 
     def relate(self) -> None:
         if self.author or self.sets:

@@ -1,4 +1,4 @@
-"""Vehicles and zones: whoever stands in one drives out of it, nobody drives in, and what they see there is no news."""
+"""Vehicles and zones: whoever stands in one drives out, nobody drives in, and what they see there is no news."""
 
 from __future__ import annotations
 
