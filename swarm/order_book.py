@@ -141,6 +141,7 @@ def judged(
 
     vehicles  ids of all vehicles
     """
+    assert given.subject is not None
     fault = _FAULTS[given.subject](given, book, scenario, vehicles)
     if fault is not None:
         return fault

@@ -15,7 +15,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, ZoneOrder, Zones
 from swarm.wire.messages.processes import RunInfo
-from swarm.wire.topics import GIVE_ORDER, OBEYED, ORDERS, RUN, ZONES, Topic
+from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, ZONES, Topic
 
 _OBEY_ZONES = frozenset({"agent", "planner"})
 _OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
@@ -62,12 +62,9 @@ class Operator:
 
     def orders(self) -> Orders:
         """What is ordered. Raises BusError without a keeper."""
-        keeper = self._keeper()
-        replies, _ = self._ask(ORDERS, Nothing(), _ORDER_S, role="keeper", id=keeper)
-        for reply in replies:
-            if isinstance(reply, Orders):
-                return reply
-        raise BusError(f"keeper {keeper} does not answer")
+        reply = self._order(GIVE_ORDER, GiveOrder(), self._keeper())
+        assert isinstance(reply, Orders)
+        return reply
 
     def give(self, order: GiveOrder) -> tuple[Order, Acknowledged]:
         """Pause, stop, say whom to chase, add targets, change settings, or take that back; wait until all obey.

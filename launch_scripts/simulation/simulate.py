@@ -119,8 +119,8 @@ class Simulation:
 
     def crash(self, name: str, *, for_good: bool = False) -> None:
         """Kills a node now, and starts it again after its backoff."""
-        node = self.nodes[name]
-        if node.bus is None:
+        node = self.nodes.get(name)
+        if node is None or node.bus is None:
             return
         node.crash()
         if for_good:
@@ -178,8 +178,9 @@ class Simulation:
             self.nodes[node.name] = node
             self.scheduler.after(NS_PER_S // 2, node.boot)
         for id in sorted(there.keys() - wanted):
-            self.crash(there[id].name, for_good=True)
-            self.nodes.pop(there[id].name)
+            node = self.nodes.pop(there[id].name)
+            node.crash()
+            node.retired = True
 
     def _watch(self) -> None:
         """Subscribes the recorder to its topics."""

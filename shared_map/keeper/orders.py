@@ -58,6 +58,10 @@ class KeptOrders:
                 event.answer(self._orders(), role="keeper", id=self._id)
                 event.end()
                 return True
+            case Asked(request=GiveOrder(subject=None)):
+                event.answer(self._orders(), keeper=self._id)
+                event.end()
+                return True
             case Asked(request=GiveOrder() as given):
                 order = self._take(given, now_ns)
                 if isinstance(order, str):

@@ -276,7 +276,7 @@ ORDERS = Topic(
     "orders", "orders/{role}/{id}", Orders,
     "what is ordered: keepers tell it, and everybody answers who starts and hears no keeper", "1 Hz, and on change",
     access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
-    request=Nothing, priority=Priority.INTERACTIVE,
+    request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 OBEYED = Topic(
     "obeyed", "obeyed/{role}/{id}", Obeyed, "that a process obeys an order, as soon as it does",

@@ -144,7 +144,8 @@ def _open(terrain: Terrain) -> int:
 @pytest.mark.parametrize("seed", range(4))
 def test_every_process_that_starts_after_an_acknowledged_pause_obeys_it(seed: int, terrain: Terrain) -> None:
     chance = random.Random(seed)
-    names = nodes_of(SMALL)
+    # Where a target is, only its planner knows when the process that moves it dies: not both are killed at once.
+    names = [name for name in nodes_of(SMALL) if not name.startswith("planner-")]
     crashes = [Crash(8.0 + 4.0 * chance.random(), chance.choice(names)) for _ in range(10)]
     simulation = simulated(terrain, FaultPlan(crashes=tuple(crashes)), seed)
     simulation.order(5.0, PAUSE)

@@ -144,11 +144,12 @@ class Order(Bounded, frozen=True, kw_only=True):
 class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order")):
     """Asks a keeper to enter an order into its book. Fields as in `Order`.
 
+    subject   None only asks what is ordered
     row, col  instead of a cell
     new       the target must not be there yet; otherwise it must
     """
 
-    subject: Subject
+    subject: Subject | None = None
     name: _Name = ""
     off: bool = False
     targets: _Targets = []
@@ -163,7 +164,7 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
     def relate(self) -> None:
         if self.name:
             check_id("name", self.name)
-        elif self.subject != "pause":
+        elif self.subject not in (None, "pause"):
             raise ValueError(f"name is missing: which {self.subject} is it about?")
         if (self.row is None) != (self.col is None) or (self.row is not None and self.cell is not None):
             raise ValueError("give either cell, or row and col")
