@@ -17,7 +17,8 @@ from swarm.wire.messages.orders import GiveOrder, Order, Subject
 
 MAX_AHEAD_NS = 24 * 3600 * NS_PER_S
 """An order stamped further ahead of the reader's clock is refused, as nobody could take it back."""
-MOST_ORDERS = 2000
+MOST_ORDERS = 1999
+"""Beside a pause, for which there is always room."""
 
 Key = tuple[Subject, str]
 
@@ -44,7 +45,8 @@ class OrderBook:
         for order in orders:
             key: Key = (order.subject, order.name)
             held = self._orders.get(key)
-            if order.stamp_ns > now_ns + MAX_AHEAD_NS or (held is None and len(self._orders) >= MOST_ORDERS):
+            full = held is None and order.subject != "pause" and len(self._orders) >= MOST_ORDERS
+            if order.stamp_ns > now_ns + MAX_AHEAD_NS or full:
                 continue
             if held is None or _rank(order) > _rank(held):
                 self._orders[key] = order
@@ -146,7 +148,8 @@ def judged(
     if fault is not None:
         return fault
     before = book.about(given.subject, given.name)
-    if len(book) >= MOST_ORDERS and before is None:
+    full = len(book) >= MOST_ORDERS and not book.knows(given.subject, given.name, 0)
+    if full and given.subject != "pause":
         return f"there are {len(book)} orders already, at most {MOST_ORDERS}"
     walk, speed_m_per_s, added = given.walk, given.speed_m_per_s, given.new
     if before is not None and before.added:  # it is moved, or removed

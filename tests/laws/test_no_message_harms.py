@@ -131,7 +131,9 @@ class Lied(SwarmModel):
                     for order in orders:
                         given = GiveOrder(subject=order.subject, name=order.name, off=True)
                         if order.subject == "target":
-                            given = GiveOrder(subject="target", name=order.name, new=order.off, cell=80, walk="still")
+                            given = GiveOrder(
+                                subject="target", name=order.name, new=order.off, cell=80, walk="still"
+                            )
                         self.ear.ask(GIVE_ORDER, given, ignore, tag="o", keeper="0")
                 case Replied(message=Zones(zones=zones)):
                     for zone in zones:
