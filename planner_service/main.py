@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from contextlib import closing
 
@@ -40,10 +41,10 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     network = scenario.network
     with (
         open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
-        closing(ThreadWorker("grow-tree", inbox, clock)) as worker,
+        closing(ThreadWorker("grow-tree", inbox)) as worker,
     ):
         service = PlannerService(
-            setup, terrain, bus, inbox.post, worker, clock.now_ns, lambda: kernels.complete, prepared
+            setup, terrain, bus, inbox.post, worker, time.thread_time_ns, lambda: kernels.complete, prepared
         )
         process = Process(service, inbox, clock, scenario.planner.tick_hz)
         process.stop_on_signals()
