@@ -24,7 +24,9 @@ from swarm.config.agents import agent_of
 from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
+from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Chasers
@@ -58,6 +60,7 @@ class PlannerService:
     ) -> None:
         scenario = setup.scenario
         self._target = job_of(setup.id)
+        self._scenario = scenario
         self._bus = bus
         self._post = post
         self._worker = worker
@@ -87,6 +90,11 @@ class PlannerService:
             leads=False,
             time_scale=scenario.time_scale,
         )
+        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obeyed_version = 0
+        self._removed = False
+        """Whether its target was removed: then it serves nobody."""
+        self._now_ns = 0
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
@@ -103,13 +111,14 @@ class PlannerService:
         else:
             self._bus.collect(POSE, target=self._target)
         self._bus.collect(CHASERS, target=self._target)
+        self._obedience.start(now_ns)
         self._candidacy.start()
         self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if self._candidacy.handle(event, now_ns):
+        if self._candidacy.handle(event, now_ns) or self._obedience.handle(event, now_ns):
             return
         match event:
             case Heard(message=Sighted() as sighted):
@@ -139,8 +148,11 @@ class PlannerService:
             self._planner.hear_chasers(heard.message, now_ns)
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
-        self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)
+        self._obey()
+        self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns) and not self._removed, now_ns)
         self._perform(self._planner.tick(now_ns), now_ns)
+        self._now_ns = now_ns
+        self._obedience.tick(now_ns)
         self._answer(now_ns)
         if self._search is not None and not self._searching:
             self._searching = True
@@ -167,6 +179,23 @@ class PlannerService:
             else:
                 event.answer(reply, target=self._target)
             event.end()
+
+    def _obey(self) -> None:
+        """Go by what is ordered."""
+        book, scenario = self._obedience.book, self._scenario
+        if book.version == self._obeyed_version:
+            return
+        self._obeyed_version = book.version
+        self._removed = self._target not in book.targets(scenario)
+        self._planner.set_pace(
+            book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
+            book.setting("planner.push_s", scenario.planner.push_s),
+        )
+
+    def _obeys(self, order: Obey) -> bool:
+        if order.subject is not None:
+            return True
+        return self._sync.holds(order.author, order.sets, self._now_ns) and self._planner.knows_map
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()

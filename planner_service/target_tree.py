@@ -97,8 +97,8 @@ class TargetTree:
         self._full_ns = self.measured_model_ns()
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
         self._schedule = WindowSchedule(grid, self._narrowest)
-        self._auto = AutoStage(config.cpu_budget * 1e9 / config.tick_hz)
-        self._auto.observe(self._full_ns, self._widest)
+        self._auto = AutoStage(0.0)
+        self.set_budget(config.cpu_budget)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
 
@@ -107,6 +107,11 @@ class TargetTree:
         """The row in force now; under `auto` it changes with `observe_full_ns`."""
         only_whole = self._costs.directed or not self._all_kernels()
         return row_of(self._config.strategy, self._auto.stage, only_whole=only_whole)
+
+    def set_budget(self, cpu_budget: float) -> None:
+        """The share of one core that this tree may take from now on, under `auto`."""
+        self._auto.budget_ns = cpu_budget * 1e9 / self._config.tick_hz
+        self._auto.observe(self._full_ns, self._widest)
 
     def share(self, cell_cost: Floats) -> None:
         """Begin with the cell costs of the map as it is before any mark, which other processes share; `update` is

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -32,6 +32,7 @@ from vehicle_agent.traffic.steering import Steering
 _LONGEST_STEP_S = 0.5
 _WISH_LASTS_NS = NS_PER_S
 """A wish that has not changed is made anew so often, as it tells the vehicle's age."""
+_STAYS = Wish()
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
@@ -82,6 +83,7 @@ class Agent:
     bodies     what they must not drive into, though it speaks no right of way
 
     wishes     what to ask of wardens, as of the last `decide`
+    stopped    whether an operator wants a vehicle to stand
     """
 
     def __init__(
@@ -99,6 +101,7 @@ class Agent:
         self.holdings = holdings
         self.wishes: dict[str, Wish] = {}
         self.blocked_ticks = 0
+        self.stopped: Callable[[str], bool] = lambda vehicle: False
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = local_map
@@ -128,6 +131,25 @@ class Agent:
         self._wished: dict[str, tuple[object, ...]] = {}
         """Vehicle under way -> what its wish was made of."""
 
+    # --- what operators order ---------------------------------------------------------------------------------
+
+    def set_targets(self, targets: Sequence[str], now_ns: int) -> None:
+        """The targets that the vehicles may go for from now on. Those that go for another get one of these."""
+        if list(targets) == self.targets:
+            return
+        self.targets = list(targets)
+        self._assignment.set_targets(self.targets)
+        for vehicle in self.vehicles.values():
+            if vehicle.target is not None and vehicle.target not in self.targets:
+                vehicle.release()
+                self._stop_soon(vehicle)
+        self._assignment.ask_soon(now_ns)
+
+    def set_pace(self, time_scale: float, reassign_s: float) -> None:
+        """Seconds on the terrain per second, and how often vehicles ask which target is the cheapest."""
+        self._time_scale = time_scale
+        self._assignment.set_period(reassign_s)
+
     # --- where vehicles start -------------------------------------------------------------------------------
 
     def place(self, vehicles: Sequence[str]) -> None:
@@ -143,6 +165,10 @@ class Agent:
         self.vehicles.clear()
         self.wishes.clear()
         self._wished.clear()
+
+    def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
+        """Cells that only an operator's zone closes, and how many steps it is from each out of it."""
+        self._steering.ways_out = ways_out
 
     @property
     def places(self) -> list[int]:
@@ -182,6 +208,8 @@ class Agent:
         physics = self._map.physics.reshape(-1)
         while left_s > 0.0:
             if motion.at_rest:
+                if self.stopped(vehicle.id):
+                    return 0.0
                 path = self.holdings.path(vehicle.id)
                 if len(path) < 2 or not self._steering.passable(path[0], path[1]):
                     return 0.0
@@ -261,10 +289,17 @@ class Agent:
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
             self._check_reach(vehicle)
+            stopped = self.stopped(vehicle.id)
+            if stopped:
+                self._stop_soon(vehicle)
             path = self.holdings.path(vehicle.id)
             ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)
+            if stopped:
+                self.wishes[vehicle.id] = _STAYS
+                self._wished.pop(vehicle.id, None)
+                continue
             self._wish(vehicle, path, now_ns)
             self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
         for (target_id, force), batch in asks.items():

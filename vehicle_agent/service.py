@@ -21,9 +21,11 @@ from swarm.errors import ConfigError
 from swarm.liveness import Roster
 from swarm.ranks import job_of
 from swarm.runtime.membership import Member
+from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
@@ -51,6 +53,7 @@ from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.zones import ZonesAround
 
 log = logging.getLogger(__name__)
 
@@ -112,7 +115,10 @@ class AgentService:
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
+        self._zones = ZonesAround(self._replica, self._cost_map)
+        self._obedience = Obedience(setup, bus, post, self._obeys)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
+        self._obeyed_version = 0
         self._roster = Roster()
         self._now_ns = 0
         self._fleet = FleetReport(self._author, group)
@@ -126,6 +132,7 @@ class AgentService:
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
         self._sync.start(now_ns)
+        self._obedience.start(now_ns)
         self._bus.collect(POSE)
         self._bus.collect(BODY)
         if self._untracked.targets:
@@ -138,7 +145,7 @@ class AgentService:
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if self._right_of_way.handle(event, now_ns):
+        if self._right_of_way.handle(event, now_ns) or self._obedience.handle(event, now_ns):
             return
         agent = self._agent
         match event:
@@ -176,13 +183,16 @@ class AgentService:
         self._right_of_way.hear_granted(now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
+        self._zones.update(agent.places, now_ns)
+        agent.set_ways_out(self._zones.ways_out)
+        self._obey(now_ns)
         agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
         if agent.places:
             self._sync.enter(self._near_marks.update(agent.places))
         self._hear_bodies(now_ns)
         agent.begin_drive(now_ns)
-        while (findings := agent.drive()) is not None:
-            if len(findings):
+        while (found := agent.drive()) is not None:
+            if len(findings := self._zones.without(found)):
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._cost_map.take_dirty(), now_ns)
@@ -201,6 +211,23 @@ class AgentService:
 
     def stop(self, now_ns: int) -> None:
         self._member.publish_stats(now_ns)
+
+    def _obey(self, now_ns: int) -> None:
+        """Go by what is ordered."""
+        orders, agent = self._obedience, self._agent
+        agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
+        if self._obeyed_version != orders.book.version:
+            self._obeyed_version = orders.book.version
+            scenario, book = self._setup.scenario, orders.book
+            agent.set_targets(book.targets_of(agent.plan.group.name, scenario), now_ns)
+            agent.set_pace(
+                book.setting("time_scale", scenario.time_scale),
+                book.setting("vehicles.reassign_s", scenario.vehicles.reassign_s),
+            )
+        orders.tick(now_ns)
+
+    def _obeys(self, order: Obey) -> bool:
+        return order.subject is not None or self._sync.holds(order.author, order.sets, self._now_ns)
 
     # --- places ---------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ import typing
 from collections.abc import Sequence
 from enum import Enum
 from types import NoneType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -107,6 +107,8 @@ class Lies:
         metas = [note for note in notes if isinstance(note, msgspec.Meta)]
         if NoneType in args:
             return None if self._chance.random() < 0.3 else self._value(name, args[0])
+        if origin is Literal:
+            return self._chance.choice(args)
         if origin is int:
             return self._whole(*_limits(metas), cell="cell" in name or name in ("start", "held"))
         if origin is float:

@@ -21,6 +21,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
+from swarm.order_book import OrderBook
 from swarm.runtime.tracking import Trackings, Verdict
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
@@ -69,6 +70,7 @@ class _Target:
     captures: int = 0
     jumps: int = 0
     calm_until_ns: int = 0
+    ordered_ns: int = 0
 
 
 class TargetWorld:
@@ -77,8 +79,11 @@ class TargetWorld:
     An incarnation that starts while planners run goes on where they last saw the targets. A capture counts once:
     a target that jumps is out of reach for a cool-down, one that stays must first have been alone for another.
 
-    leads  false for a standby, which follows the poses that another tells and does nothing itself
+    leads   false for a standby, which follows the poses that another tells and does nothing itself
+    paused  nothing moves, and nobody is captured
     """
+
+    paused = False
 
     def __init__(
         self,
@@ -124,6 +129,35 @@ class TargetWorld:
                 raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
         walker = Walker(id, config.walk, slowness_of(config, scenario.cost), chance, cell)
         return _Target(config, walker, *self._grid.centre_m(cell))
+
+    def obey(self, book: OrderBook, scenario: Scenario, now_ns: int, *, first: bool) -> list[Action]:
+        """Go by what is ordered: who is there, and who was put somewhere else.
+
+        first  what was ordered before this process began: its targets are where planners last saw them
+        """
+        self._time_scale = book.setting("time_scale", scenario.time_scale)
+        self.paused = book.paused
+        configs = book.targets(scenario)
+        for id in self._targets.keys() - configs.keys():
+            del self._targets[id]
+        actions: list[Action] = []
+        for id, config in configs.items():
+            order = book.about("target", id)
+            target = self._targets.get(id)
+            if target is None or (order is not None and order.added and target.config != config):
+                target = self._targets[id] = self._place(id, config, scenario)
+            if order is None or order.cell is None or order.stamp_ns == target.ordered_ns:
+                continue
+            target.ordered_ns = order.stamp_ns
+            if not config.is_simulated or order.cell >= self._grid.cells or (target.placed and first):
+                continue
+            target.walker.put(self._terrain.nearest(order.cell))
+            if not first:
+                target.placed = True
+                target.jumps += 1
+                if self.leads:
+                    actions.append(Publish(self._pose(id, target, now_ns)))
+        return actions
 
     def lead(self, leads: bool) -> None:
         """Take over where the poses of the one before ended, or leave it to another.
@@ -190,8 +224,8 @@ class TargetWorld:
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
         actions: list[Action] = list(self._referee.hear(fleet))
-        if not self.leads:
-            return []
+        if not self.leads or self.paused:
+            return actions if self.leads else []
         for index, vehicle in self._catchers(fleet, now_ns):
             id = fleet.target_ids[index]
             actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
@@ -204,6 +238,8 @@ class TargetWorld:
         if self._started_ns is None:
             self._started_ns = self._ticked_ns = now_ns
         elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * self._time_scale
+        if self.paused:
+            elapsed_s = 0.0
         self._ticked_ns = now_ns
         waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells

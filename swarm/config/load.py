@@ -13,6 +13,7 @@ from swarm.config.explain import explain, nearest
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.scenario import (
     MOST_TARGETS,
+    RESERVED_GROUP,
     WHOLE_TREE_STRATEGIES,
     PlannerConfig,
     Scenario,
@@ -70,6 +71,8 @@ def _check(scenario: Scenario, source: str) -> None:
     if len(set(names)) < len(names):
         raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
     for name in names:
+        if name.split(".")[0] == RESERVED_GROUP:
+            raise ConfigError(f"{source}: groups: {name!r} is not free: zones of operators are marks of that name")
         longer = [other for other in names if other.startswith(f"{name}.")]
         if longer:  # the id of an author begins with its group and a point
             raise ConfigError(

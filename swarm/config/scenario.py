@@ -26,6 +26,8 @@ Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Point = tuple[Metres, Metres]
 Polygon = Annotated[tuple[Point, ...], Meta(min_length=3, max_length=10_000)]
 
+RESERVED_GROUP = "operator"
+"""No group is called so: zones are marks of this one, which every group hears."""
 MOST_TARGETS = 1000
 """Of all entries together."""
 

@@ -16,6 +16,7 @@ from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
@@ -145,6 +146,10 @@ def _chunk(value: str | int) -> str:
 _REPLICAS = "agent keeper planner monitor"
 """Roles which hold a replica of the map."""
 
+OBEYING = "agent planner targets keeper"
+"""Roles which go by orders."""
+OBEYING_OWN = " ".join(f"{role}:role,id" for role in OBEYING.split())
+
 RUN = Topic(
     "run", "run/{role}/{id}", RunInfo, "which run and terrain a process belongs to", "asked at every start",
     access(serve=MEMBERS_OWN, ask=MEMBERS),
@@ -268,6 +273,27 @@ LEAD = Topic(
     access(put="planner:role,id targets:role,id", hear="planner targets monitor"),
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
+ZONES = Topic(
+    "zones", "order/{keeper}/zones", Zones, "adds, removes and lists zones: areas that operators close",
+    "asked by people", access(serve="keeper:keeper"),
+    request=ZoneOrder, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+GIVE_ORDER = Topic(
+    "give-order", "order/{keeper}/give", Orders,
+    "enters an order into a keeper's book: pause, stop, whom to chase, which targets, settings", "asked by people",
+    access(serve="keeper:keeper"), request=GiveOrder, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+ORDERS = Topic(
+    "orders", "orders/{role}/{id}", Orders,
+    "what is ordered: keepers tell it, and everybody answers who starts and hears no keeper", "1 Hz, and on change",
+    access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
+    request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+OBEYED = Topic(
+    "obeyed", "obeyed/{role}/{id}", Obeyed, "that a process obeys an order, as soon as it does",
+    "asked after each order", access(serve="agent:role,id planner:role,id targets:role,id"),
+    request=Obey, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz",
     access(put=MEMBERS_OWN, hear="monitor"),
@@ -281,7 +307,8 @@ NOTE = Topic(
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, FOLLOWED,
-    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, STATS, NOTE,
+    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER, ORDERS, OBEYED,
+    STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"
