@@ -18,6 +18,7 @@ from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec, Window
 from swarm.liveness import POSE_SILENCE_NS, Newest
+from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
@@ -25,7 +26,6 @@ from vehicle_agent.assignment import AskCosts, Assignment
 from vehicle_agent.driving.route_follower import route_cells
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
-from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
