@@ -94,7 +94,7 @@ class RightOfWay:
         """
         if request.agent == self.agent or self.silent or self._is_guest:
             return []
-        if request.agent not in self._spawns:
+        if request.agent not in self._spawns or not request.disk:
             life, plots = self._known(request.agent)
             lives, agents = self._lives_of(request.agent), list(self.plots.agents)
             return [Known(agent=self.agent, disk=request.disk, life=life, plots=plots, lives=lives, agents=agents)]

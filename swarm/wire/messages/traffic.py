@@ -145,7 +145,7 @@ class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
     """A new life of an agent or a guest asks all agents what they know of it. `disk` names the file that it keeps;
-    nobody notes a guest's."""
+    a guest's is 0, and nobody notes it."""
 
     agent: Id
     disk: Natural
