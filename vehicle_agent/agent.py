@@ -17,6 +17,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec, Window, walk
+from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings, Verdict
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
@@ -26,7 +27,6 @@ from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.detours import Detours
-from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
