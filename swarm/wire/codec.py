@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import msgpack
 import msgspec
-import numpy as np
 
 from swarm.errors import ProtocolError
+from swarm.lazy_numpy import numpy_loaded, np
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import faulty_sets
@@ -62,7 +62,7 @@ def decode_either(payload: bytes, usual: type[M], other: type[N] | None) -> M | 
 
 def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | ProtocolError]:
     """As `decode` of each payload, errors in place. The statements of many mark sets are checked at once."""
-    at_once = len(payloads) >= _MANY_SETS
+    at_once = len(payloads) >= _MANY_SETS and numpy_loaded()
     found: list[M | ProtocolError] = []
     unchecked: list[tuple[int, MarkSet]] = []
     for payload in payloads:
