@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MEMBERS = "keeper planner agent targets tracker monitor"
-"""The roles of the processes of a run. A `tracker` publishes the pose of one real target; an external process."""
+MEMBERS = "keeper planner agent targets tracker rover monitor"
+"""The roles of the processes of a run. Two are external: a `tracker` publishes the pose of one real target, a
+`rover` where one vehicle is that no agent drives."""
 OPERATOR = "operator"
 """People's tools and the launcher: hear and ask everything, change nothing."""
 ROLES = (*MEMBERS.split(), OPERATOR)

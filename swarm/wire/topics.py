@@ -14,6 +14,7 @@ from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, access
 from swarm.wire.codec import prime
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
 from swarm.wire.messages.planning import (
     CostReply,
@@ -236,14 +237,20 @@ SIGHTED = Topic(
     "while it is in sight, at most 2 Hz",
     access(put="agent:author", hear="agent planner keeper monitor"),
 )  # fmt: skip
+BODY = Topic(
+    "body", "body/{id}", Body,
+    "where something is that vehicles must not drive into, though it speaks no right of way: an outside vehicle, "
+    "a person", "10 Hz while it moves, else before its lease ends",
+    access(put="rover:id targets", hear="agent rover targets monitor"), priority=Priority.INTERACTIVE,
+)  # fmt: skip
 ROUTE = Topic(
     "route", "target/{target}/route", RouteReply, "routes from cells to the target", "asked",
-    access(serve="planner:target", ask="agent"),
+    access(serve="planner:target", ask="agent rover"),
     request=RouteRequest, published=False,
 )  # fmt: skip
 COST = Topic(
     "cost", "target/{target}/cost", CostReply, "cost-to-go of a batch of cells", "asked",
-    access(serve="planner:target", ask="agent targets"),
+    access(serve="planner:target", ask="agent targets rover"),
     request=CostRequest, published=False,
 )  # fmt: skip
 STATUS = Topic(
@@ -270,7 +277,7 @@ NOTE = Topic(
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, FOLLOWED,
-    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, LEAD, STATS, NOTE,
+    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

@@ -35,6 +35,7 @@ NAMES = {
     "agent": "agent.blue.a0",
     "targets": "targets.0",
     "tracker": "tracker.t0",
+    "rover": "rover.r1",
     "monitor": "monitor.0",
     "operator": "operator.anna",
 }
@@ -82,6 +83,10 @@ FORBIDDEN = [
     ("operator", "put", "note/operator/anna"),
     ("operator", "raise", "alive/operator/anna/1"),
     ("tracker", "put", "target/t1/pose"),
+    ("rover", "put", "body/r2"),
+    ("rover", "put", "target/t0/pose"),
+    ("rover", "raise", "alive/agent/r1/1"),
+    ("agent", "put", "body/r1"),
     ("outsider", "hear", "**"),
     ("outsider", "ask", "**"),
     ("outsider", "put", "marks/0/0/blue.a7.1"),

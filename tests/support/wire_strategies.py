@@ -12,6 +12,7 @@ from shared_map.replication.mark_sets import packed
 from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET, pack_column
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages.bodies import LONGEST_LEASE_S, Body
 from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
 from swarm.wire.messages.planning import (
     CostReply,
@@ -221,6 +222,11 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         TargetPose, target=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, cell=cells, x_m=metres,
         y_m=metres, captures=counts, jumps=counts,
     ),
+    Body: st.builds(
+        Body, id=ids, group=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, x_m=metres, y_m=metres,
+        heading_rad=st.none() | st.floats(-12.5, 12.5), speed_m_per_s=st.floats(0, 1e6), radius_m=st.floats(0, 1e9),
+        lease_s=st.floats(0, LONGEST_LEASE_S),
+    ),
     Sighted: st.builds(
         Sighted, author=ids, group=ids, target=ids, seq=naturals, stamp_ns=naturals, until_ns=naturals, cell=cells,
         x_m=metres, y_m=metres, uncertainty_m=st.floats(0, 1e9),
@@ -311,6 +317,10 @@ EXAMPLES: tuple[Message, ...] = (
     Sighted(
         author="all.a0.7", group="all", target="t0", seq=2, stamp_ns=10, until_ns=90, cell=9, x_m=1.5, y_m=-2.5,
         uncertainty_m=8.0,
+    ),
+    Body(
+        id="r1", group="blue", incarnation=7, seq=3, stamp_ns=10, x_m=1.5, y_m=-2.5, heading_rad=0.5,
+        speed_m_per_s=2.0, radius_m=1.2, lease_s=2.0,
     ),
     RouteRequest(cells=[4, 5], vehicles=["a0-00", "a0-01"], max_cells=50, force=True),
     RouteReply(
