@@ -1,7 +1,7 @@
 """NumPy, imported when it is first used: a robot's process neither waits for it nor needs it installed.
 
-All roles of a swarm load it. Where nothing has, `numpy_loaded` is false and messages are read as lists, which is slower
-for many values and needs nothing: so does `swarm.client`.
+All roles of a swarm load it. Where nothing has, `numpy_loaded` is false and messages are read as lists, which is
+slower for many values and needs nothing: so does `swarm.client`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ else:
 
     np = _NumPy()
 
-__all__ = ["numpy_loaded", "np"]
+__all__ = ["np", "numpy_loaded"]
 
 
 def numpy_loaded() -> bool:

@@ -14,7 +14,7 @@ import msgpack
 import msgspec
 
 from swarm.errors import ProtocolError
-from swarm.lazy_numpy import numpy_loaded, np
+from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import faulty_sets
@@ -109,6 +109,8 @@ def _unpacked(payload: bytes) -> dict[Any, Any]:
     """The fields in a payload, with a `schema` of any value. Raises ProtocolError."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ProtocolError(f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES}")
+    if payload[:1] == b"{":
+        raise ProtocolError("it looks like JSON, which needs Zenoh's encoding application/json")
     # msgpack allocates a list as long as it claims to be: none has more items than the payload has bytes.
     longest = min(len(payload), MAX_ITEMS)
     # A short payload cannot hold too many items, so the usual one is not slowed down by counting them.

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from swarm.lazy_numpy import numpy_loaded, np
+from swarm.lazy_numpy import np, numpy_loaded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

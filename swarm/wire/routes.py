@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
-from swarm.lazy_numpy import numpy_loaded, np
+from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.fields import Bounded, Cell, Column, Cost, Directions, Length, check_column, column, pack_column
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import struct
 from typing import TYPE_CHECKING
 
 from swarm.grid import TILE_CELLS
-from swarm.lazy_numpy import numpy_loaded, np
+from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.fields import check_column, column
 
 if TYPE_CHECKING:

@@ -87,8 +87,11 @@ class ZenohWorld:
         self.buses.append(open_bus(self.network(namespace), authenticator=authenticator))
         return self.buses[-1]
 
-    def put_bytes(self, bus: ZenohBus, topic: Topic, payload: bytes, **fields: str) -> None:
-        bus.session.put(topic.keyed(bus.namespace, **fields), payload)
+    def put_bytes(
+        self, bus: ZenohBus, topic: Topic, payload: bytes, *, in_json: bool = False, **fields: str
+    ) -> None:
+        encoding = zenoh.Encoding.APPLICATION_JSON if in_json else zenoh.Encoding.ZENOH_BYTES
+        bus.session.put(topic.keyed(bus.namespace, **fields), payload, encoding=encoding)
 
     def until(self, true: Callable[[], object], within_s: float = 5.0) -> None:
         deadline_s = time.monotonic() + within_s

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from swarm.lazy_numpy import numpy_loaded, np
+from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.fields import Column, Id, Natural, Tile, Word, check_column, column, width_of
 from swarm.wire.messages.base import Message, schema_of
 from swarm.wire.statements import (
