@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import random
 import re
@@ -102,7 +103,7 @@ def test_a_column_is_a_list_of_its_numbers_or_base64_of_its_bytes():
         (Body, {"x_m": None}, "x_m"),
         (Body, {"x_m": "1"}, "x_m"),
         (Body, {"seq": 1.5}, "seq"),
-        (Body, {"seq": 1 << 70}, ""),
+        (Body, {"seq": 1 << 70}, "OverflowError"),
         (Body, {"id": "a/b"}, "id 'a/b' is not 1 to 64 of letters"),
         (PushedRoute, {"route": {"status": "ok", "start": 1, "directions": ["UP"]}}, "route.directions has 'UP'"),
     ],
@@ -137,14 +138,11 @@ json_values = st.recursive(
 def test_any_values_in_any_fields_raise_nothing_but_protocol_errors(data):
     message = BY_TYPE[data.draw(st.sampled_from(list(BY_TYPE)))]
     fields = as_dict(message)
-    for name in data.draw(
-        st.lists(st.sampled_from([*type(message).__struct_fields__, "schema", "odd"]), max_size=3)
-    ):
+    names = [*type(message).__struct_fields__, "schema", "odd"]
+    for name in data.draw(st.lists(st.sampled_from(names), max_size=3)):
         fields[name] = data.draw(json_values)
-    try:
+    with contextlib.suppress(ProtocolError):
         assert isinstance(read(json.dumps(fields), type(message)), type(message))
-    except ProtocolError as error:
-        assert str(error)
 
 
 def test_twenty_thousand_mutations_of_json_raise_nothing_but_protocol_errors():
