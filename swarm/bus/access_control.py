@@ -29,8 +29,8 @@ _LOOPBACK = "loopback"
 class Bearer:
     """Who a certificate was issued to.
 
-    name    `ROLE.ID`, for an agent `agent.GROUP.ID`
-    author  what its ids as an author begin with: the group and id of an agent, else the id
+    name    `ROLE.ID`, for an agent `agent.GROUP.ID`, for a rover that marks `rover.GROUP.ID`
+    author  what its ids as an author begin with: the group and id of an agent or rover, else the id
     """
 
     name: str
@@ -55,7 +55,7 @@ def bearer(name: str) -> Bearer:
     if role not in (*ROLES, ROUTER) or not author or (role == "agent" and not (group and id)):
         roles = ", ".join((ROUTER, *ROLES))
         raise ConfigError(f"{name!r} is no name of a process: ROLE.ID or agent.GROUP.ID; the roles are {roles}")
-    return Bearer(name, role, id if role == "agent" else author, author)
+    return Bearer(name, role, id if role in ("agent", "rover") else author, author)
 
 
 def common_name(name: str, revoked: Collection[str]) -> str:
