@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from contextlib import closing
 
@@ -38,10 +39,10 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     inbox = Inbox()
     with (
         open_bus(scenario.network, patient=True) as bus,
-        closing(ThreadWorker("grow-tree", inbox, clock)) as worker,
+        closing(ThreadWorker("grow-tree", inbox)) as worker,
     ):
         service = PlannerService(
-            setup, terrain, bus, inbox.post, worker, clock.now_ns, lambda: kernels.complete, prepared
+            setup, terrain, bus, inbox.post, worker, time.thread_time_ns, lambda: kernels.complete, prepared
         )
         process = Process(service, inbox, clock, scenario.planner.tick_hz)
         process.stop_on_signals()

@@ -39,8 +39,11 @@ MAX_GAP = 1.5
 MOST_ROUTES = 20_000
 MOST_STEPS = 4 << 20
 """In one answer, which must fit into one message: longer routes are cut, as if `max_cells` had asked for that."""
+GOOD_GAP = 1.05
+"""Under a strategy that goes by proofs, nothing is grown for a route asked for by force that is proven to be this
+good already."""
 _MEDIAN_OF = 5
-"""Growths whose median time `auto` goes by: on a busy machine single ones take many times as long."""
+"""Growths whose median CPU time `auto` goes by: single ones take longer, as after a change of processors."""
 
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
 
@@ -52,7 +55,7 @@ class Planner:
     way, and what changes meanwhile is made up for when it is adopted. Before the first tree all routes are
     NO_TARGET. The cost map belongs to the caller, which applies marks to it between calls.
 
-    stopwatch       times growths on this thread; without one they take what a model says, as in a simulation
+    stopwatch       CPU time of this thread, ns; without one growths take what a model says, as in a simulation
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
     shelf           where the planners of a machine leave corridors for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
@@ -267,11 +270,11 @@ class Planner:
 
     def _routes(self, request: RouteRequest, now_ns: int) -> RouteReply:
         cells = self._cells(request)
-        if request.force and self.tree.ready:
-            self._force(cells, now_ns)
         most = MOST_STEPS // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
         routes = self.tree.routes(cells, max_cells)
+        if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
+            routes = self.tree.routes(cells, max_cells)
         self.counters.count("routes_served", len(routes))
         self._certify(routes, now_ns)
         for index, vehicle in enumerate(request.vehicles):
@@ -287,11 +290,19 @@ class Planner:
             routes=routes.columns(),
         )
 
-    def _force(self, cells: list[int], now_ns: int) -> None:
-        """Cover cells, once each between two changes of the tree: asking again costs nothing."""
+    def _improvable(self, cells: list[int], routes: RouteBatch) -> list[int]:
+        """The cells whose routes may be worth a growth: all, or those without a proof that they are good."""
+        if not self.tree.strategy.renews_loose_bounds:
+            return cells
+        good = routes.cost_s <= GOOD_GAP * routes.lower_bound_s
+        return [cell for cell, is_good in zip(cells, good.tolist(), strict=True) if not is_good]
+
+    def _force(self, cells: list[int], now_ns: int) -> bool:
+        """Cover cells, once each between two changes of the tree: asking again costs nothing. Whether the tree has
+        changed."""
         fresh = sorted({cell for cell in cells if 0 <= cell < self._grid.cells} - self._forced)
         if not fresh:
-            return
+            return False
         began_ns = self._now()
         update = self.tree.force(fresh)
         self._timed(update, self._now() - began_ns, now_ns)
@@ -299,6 +310,7 @@ class Planner:
             self._changed(update, (), now_ns)
         self._wants_full |= update.wants_full
         self._forced.update(fresh)
+        return update.kind != "none"
 
     def _certify(self, routes: RouteBatch, now_ns: int) -> None:
         """Note the proven gaps; one that is too wide asks for a full growth, now and then, if the strategy does."""

@@ -40,7 +40,8 @@ _HOLD_NS, _MOST_HELD = NS_PER_S, 256
 class PlannerService:
     """Serves routes and costs to the target that the process is named after.
 
-    stopwatch     the clock that growths on this thread are timed with; a simulation gives none, and a model is used
+    stopwatch     the CPU time of this thread, ns, that growths on it are timed with; a simulation gives none, and a
+                  model is used
     all_kernels   whether all kernels may be called by now, not only those for whole trees
     """
 

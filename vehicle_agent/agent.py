@@ -16,13 +16,12 @@ from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
-from swarm.grid import GridSpec, Window
+from swarm.grid import GridSpec, Window, walk
 from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.assignment import AskCosts, Assignment
-from vehicle_agent.driving.route_follower import route_cells
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.holdings import Holdings, Wish
@@ -361,17 +360,18 @@ class Agent:
         return self._take(vehicle, pushed.target, pushed.route, now_ns, pushed=True)
 
     def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Follow]:
-        cells = (
-            route_cells(self._map.grid, route.start, route.directions) if route.status is RouteStatus.OK else None
-        )
-        if cells is None:
-            if not pushed and route.status is RouteStatus.OK:
-                vehicle.no_answer(now_ns)
-            elif not pushed:
+        if route.status is not RouteStatus.OK:
+            if not pushed:
                 vehicle.refuse_route(target, route.status, now_ns)
             return []
+        try:
+            cells = walk(self._map.grid, route.start, route.directions)
+        except ValueError:
+            if not pushed:
+                vehicle.no_answer(now_ns)
+            return []
         partial = route.remaining_s > 0.0
-        given = GivenRoute(target, cells, route.cost_s, route.lower_bound_s, partial, pushed)
+        given = GivenRoute(target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed)
         path = self.holdings.path(vehicle.id)
         begun = vehicle.give_route(given, path, now_ns)
         if begun is None:

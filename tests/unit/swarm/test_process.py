@@ -249,8 +249,8 @@ def test_a_process_ticks_at_its_rate_and_stops_from_another_thread():
 
 
 def test_a_worker_gives_its_result_back_as_an_event():
-    inbox, clock = Inbox(), MonotonicClock()
-    worker = ThreadWorker("w", inbox, clock)
+    inbox = Inbox()
+    worker = ThreadWorker("w", inbox)
     worker.submit("grow", lambda: 42, inbox.post)
     done = inbox.take(5.0)
     assert isinstance(done, WorkDone)
@@ -264,7 +264,7 @@ def test_a_worker_gives_its_result_back_as_an_event():
 
 def test_closing_a_worker_waits_for_no_job_and_begins_no_other():
     inbox, began, release = Inbox(), threading.Event(), threading.Event()
-    worker = ThreadWorker("w", inbox, MonotonicClock())
+    worker = ThreadWorker("w", inbox)
     worker.submit("kernel", lambda: (began.set(), release.wait(10.0)), inbox.post)
     worker.submit("forgotten", lambda: 1 // 0, inbox.post)
     assert began.wait(5.0)
@@ -363,7 +363,7 @@ from swarm.runtime.process import Inbox, Process, ThreadWorker
 from swarm.runtime.stats import Counters
 
 inbox, clock, began = Inbox(), MonotonicClock(), threading.Event()
-worker = ThreadWorker("kernel", inbox, clock)
+worker = ThreadWorker("kernel", inbox)
 
 class Working:
     counters = Counters()
