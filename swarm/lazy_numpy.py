@@ -36,4 +36,4 @@ __all__ = ["np", "numpy_loaded"]
 
 def numpy_loaded() -> bool:
     """Whether anything in this process has imported NumPy: if not, bytes are read as lists."""
-    return "numpy" in sys.modules
+    return sys.modules.get("numpy") is not None

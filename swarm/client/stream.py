@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+if TYPE_CHECKING:
+    import asyncio
 
 T = TypeVar("T")
 MOST_WAITING = 1024
@@ -58,7 +60,9 @@ class Stream(Generic[T]):
             yield value
 
     async def __aiter__(self) -> AsyncIterator[T]:
-        loop = asyncio.get_running_loop()
+        from asyncio import get_running_loop  # whose import takes as long as all of ours
+
+        loop = get_running_loop()
         while True:
             with self._changed:
                 value = self._waiting.popleft() if self._waiting else None
