@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 CAPTURE = "capture"
 _SILENCE_NS = 5 * NS_PER_S
 _EVERY_S = 0.2
+_HEARD = (FLEET, BODY, POSE, FOLLOWED, NOTE, MARKS)
+_SAMPLED = (FLEET,)
+"""Of these only the newest is read, five times a second: they come at every tick, of every vehicle."""
 _MARKS_TAG = "observer-marks"
 _MOST_SETS = 1 << 16
 
@@ -83,10 +86,11 @@ class Observer:
         """(tile, author) -> its newest set."""
         session.add(self)
         bus, post = session.bus, session.post
-        for topic in (FLEET, BODY, POSE):
-            bus.subscribe(topic, post, every_s=_EVERY_S)
-        for topic in (FOLLOWED, NOTE, MARKS):
-            bus.subscribe(topic, post)
+        for topic in _HEARD:
+            if topic in _SAMPLED:
+                bus.subscribe(topic, post, every_s=_EVERY_S)
+            else:
+                bus.subscribe(topic, post)
         self._ask_marks()
 
     def __enter__(self) -> Observer:
@@ -169,7 +173,7 @@ class Observer:
         """Watch no more. May be repeated."""
         with self._session.lock:
             self.notes.close()
-            for topic in (FLEET, BODY, POSE, FOLLOWED, NOTE, MARKS):
+            for topic in _HEARD:
                 self._session.bus.unsubscribe(topic)
             self._session.remove(self)
 

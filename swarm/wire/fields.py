@@ -40,13 +40,13 @@ class Characters:
 class Column:
     """In an annotation of bytes: the values that they hold. `Bounded` checks it.
 
-    dtype        of the values, as NumPy writes it, or a list of names and types: a row; NaN is refused
+    dtype        of the values, as NumPy writes it, or the names and types of a row; NaN is refused
     per          the field of the same struct that has as many items as this column values; "" if there is none
     least, most  bounds of the values; None where the dtype has no other, or `relate` says more
     checked      false where the struct checks it itself: the statements of many sets of marks at once
     """
 
-    dtype: str | list[tuple[str, str]]
+    dtype: str | tuple[tuple[str, str], ...]
     per: str = ""
     least: float | None = None
     most: float | None = None
@@ -146,7 +146,7 @@ SMALL, LARGE = Meta(max_length=MOST_VEHICLES), Meta(max_length=100_000)
 IDS = Meta(max_length=MOST_IDS)
 
 
-def width_of(dtype: str | list[tuple[str, str]]) -> int:
+def width_of(dtype: str | tuple[tuple[str, str], ...]) -> int:
     """Bytes of a value, or of a row."""
     return int(dtype[2:]) if isinstance(dtype, str) else sum(width_of(part) for _, part in dtype)
 

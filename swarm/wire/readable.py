@@ -189,9 +189,9 @@ def _of_map(item: _Form, numbered: bool) -> _Form:
     return _Form(lambda value: {str(name): item.show(each) for name, each in value.items()}, pack)
 
 
-def _of_bytes(dtype: str | list[tuple[str, str]]) -> _Form:
+def _of_bytes(dtype: str | tuple[tuple[str, str], ...]) -> _Form:
     """A column: a list of its values, or of its rows; or base64 of its bytes."""
-    row = [part for _, part in dtype] if isinstance(dtype, list) else None
+    row = [part for _, part in dtype] if isinstance(dtype, tuple) else None
     layout = struct.Struct("<" + "".join(CODES[part] for part in row or [str(dtype)]))
     floats = row is None and dtype[1] == "f"
     what = "[" + ", ".join(map(name_of, row)) + "]" if row else name_of(str(dtype))

@@ -22,11 +22,12 @@ from swarm.wire.statements import (
 
 SEQ_STEP = 1 << 16
 """An author's own numbers are multiples of this."""
-DIGEST_ROW = [("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8")]
-"""NumPy's description of a row."""
+_ROW = (("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8"))
+DIGEST_ROW = list(_ROW)
+"""As NumPy wants it."""
 MOST_TILES = 1 << 18
 """Named in one message: every tile of a map of 16,384 x 16,384 cells."""
-_ROWS = Meta(max_length=width_of(DIGEST_ROW) * MOST_TILES)
+_ROWS = Meta(max_length=width_of(_ROW) * MOST_TILES)
 _AUTHORS = Meta(max_length=1 << 16)
 _Cells = Annotated[bytes, Column("<u2", per="kinds", least=0, most=TILE_AREA - 1, checked=False)]
 _Kinds = Annotated[bytes, Column("<u1", least=0, most=LAST_KIND, checked=False)]
@@ -133,7 +134,7 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
 
     author: Id
     role: Word
-    held: Annotated[dict[Id, Annotated[bytes, _ROWS, Column(DIGEST_ROW)]], _AUTHORS]
+    held: Annotated[dict[Id, Annotated[bytes, _ROWS, Column(_ROW)]], _AUTHORS]
     whole: bool = True
     seq: Natural = 0
 
