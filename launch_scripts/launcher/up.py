@@ -34,6 +34,7 @@ from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
+from shared_map.terrain.terrain_report import summary_of
 from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
@@ -182,7 +183,9 @@ class _Run:
     def _run(self) -> int:
         with self._stop_asked.interrupting():
             self._terrain, self._truth = self._prepared()
-            log.info("terrain is ready")
+            log.info("terrain is ready: %s", summary_of(self._terrain))
+            for note in self._terrain.notes:
+                log.info("terrain: %s", note)
         if self._stop_asked:
             return 0
         self._wait(lambda: self._warm_up.progress, self._warm_up.done, again_s=2.0)

@@ -79,20 +79,24 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Where elevation and photo come from.
 
-    source        "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .hgt, .vrt, .asc, .npz, .png, .map
-                  (MovingAI), .yaml or .yml (ROS)
-    photo         a colour GeoTIFF on the same ground, or nothing
-    labels        a TOML file of labelled polygons and points, from which to learn what the photo shows
-    resolution_m  cell size to bring everything to; the source's own if not given
-    crs           coordinate system of the source where the file does not say it, such as "EPSG:32632"
-    height_scale  metres per unit of height, where the file does not say it (.png)
-    nodata        voids are lethal, or filled from their surroundings
-    roads         how many roads to lay between seeded places, as there is no map of them
-    rows          synthetic: cells from north to south
-    cols          synthetic: cells from west to east
-    relief_m      synthetic: height of the highest cell above the lowest
-    rivers        synthetic: how many rivers cross the terrain
-    hidden        what is true of the terrain and missing from the map
+    source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .hgt, .vrt, .asc, .npz, .png, .map
+                   (MovingAI), .yaml or .yml (ROS)
+    photo          a colour GeoTIFF on the same ground, or nothing
+    labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
+    resolution_m   cell size to bring everything to; the source's own if not given
+    crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
+    height_scale   metres per unit of height, where the file does not say it (.png)
+    nodata         voids are lethal, or filled from their surroundings
+    nodata_values  heights, as they are stored in the source, that stand for no height beside those that it declares
+    level_is       what level ground of a file is taken for where no photo shows it: elevation models are levelled
+                   on lakes and the sea
+    water_below_m  ground of a file lower than this is water where no photo shows it; 0 for a coast
+    roads          how many roads to lay between seeded places, as there is no map of them
+    rows           synthetic: cells from north to south
+    cols           synthetic: cells from west to east
+    relief_m       synthetic: height of the highest cell above the lowest
+    rivers         synthetic: how many rivers cross the terrain
+    hidden         what is true of the terrain and missing from the map
     """
 
     source: Annotated[str, Meta(min_length=1)] = "jacksboro"
@@ -102,6 +106,9 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     crs: str | None = None
     height_scale: Positive | None = None
     nodata: Literal["lethal", "fill"] = "lethal"
+    nodata_values: Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(max_length=20)] = ()
+    level_is: Literal["water", "ground"] = "water"
+    water_below_m: Annotated[float, Meta(ge=-20_000, le=20_000)] | None = None
     roads: Annotated[int, Meta(ge=0, le=200)] = 0
     rows: Annotated[int, Meta(ge=1, le=16384)] = 256
     cols: Annotated[int, Meta(ge=1, le=16384)] = 256

@@ -183,7 +183,7 @@ def no_crs(folder: Path) -> dict[str, Any]:
 
 
 def without_metres(folder: Path) -> dict[str, Any]:
-    local = 'LOCAL_CS["mine",UNIT["metre",1]]'
+    local = 'LOCAL_CS["mine",UNIT["foot",0.3048]]'
     return {"source": write(folder / "a.tif", heights(), crs=local)}
 
 
