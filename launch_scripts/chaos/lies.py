@@ -134,12 +134,12 @@ class Lies:
         return self._made(origin)
 
     def _column(self, rule: Column, many: int) -> bytes:
-        dtype = np.dtype(rule.dtype)
-        if dtype.names:
+        if not isinstance(rule.dtype, str):
             rows = [
                 (self._chance.randrange(9), self._whole(0, (1 << 62)), self._whole(0, 1 << 62)) for _ in range(many)
             ]
             return np.array(rows, DIGEST_ROW).tobytes()
+        dtype: np.dtype[Any] = np.dtype(rule.dtype)
         if dtype.kind == "f":
             assert rule.least is not None
             assert rule.most is not None

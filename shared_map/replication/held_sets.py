@@ -11,7 +11,7 @@ from shared_map.replication.limits import Capacity
 from shared_map.replication.marks import fault, is_tombstone, supersedes
 from shared_map.replication.tombstones import Tombstones
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.wire.messages.marks import DIGEST_ROW, MarkSet, MarksRequest
+from swarm.wire.messages.marks import DIGEST_ROW, DIGEST_ROW_BYTES, MarkSet, MarksRequest
 
 
 class HeldSets:
@@ -116,7 +116,7 @@ class HeldSets:
     def lacking(self, author: str, rows: bytes) -> list[int]:
         """Tiles of which neither the author's set is held under the number in these rows, or above, nor a tombstone
         that came after it."""
-        if len(rows) % DIGEST_ROW.itemsize:
+        if len(rows) % DIGEST_ROW_BYTES:
             return []
         numbers = {tile: (epoch, seq) for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist()}
         newer = [tile for _, tiles in self.ledger.missing({author: rows}) for tile in tiles]

@@ -29,8 +29,8 @@ _LOOPBACK = "loopback"
 class Bearer:
     """Who a certificate was issued to.
 
-    name    `ROLE.ID`, for an agent `agent.GROUP.ID`
-    author  what its ids as an author begin with: the group and id of an agent, else the id
+    name    `ROLE.ID`, for an agent `agent.GROUP.ID`, for a rover that marks `rover.GROUP.ID`
+    author  what its ids as an author begin with: the group and id of an agent or rover, else the id
     """
 
     name: str
@@ -59,7 +59,7 @@ def bearer(name: str) -> Bearer:
         raise ConfigError(
             f"{name!r} is no name of a process: no group is called {OPERATOR!r}, as zones are its marks"
         )
-    return Bearer(name, role, id if role == "agent" else author, author)
+    return Bearer(name, role, id if role in ("agent", "rover") else author, author)
 
 
 def common_name(name: str, revoked: Collection[str]) -> str:

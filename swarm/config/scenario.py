@@ -321,7 +321,7 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
                        not answer; while no router listens, processes wait
     tls                certificates, for endpoints beyond loopback
     admit              names in certificates that a router lets take part, beside those of the scenario's processes:
-                       router.north, keeper.east, operator.anna, rover.r1
+                       router.north, keeper.east, operator.anna, rover.all.r1
     revoked            names in certificates that a router denies everything
     """
 

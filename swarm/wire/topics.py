@@ -159,12 +159,15 @@ MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", MarkSet,
     "an author's whole set for a tile; the author and the keeper answer for it",
     "on change, at most 10 Hz a tile",
-    access(put="agent:author keeper planner", serve="agent:author keeper", ask=_REPLICAS, hear=_REPLICAS),
+    access(
+        put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
+        hear=f"{_REPLICAS} rover:author",
+    ),
     request=MarksRequest, bulk=MarkSets, buffer=8192,
 )  # fmt: skip
 DIGEST = Topic(
     "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",
-    access(put="agent:author keeper:author", hear=_REPLICAS),
+    access(put="agent:author rover:author keeper:author", hear=_REPLICAS),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 BASE_MAP = Topic(
@@ -226,7 +229,7 @@ FOLLOWED = Topic(
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,
     "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
-    access(put="planner", hear="agent:agent"),
+    access(put="planner", hear="agent:agent rover:agent"),
 )  # fmt: skip
 POSE = Topic(
     "pose", "target/{target}/pose", TargetPose,

@@ -12,7 +12,6 @@ from swarm.wire.fields import (
     Bounded,
     Cell,
     CellIndex,
-    Column,
     Count,
     Gauge,
     Id,
@@ -23,7 +22,7 @@ from swarm.wire.fields import (
     check_id,
 )
 from swarm.wire.messages.base import Message, schema_of
-from swarm.wire.messages.marks import DIGEST_ROW, MOST_TILES
+from swarm.wire.messages.marks import DigestRows
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 MOST_CORNERS = 256
@@ -33,7 +32,6 @@ ZoneName = Annotated[str, Meta(max_length=40)]
 """Empty where none is given."""
 _ZONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 Corners = Annotated[list[tuple[Metres, Metres]], Meta(max_length=MOST_CORNERS)]
-_Rows = Annotated[bytes, Meta(max_length=DIGEST_ROW.itemsize * MOST_TILES), Column(DIGEST_ROW)]
 _Pace = Annotated[float, Meta(ge=PACE_LEAST, le=PACE_MOST)]
 _Seconds = Annotated[float, Meta(gt=0, le=1e9)]
 
@@ -99,7 +97,7 @@ class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):
     keeper: Id
     zones: Annotated[list[Zone], Meta(max_length=MOST_ZONES)]
     changed: ZoneName = ""
-    sets: _Rows = b""
+    sets: DigestRows = b""
 
 
 Subject = Literal["pause", "vehicle", "group", "target", "set"]
@@ -192,7 +190,7 @@ class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
     """
 
     author: Word = ""
-    sets: _Rows = b""
+    sets: DigestRows = b""
     subject: Subject | None = None
     name: _Name = ""
     stamp_ns: StampNs = 0
