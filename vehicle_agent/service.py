@@ -19,6 +19,7 @@ from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Po
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
+from swarm.plugins.find import named_plugin
 from swarm.ranks import job_of
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
@@ -46,7 +47,7 @@ from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
-from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
 
 log = logging.getLogger(__name__)
@@ -95,7 +96,10 @@ class AgentService:
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
-        sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
+        self._faults: list[str] = []
+        """What plug-ins did wrong and nobody has been told yet."""
+        world = SensorWorld(grid, truth, scenario.vehicles.sense_range_m, setup.id, scenario.seed)
+        sensor = sensor_of(named_plugin(scenario, "vehicles.sensor"), world, self._faults.append)
         self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
         self._detector = TargetDetector(
             grid,
@@ -191,6 +195,7 @@ class AgentService:
         for chasers in self._chasers.reports(chasing, now_ns):
             self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
+        self._member.tell_faults(self._faults, now_ns)
         self._gauge()
 
     def stop(self, now_ns: int) -> None:
@@ -204,9 +209,7 @@ class AgentService:
             log.info("%d vehicles have their places", len(self._agent.vehicles))
 
     def _warn(self, kind: str, text: str) -> None:
-        log.warning("%s: %s", kind, text)
-        self.counters.count(kind)
-        self._member.note(self._now_ns, kind, text)
+        self._member.warn(self._now_ns, kind, text)
 
     def _stand_down(self, now_ns: int) -> None:
         """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""

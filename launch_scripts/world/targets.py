@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.world.referee import Collision, LethalEntry, Referee
-from launch_scripts.world.walks import Budget, TrueTerrain, Walker, far_place, slowness_of
+from launch_scripts.world.walks import Budget, TrueTerrain, Walker, WalkWorld, far_place, slowness_of, walk_of
 from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
@@ -21,6 +21,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.liveness import POSE_SILENCE_NS, Newest
+from swarm.plugins.find import Plugin, named_plugin
 from swarm.wire.fields import column
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
@@ -33,6 +34,7 @@ PATIENCE_NS = 5 * NS_PER_S
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
+_WAYS_PER_TICK = 1
 _MOST_COUNTED = 1 << 32
 """Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
 
@@ -58,6 +60,7 @@ class _Target:
     walker: Walker
     x_m: float
     y_m: float
+    chance: random.Random
     placed: bool = False
     unheard_of: bool = False
     planner_up: bool = False
@@ -73,7 +76,8 @@ class TargetWorld:
     An incarnation that starts while planners run goes on where they last saw the targets. A capture counts once:
     a target that jumps is out of reach for a cool-down, one that stays must first have been alone for another.
 
-    leads  false for a standby, which follows the poses that another tells and does nothing itself
+    leads   false for a standby, which follows the poses that another tells and does nothing itself
+    faults  what plug-ins did wrong, for the owner to tell and clear
     """
 
     def __init__(
@@ -86,6 +90,8 @@ class TargetWorld:
         leads: bool = True,
     ) -> None:
         self.leads = leads
+        self.faults: list[str] = []
+        self._budget = Budget()
         self._grid = terrain.grid
         # A target keeps to cells where a vehicle fits, by the truth and by the prior map: others are out of reach.
         halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
@@ -103,10 +109,12 @@ class TargetWorld:
         self._started_ns: int | None = None
         self._ticked_ns = 0
         self._targets = {
-            id: self._place(id, config, scenario) for config in scenario.targets for id in ids_of(config)
+            id: self._place(id, config, named_plugin(scenario, f"targets[{n}].walk"), scenario)
+            for n, config in enumerate(scenario.targets)
+            for id in ids_of(config)
         }
 
-    def _place(self, id: str, config: TargetConfig, scenario: Scenario) -> _Target:
+    def _place(self, id: str, config: TargetConfig, plugin: Plugin, scenario: Scenario) -> _Target:
         chance = random.Random(f"{scenario.seed}/{id}")
         if config.start is None:
             cell = self._terrain.random_home(chance)
@@ -117,8 +125,10 @@ class TargetWorld:
             cell = self._grid.cell(*config.start)
             if self._terrain.lethal(cell):
                 raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
-        walker = Walker(id, config.walk, slowness_of(config, scenario.cost), chance, cell)
-        return _Target(config, walker, *self._grid.centre_m(cell))
+        world = WalkWorld(id, self._terrain, chance, self._budget)
+        walk = walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
+        walker = Walker(id, walk, slowness_of(config, scenario.cost), cell)
+        return _Target(config, walker, *self._grid.centre_m(cell), chance)
 
     def lead(self, leads: bool) -> None:
         """Take over where the poses of the one before ended, or leave it to another.
@@ -196,14 +206,14 @@ class TargetWorld:
         self._ticked_ns = now_ns
         waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells
-        budget = Budget()
+        self._budget.ways = _WAYS_PER_TICK
         actions: list[Action] = []
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
                 continue
             if target.placed:
-                target.walker.advance(self._terrain, elapsed_s, vehicles, budget)
+                target.walker.advance(self._terrain, elapsed_s, vehicles)
             target.placed = True
             actions.append(Publish(self._pose(id, target, now_ns)))
         return actions
@@ -263,7 +273,7 @@ class TargetWorld:
         target.jumps += 1
         clear_cells = 1 + int(2 * self._capture_range_m / self._grid.resolution_m)
         walker = target.walker
-        walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, walker.chance))
+        walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, target.chance))
         return [captured, Publish(self._pose(id, target, now_ns))]
 
 
