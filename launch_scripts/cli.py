@@ -333,6 +333,9 @@ _mount(
 _mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swarm terrain --help`.")
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
 _mount(
+    "plugins", "launch_scripts.commands.plugins", "Your own sensors, walks, and so on. See `swarm plugins --help`."
+)
+_mount(
     "deploy",
     "launch_scripts.commands.deploy",
     "Certificates and zenohd, for several machines. See `swarm deploy --help`.",

@@ -39,8 +39,9 @@ from swarm.wire.topics import (
     TRUE_POSE,
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
-from vehicle_agent.assignment import AskCosts
+from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of
 from vehicle_agent.chasers import ChasersReport
+from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
@@ -108,7 +109,12 @@ class AgentService:
             scenario.vehicles.sense_range_m,
         )
         self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
-        self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings)
+        targets = plan.group.targets or tuple(scenario.target_ids)
+        assigned = AssignmentWorld(setup.id, group, targets, scenario.seed)
+        assigner = assigner_of(named_plugin(scenario, "vehicles.assignment"), assigned, self._faults.append)
+        driven = DynamicsWorld(setup.id, grid, scenario.seed)
+        dynamics = dynamics_of(named_plugin(scenario, "vehicles.dynamics"), driven, self._faults.append)
+        self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings, assigner, dynamics)
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)

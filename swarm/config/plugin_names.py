@@ -73,7 +73,7 @@ def plugins_of(scenario: Scenario) -> list[NamedPlugin]:
     vehicles, planner = scenario.vehicles, scenario.planner
     sensor, assignment = PLUGIN_KINDS["sensor"], PLUGIN_KINDS["assignment"]
     dynamics, strategy = PLUGIN_KINDS["dynamics"], PLUGIN_KINDS["strategy"]
-    walk, layer = PLUGIN_KINDS["walk"], PLUGIN_KINDS["cost_layer"]
+    walk = PLUGIN_KINDS["walk"]
     return [
         NamedPlugin(sensor, "vehicles.sensor", vehicles.sensor, vehicles.sensor_options),
         NamedPlugin(assignment, "vehicles.assignment", vehicles.assignment, vehicles.assignment_options),
@@ -83,10 +83,16 @@ def plugins_of(scenario: Scenario) -> list[NamedPlugin]:
             NamedPlugin(walk, f"targets[{n}].walk", target.walk, target.walk_options)
             for n, target in enumerate(scenario.targets)
         ),
-        *(
-            NamedPlugin(layer, f"cost.layers[{n}].layer", each.layer, each.options)
-            for n, each in enumerate(scenario.cost.layers)
-        ),
+        *cost_layers_of(scenario),
+    ]
+
+
+def cost_layers_of(scenario: Scenario) -> list[NamedPlugin]:
+    """The plug-ins that have a part in the map, in the order in which they are applied."""
+    kind = PLUGIN_KINDS["cost_layer"]
+    return [
+        NamedPlugin(kind, f"cost.layers[{n}].layer", each.layer, each.options)
+        for n, each in enumerate(scenario.cost.layers)
     ]
 
 

@@ -19,8 +19,8 @@ class Hangs(BaseException):
 def call_within(seconds: float, call: Callable[[], T]) -> T:
     """What `call` returns. Raises `Hangs` in it once so many seconds have passed, and again as often.
 
-    An alarm of the operating system ends loops, sleeps and waits alike. What runs inside native code and never comes
-    back to the interpreter cannot be ended so. On another thread than the main one there is no alarm.
+    An alarm of the operating system ends loops, sleeps and waits alike. Native code that never comes back to the
+    interpreter cannot be ended so. On another thread than the main one there is no alarm.
     """
     if threading.current_thread() is not threading.main_thread():
         return call()

@@ -1,7 +1,7 @@
 """The door through which a plug-in is called: whatever it does there, its caller gets a checked value.
 
-One that raises, hangs or returns what breaks its contract is out for the rest of the process's life: its fault is said
-once, with its name, its kind and the place, and its caller does what `PluginKind.failing` says.
+One that raises, hangs or returns what breaks its contract is out for the rest of the process's life: its fault is
+said once, with its name, its kind and the place, and its caller does what `PluginKind.failing` says.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Door:
         self._slow = False
 
     def ask(self, call: Callable[[], object], check: Callable[[object], T], otherwise: Callable[[], T]) -> T:
-        """What `call` returns, as `check` makes it; what `otherwise` returns where the plug-in fails, or has failed.
+        """What `call` returns, as `check` makes it; what `otherwise` returns if the plug-in fails, or has failed.
 
         check  raises `Nonsense` on what breaks the contract; what else it raises counts as the plug-in's fault, too
         """

@@ -1,14 +1,16 @@
 """From a name in the scenario to the code that it names, with its options checked.
 
-A plug-in is called with its world and its options, and returns what its kind's `Protocol` asks for: a class, mostly.
-What has that method already is taken as it is. If it has an attribute `Options`, a msgspec Struct or a dataclass, the table of the scenario becomes one of these, and
-a key, type or value that does not fit is refused; else it gets the table as it stands.
+A plug-in is called with its world and its options, and returns what has the method of its kind's `Protocol`: mostly
+it is a class. What has that method already is taken as it is. If the plug-in has an attribute `Options`, a msgspec
+Struct or a dataclass, the table of the scenario becomes one of these, and a key, type or value that does not fit is
+refused; else it gets the table as it stands.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import importlib.util
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -44,8 +46,8 @@ class Plugin:
         return f"{self.named.kind.name} plug-in {self.named.name!r}"
 
     def make(self, world: object) -> Any:
-        """What does the work, for a plug-in from outside. Raises ConfigError if it raises, hangs or lacks the method
-        of its kind."""
+        """What does the work, for a plug-in from outside. Raises ConfigError if that raises, hangs or lacks the
+        method of its kind."""
         assert self.factory is not None
         factory = self.factory
         made = _started(self.named, "could not be made", lambda: factory(world, self.options))
@@ -76,15 +78,34 @@ def check_plugins(scenario: Scenario) -> None:
         find_plugin(named, scenario.plugin_folder)
 
 
+def source_of(named: NamedPlugin, folder: str) -> bytes:
+    """The text of the module that a name stands for, without running it; empty where there is none to be found."""
+    name = named.name
+    if ":" not in name:
+        points = installed(named.kind).get(name)
+        name = points[0].value if points else name
+    try:
+        _reach(folder)
+        spec = importlib.util.find_spec(name.partition(":")[0])
+        return Path(spec.origin).read_bytes() if spec is not None and spec.origin is not None else b""
+    except (ImportError, ValueError, AttributeError, OSError):
+        return b""
+
+
+def _reach(folder: str) -> None:
+    """Let modules of this folder be imported."""
+    if folder not in sys.path:
+        sys.path.append(folder)  # last: it hides nothing that is installed
+        importlib.invalidate_caches()
+
+
 def _imported(named: NamedPlugin, folder: str) -> Factory:
     kind, name = named.kind, named.name
     check_name(named, "scenario")
     found: object
     if ":" in name:
         module, _, attribute = name.partition(":")
-        if folder not in sys.path:
-            sys.path.append(folder)  # last: it hides nothing that is installed
-            importlib.invalidate_caches()
+        _reach(folder)
         found = _started(named, "could not be imported", lambda: importlib.import_module(module))
         for part in attribute.split("."):
             if not hasattr(found, part):

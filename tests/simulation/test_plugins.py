@@ -11,6 +11,7 @@ from support.plugin_pages import write_example
 
 from launch_scripts.simulation.simulate import Simulation
 from swarm.config.load import load_scenario
+from swarm.config.plugin_names import PLUGIN_KINDS
 from swarm.wire.messages.processes import Note
 
 SMALL = """
@@ -47,7 +48,7 @@ def run(scenario: Path, seconds: float = 20.0) -> tuple[Simulation, list[str]]:
     return simulation, notes
 
 
-@pytest.mark.parametrize("page", ["sensor", "walk"])
+@pytest.mark.parametrize("page", PLUGIN_KINDS)
 def test_the_example_of_a_page_runs_as_it_stands(page: str, tmp_path: Path) -> None:
     simulation, notes = run(write_example(page, tmp_path, SMALL))
     assert not notes

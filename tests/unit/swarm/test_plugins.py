@@ -111,7 +111,7 @@ def test_what_cannot_be_found_or_does_not_fit_is_refused_in_one_sentence(
     ],
 )
 def test_what_cannot_be_made_is_refused(name: str, sentence: str, folder: Path) -> None:
-    with pytest.raises(ConfigError, match="vehicles.sensor") as refused:
+    with pytest.raises(ConfigError, match=r"vehicles\.sensor") as refused:
         find_plugin(sensor(name), str(folder)).make(None)
     assert sentence in str(refused.value)
 
@@ -122,12 +122,12 @@ def test_a_name_that_nobody_offers_is_refused_when_the_scenario_is_read() -> Non
     ):
         parse_scenario("[[targets]]\nname = 'a'\n[[targets]]\nwalk = 'evad'")
     for key in ("[vehicles]\nsensor", "[vehicles]\nassignment", "[vehicles]\ndynamics", "[planner]\nstrategy"):
-        with pytest.raises(ConfigError, match="allowed: '.*or a plug-in as 'module:Name'"):
+        with pytest.raises(ConfigError, match=r"allowed: '.*or a plug-in as 'module:Name'"):
             parse_scenario(f"{key} = 'nobodys'")
     with pytest.raises(ConfigError, match=r"cost.layers\[0\].layer: found 'mud'; allowed: or a plug-in"):
         parse_scenario("[[cost.layers]]\nlayer = 'mud'")
     for odd in ("a b", "os; rm:X", "../x:Y", "a:b:c", ":X", "x:"):
-        with pytest.raises(ConfigError, match="vehicles.sensor"):
+        with pytest.raises(ConfigError, match=r"vehicles\.sensor"):
             parse_scenario(f"[vehicles]\nsensor = '{odd}'")
 
 
@@ -147,7 +147,7 @@ def test_an_installed_packages_name_is_found_and_two_of_one_name_are_refused(
         check_plugins(scenario)
 
 
-# --- the door -------------------------------------------------------------------------------------------------------
+# --- the door ---------------------------------------------------------------------------------------------------
 
 
 class Faults(list[str]):
