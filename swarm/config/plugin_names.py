@@ -22,6 +22,7 @@ class PluginKind:
     """What a kind of plug-in is called, and what becomes of a process whose plug-in fails.
 
     name      as in the group of its entry points
+    role      the role that calls it; every role builds the map, if it is not prepared
     built_in  names of the kind's own table
     method    what a plug-in is asked for, as its `Protocol` names it
     call_s    a call that takes longer hangs, and is broken off
@@ -29,6 +30,7 @@ class PluginKind:
     """
 
     name: str
+    role: str
     built_in: tuple[str, ...]
     method: str
     call_s: float
@@ -42,16 +44,31 @@ class PluginKind:
 
 _KINDS = (
     PluginKind(
-        "sensor", typing.get_args(Sensor), "look", 2.0, "this agent's vehicles see only the cells next to them now"
+        "sensor",
+        "agent",
+        typing.get_args(Sensor),
+        "look",
+        2.0,
+        "this agent's vehicles see only the cells next to them now",
     ),
-    PluginKind("walk", typing.get_args(Walk), "choose", 2.0, "the target stands still now"),
-    PluginKind("cost_layer", (), "cost", 300.0, "there is no map without it"),
+    PluginKind("walk", "targets", typing.get_args(Walk), "choose", 2.0, "the target stands still now"),
+    PluginKind("cost_layer", "any", (), "cost", 300.0, "there is no map without it"),
     PluginKind(
-        "assignment", typing.get_args(Assigner), "assign", 2.0, "this agent spreads its vehicles evenly now"
+        "assignment",
+        "agent",
+        typing.get_args(Assigner),
+        "assign",
+        2.0,
+        "this agent spreads its vehicles evenly now",
     ),
-    PluginKind("strategy", typing.get_args(Strategy), "row", 2.0, "this planner grows whole trees now"),
+    PluginKind("strategy", "planner", typing.get_args(Strategy), "row", 2.0, "this planner grows whole trees now"),
     PluginKind(
-        "dynamics", typing.get_args(Dynamics), "speed", 2.0, "this agent's vehicles drive as the ground allows now"
+        "dynamics",
+        "agent",
+        typing.get_args(Dynamics),
+        "speed",
+        2.0,
+        "this agent's vehicles drive as the ground allows now",
     ),
 )
 PLUGIN_KINDS: Mapping[str, PluginKind] = {kind.name: kind for kind in _KINDS}

@@ -12,7 +12,7 @@ import dataclasses
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -72,10 +72,11 @@ def find_plugin(named: NamedPlugin, folder: str) -> Plugin:
     return Plugin(named, found, _options(named, getattr(found, "Options", None)))
 
 
-def check_plugins(scenario: Scenario) -> None:
-    """Find every plug-in of a scenario, so that a fault is said once, before processes start."""
+def check_plugins(scenario: Scenario, roles: Collection[str]) -> None:
+    """Find every plug-in that these roles call, so that a fault is said once, before processes start."""
     for named in plugins_of(scenario):
-        find_plugin(named, scenario.plugin_folder)
+        if named.kind.role in roles:
+            find_plugin(named, scenario.plugin_folder)
 
 
 def source_of(named: NamedPlugin, folder: str) -> bytes:

@@ -138,13 +138,14 @@ def test_an_installed_packages_name_is_found_and_two_of_one_name_are_refused(
     monkeypatch.setattr(plugin_names, "entry_points", lambda group: points if group == points[0].group else [])
     monkeypatch.syspath_prepend(str(folder))
     scenario = parse_scenario("[vehicles]\nsensor = 'wide'\nsensor_options = { reach_cells = 2 }")
-    check_plugins(scenario)
+    check_plugins(scenario, ["agent"])
     assert named_plugin(scenario, "vehicles.sensor").make(None).look([]) == 2
     with pytest.raises(ConfigError, match=r"walk: found 'wide'.*allowed"):
         parse_scenario("[[targets]]\nwalk = 'wide'")  # each kind has a group of its own
     points.append(points[0])
     with pytest.raises(ConfigError, match="'wide' is offered by several packages"):
-        check_plugins(scenario)
+        check_plugins(scenario, ["agent"])
+    check_plugins(scenario, ["planner", "targets"])  # others do not need it
 
 
 # --- the door ---------------------------------------------------------------------------------------------------
