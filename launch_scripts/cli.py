@@ -337,6 +337,9 @@ _mount("zone", "launch_scripts.commands.zone", "Close areas while the swarm runs
 _mount("target", "launch_scripts.commands.target", "Add, move and remove targets. See `swarm target --help`.")
 _mount("vehicle", "launch_scripts.commands.vehicle", "Stop vehicles and let them go. See `swarm vehicle --help`.")
 _mount(
+    "plugins", "launch_scripts.commands.plugins", "Your own sensors, walks, and so on. See `swarm plugins --help`."
+)
+_mount(
     "deploy",
     "launch_scripts.commands.deploy",
     "Certificates and zenohd, for several machines. See `swarm deploy --help`.",

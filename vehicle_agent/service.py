@@ -19,6 +19,7 @@ from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Po
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
+from swarm.plugins.find import named_plugin
 from swarm.ranks import job_of
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
@@ -42,16 +43,17 @@ from swarm.wire.topics import (
     TRUE_POSE,
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
-from vehicle_agent.assignment import AskCosts
+from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.chasers import ChasersReport
+from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
-from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
 from vehicle_agent.zones import ZonesAround
 
@@ -101,7 +103,10 @@ class AgentService:
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
-        sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
+        self._faults: list[str] = []
+        """What plug-ins did wrong and nobody has been told yet."""
+        world = SensorWorld(grid, truth, scenario.vehicles.sense_range_m, setup.id, scenario.seed)
+        sensor = sensor_of(named_plugin(scenario, "vehicles.sensor"), world, self._faults.append)
         self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
         self._detector = TargetDetector(
             grid,
@@ -111,7 +116,14 @@ class AgentService:
         )
         self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
         bodies = Bodies(grid, scenario.cost.vehicle_radius_m)
-        self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings, bodies)
+        targets = plan.group.targets or tuple(scenario.target_ids)
+        assigned = AssignmentWorld(setup.id, group, targets, scenario.seed)
+        assigner = assigner_of(named_plugin(scenario, "vehicles.assignment"), assigned, self._faults.append)
+        driven = DynamicsWorld(setup.id, grid, scenario.seed)
+        dynamics = dynamics_of(named_plugin(scenario, "vehicles.dynamics"), driven, self._faults.append)
+        self._agent = Agent(
+            plan, scenario, local, sensor, self._right_of_way.core.holdings, bodies, assigner, dynamics
+        )
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
@@ -207,6 +219,7 @@ class AgentService:
         for chasers in self._chasers.reports(chasing, now_ns):
             self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
+        self._member.tell_faults(self._faults, now_ns)
         self._gauge()
 
     def stop(self, now_ns: int) -> None:
@@ -237,9 +250,7 @@ class AgentService:
             log.info("%d vehicles have their places", len(self._agent.vehicles))
 
     def _warn(self, kind: str, text: str) -> None:
-        log.warning("%s: %s", kind, text)
-        self.counters.count(kind)
-        self._member.note(self._now_ns, kind, text)
+        self._member.warn(self._now_ns, kind, text)
 
     def _stand_down(self, now_ns: int) -> None:
         """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""

@@ -43,6 +43,7 @@ from swarm.clock import MonotonicClock
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError, StoreError, SwarmError
 from swarm.order_book import OrderBook
+from swarm.plugins.find import check_plugins
 from swarm.ranks import job_of
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
@@ -124,6 +125,7 @@ def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     for spec in _table(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
+    check_plugins(options.scenario, options.roles)
     if not options.joins:
         check_ports(options.scenario, options.roles)
     run_id = _run_id(options)

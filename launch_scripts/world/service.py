@@ -113,6 +113,7 @@ class TargetsService:
             self._bus.ask(COST, CostRequest(), self._post, tag=_ASK)
         self._obey(now_ns)
         self._perform(self._world.tick(now_ns), now_ns)
+        self._member.tell_faults(self._world.faults, now_ns)
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:

@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 
 from launch_scripts.world.referee import BodyHit, Collision, LethalEntry, Referee
 from launch_scripts.world.rovers import Rovers
-from launch_scripts.world.walks import Budget, TrueTerrain, Walker, far_place, slowness_of
+from launch_scripts.world.walks import Budget, TrueTerrain, Walker, WalkWorld, far_place, slowness_of, walk_of
 from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
+from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.order_book import OrderBook
+from swarm.plugins.find import find_plugin
 from swarm.runtime.tracking import Trackings, Verdict
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
@@ -38,6 +40,7 @@ STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
 TRACKER = "targets"
 """The name under which this process and its standbys tell poses: a later life takes over at once."""
+_WAYS_PER_TICK = 1
 _MOST_COUNTED = 1 << 32
 """Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
 
@@ -63,6 +66,7 @@ class _Target:
     walker: Walker
     x_m: float
     y_m: float
+    chance: random.Random
     placed: bool = False
     unheard_of: bool = False
     planner_up: bool = False
@@ -81,6 +85,7 @@ class TargetWorld:
 
     leads   false for a standby, which follows the poses that another tells and does nothing itself
     paused  nothing moves, and nobody is captured
+    faults  what plug-ins did wrong, for the owner to tell and clear
     """
 
     paused = False
@@ -95,6 +100,8 @@ class TargetWorld:
         leads: bool = True,
     ) -> None:
         self.leads = leads
+        self.faults: list[str] = []
+        self._budget = Budget()
         self._grid = terrain.grid
         # A target keeps to cells where a vehicle fits, by the truth and by the prior map: others are out of reach.
         halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
@@ -113,10 +120,13 @@ class TargetWorld:
         self._started_ns: int | None = None
         self._ticked_ns = 0
         self._targets = {
-            id: self._place(id, config, scenario) for config in scenario.targets for id in ids_of(config)
+            id: self._place(id, config, scenario, f"targets[{n}].walk")
+            for n, config in enumerate(scenario.targets)
+            for id in ids_of(config)
         }
 
-    def _place(self, id: str, config: TargetConfig, scenario: Scenario) -> _Target:
+    def _place(self, id: str, config: TargetConfig, scenario: Scenario, key: str) -> _Target:
+        """key  what names the target's walk"""
         chance = random.Random(f"{scenario.seed}/{id}")
         if config.start is None:
             cell = self._terrain.random_home(chance)
@@ -127,8 +137,12 @@ class TargetWorld:
             cell = self._grid.cell(*config.start)
             if self._terrain.lethal(cell):
                 raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
-        walker = Walker(id, config.walk, slowness_of(config, scenario.cost), chance, cell)
-        return _Target(config, walker, *self._grid.centre_m(cell))
+        named = NamedPlugin(PLUGIN_KINDS["walk"], key, config.walk, config.walk_options)
+        plugin = find_plugin(named, scenario.plugin_folder)
+        world = WalkWorld(id, self._terrain, chance, self._budget)
+        walk = walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
+        walker = Walker(id, walk, slowness_of(config, scenario.cost), cell)
+        return _Target(config, walker, *self._grid.centre_m(cell), chance)
 
     def obey(self, book: OrderBook, scenario: Scenario, now_ns: int, *, first: bool) -> list[Action]:
         """Go by what is ordered: who is there, and who was put somewhere else.
@@ -145,7 +159,7 @@ class TargetWorld:
             order = book.about("target", id)
             target = self._targets.get(id)
             if target is None or (order is not None and order.added and target.config != config):
-                target = self._targets[id] = self._place(id, config, scenario)
+                target = self._targets[id] = self._place(id, config, scenario, f"target {id}: walk")
             if order is None or order.cell is None or order.stamp_ns == target.ordered_ns:
                 continue
             target.ordered_ns = order.stamp_ns
@@ -243,14 +257,14 @@ class TargetWorld:
         self._ticked_ns = now_ns
         waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells
-        budget = Budget()
+        self._budget.ways = _WAYS_PER_TICK
         actions: list[Action] = [*self.rovers.tick(now_ns)]
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
                 continue
             if target.placed:
-                target.walker.advance(self._terrain, elapsed_s, vehicles, budget)
+                target.walker.advance(self._terrain, elapsed_s, vehicles)
             target.placed = True
             actions.append(Publish(self._pose(id, target, now_ns)))
         return actions
@@ -317,7 +331,7 @@ class TargetWorld:
         target.jumps += 1
         clear_cells = 1 + int(2 * self._capture_range_m / self._grid.resolution_m)
         walker = target.walker
-        walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, walker.chance))
+        walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, target.chance))
         return [captured, Publish(self._pose(id, target, now_ns))]
 
 
