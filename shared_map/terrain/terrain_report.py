@@ -82,7 +82,7 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
 
 
 def said_of(terrain: Terrain) -> list[str]:
-    """What a run says of its terrain before anything drives: a line of numbers, how it was made, what looks wrong."""
+    """What a run says of its terrain before anything drives: numbers, how it was made, what looks wrong."""
     grid, lethal = terrain.grid, float(np.isinf(terrain.pace_s_per_m).mean())
     water = float((terrain.classes == TerrainClass.WATER).mean())
     size = f"{grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m"
