@@ -237,13 +237,14 @@ class TargetWorld:
         self._referee.hear_body(body, now_ns)
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
-        actions: list[Action] = list(self._referee.hear(fleet))
+        seen = self._referee.hear(fleet)
         if not self.leads or self.paused:
-            return actions if self.leads else []
+            return list(seen) if self.leads else []
+        actions: list[Action] = []
         for index, vehicle in self._catchers(fleet, now_ns):
             id = fleet.target_ids[index]
             actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
-        return actions
+        return [*actions, *seen]
 
     def tick(self, now_ns: int) -> list[Action]:
         """Moves all targets and returns their poses."""
