@@ -271,10 +271,12 @@ class AgentService:
     def _hear_pose(self, heard: Heard, now_ns: int) -> None:
         pose = heard.message
         assert isinstance(pose, TargetPose)
-        # A tracker's pose is the truth for the simulated sensor of targets only if it counts.
-        tracked = pose.target not in self._untracked.targets
-        if heard.topic is TRUE_POSE or (tracked and self._agent.hear_pose(pose, now_ns)):
+        if heard.topic is TRUE_POSE:
             self._detector.set_truth(pose, now_ns)
+        elif pose.target not in self._untracked.targets:
+            counts = self._agent.hear_pose(pose, now_ns)
+            if counts is not None:  # for the simulated sensor of targets it is the truth
+                self._detector.set_truth(counts, now_ns)
 
     def _hear_bodies(self, now_ns: int) -> None:
         bodies = self._agent.bodies

@@ -135,11 +135,9 @@ def _route_on_terrain(terrain: str, start: str, end: str, out: Path | None, as_j
     if as_json:
         typer.echo(json.dumps(facts))
         return
-    above = found.found.gap - 1
-    typer.echo(
-        f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {facts['up_m']:.0f} m up and {facts['down_m']:.0f} m"
-        f" down, {facts['steps']} cells; proven to be at most {max(above, 0):.2%} above the optimum"
-    )
+    above, climbed = max(found.found.gap - 1, 0), f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
+    typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} cells")
+    typer.echo(f"proven to be at most {above:.2%} above the optimum")
     typer.echo(profile_of(found))
 
 

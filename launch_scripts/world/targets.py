@@ -24,7 +24,7 @@ from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.order_book import OrderBook
 from swarm.plugins.find import find_plugin
-from swarm.runtime.tracking import Trackings, Verdict
+from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.targets import TargetPose
@@ -113,7 +113,7 @@ class TargetWorld:
         self.rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
         # Who tracks external targets, and for a standby who leads; and the highest incarnation of a leader.
-        self._trackings = Trackings(terrain.grid.cells)
+        self._trackings = Trackings(terrain.grid)
         self._others_incarnation = 0
         self._capture_range_m = scenario.vehicles.capture_range_m
         self._time_scale = scenario.time_scale
@@ -215,8 +215,10 @@ class TargetWorld:
         target = self._targets.get(pose.target)
         if target is None or (target.config.is_simulated and self.leads):
             return
-        if self._trackings.hear(pose, now_ns) is not Verdict.COUNTS:
+        counts = self._trackings.hear(pose, now_ns)
+        if counts is None:
             return
+        pose = counts
         if target.config.is_simulated:
             if self._terrain.lethal(pose.cell):
                 return
