@@ -16,6 +16,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
@@ -51,9 +52,11 @@ from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.target_bodies import TargetBodies
 
 log = logging.getLogger(__name__)
 
+_LONGEST_AGE_NS = 10 * NS_PER_S
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least."""
 
@@ -99,6 +102,7 @@ class AgentService:
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
+        self._target_bodies = TargetBodies(scenario, grid)
         self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
         self._detector = TargetDetector(
             grid,
@@ -168,6 +172,7 @@ class AgentService:
 
     def tick(self, now_ns: int) -> None:
         self._now_ns = now_ns
+        self._agent.bodies.tick(now_ns)
         for heard in (*self._bus.collected(POSE), *self._bus.collected(TRUE_POSE)):
             self._hear_pose(heard, now_ns)
         self._member.tick(now_ns)
@@ -236,13 +241,16 @@ class AgentService:
         self._detector.set_truth(pose, now_ns)
         if heard.topic is POSE and pose.target not in self._untracked.targets:
             self._agent.hear_pose(pose, now_ns)
+            self._hear_target_bodies(pose, now_ns)
 
     def _hear_bodies(self, now_ns: int) -> None:
         bodies = self._agent.bodies
-        bodies.tick(now_ns)
         for heard in self._bus.collected(BODY):
             assert isinstance(heard.message, Body)
             bodies.hear(heard.message, now_ns)
+            age_ns = now_ns - heard.message.stamp_ns
+            if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree
+                self.counters.observe("body_ms", age_ns / 1e6)
         self._agent.bodies_moved()
         self.counters.counts["bodies_refused"] = bodies.refused
         self.counters.counts["detours"] = self._agent.detours.found
@@ -254,6 +262,11 @@ class AgentService:
         pose = self._untracked.hear(sighted, now_ns)
         if pose is not None:
             self._agent.set_pose(pose, now_ns)
+            self._hear_target_bodies(pose, now_ns)
+
+    def _hear_target_bodies(self, pose: TargetPose, now_ns: int) -> None:
+        for body in self._target_bodies.bodies_of(pose, now_ns):
+            self._agent.bodies.hear(body, now_ns)
 
     def _planners(self) -> dict[str, int]:
         """Target -> incarnation of its living planner, or of the first of its standbys that lives."""
