@@ -45,10 +45,11 @@ class TargetBodies:
         self._last: dict[str, _Last] = {}
         for id, radius_m in self._radii_m.items():
             needed_m = radius_m + scenario.cost.vehicle_radius_m + _CELLS_BETWEEN * grid.resolution_m
-            if scenario.vehicles.capture_range_m < needed_m:
+            range_m = scenario.vehicles.capture_range_m
+            if range_m < needed_m:
                 raise ConfigError(
                     f"targets: {id}: with body_radius_m = {radius_m:g} no vehicle comes near enough to capture it: "
-                    f"vehicles.capture_range_m is {scenario.vehicles.capture_range_m:g}, expected at least {needed_m:g}"
+                    f"vehicles.capture_range_m is {range_m:g}, expected at least {needed_m:g}"
                 )
 
     def bodies_of(self, pose: TargetPose, now_ns: int) -> list[Body]:

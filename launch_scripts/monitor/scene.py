@@ -7,7 +7,7 @@ stretched so that gentle land still looks like land.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,10 +39,12 @@ STATE_COLOURS = {
     VehicleState.ARRIVED: (205, 255, 80),
     VehicleState.STRANDED: (150, 150, 20),
     VehicleState.LOST: (40, 84, 60),
+    VehicleState.OUTDATED: (190, 200, 200),
 }
 _STEP_ROW, _STEP_COL = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int64)
 _STATE_COLOURS = np.array([STATE_COLOURS[state] for state in VehicleState], np.uint8)
 TARGET_COLOUR = (255, 46, 46)
+LOST_TARGET_COLOUR = (120, 120, 120)
 SIGHTED_COLOUR = (255, 170, 150)
 BODY_COLOUR = (110, 160, 255)
 LETHAL_MARK = (86, 22, 150)
@@ -226,11 +228,14 @@ def vehicle_points(mesh: TerrainMesh, vehicles: VehicleColumns) -> Points:
     return Points(vehicles.ids, positions, _STATE_COLOURS[vehicles.states])
 
 
-def target_points(mesh: TerrainMesh, places_m: Mapping[str, tuple[float, float]]) -> Points:
-    """All targets, on top of poles that show over the hills."""
+def target_points(
+    mesh: TerrainMesh, places_m: Mapping[str, tuple[float, float]], lost: Collection[str] = ()
+) -> Points:
+    """All targets, on top of poles that show over the hills; grey where nobody tracks them any more."""
     east_south = np.array(list(places_m.values()), np.float32).reshape(-1, 2)
     positions = mesh.place(east_south[:, 0], east_south[:, 1], 2.2 * mesh.scale_m)
-    return Points(list(places_m), positions, np.tile(np.array(TARGET_COLOUR, np.uint8), (len(positions), 1)))
+    colours = [LOST_TARGET_COLOUR if id in lost else TARGET_COLOUR for id in places_m]
+    return Points(list(places_m), positions, np.array(colours, np.uint8).reshape(-1, 3))
 
 
 def sighting_points(mesh: TerrainMesh, seen: Mapping[str, Sighted]) -> tuple[Points, Floats]:

@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
 
 FRAME_HZ = 10.0
 """How often the view is drawn."""
-_DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.5 / FRAME_HZ, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0}
+_DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0}
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
 _TARGETS_NS = NS_PER_S // 5
 """Targets, each with its pole and its name, take as long to draw as all vehicles, which move faster."""
@@ -118,6 +118,8 @@ class MonitorService:
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
         self._bodies_drawn: list[Body] = []
         self._fleets_new = self._targets_new = self._windows_new = False
+        self._lost: set[str] = set()
+        """Targets that were drawn as lost."""
         self._windows: dict[str, tuple[int, ...]] = {}
         """Target -> the window that its planner grew last."""
         self._windows_due_ns = self._targets_due_ns = self._bodies_due_ns = 0
@@ -152,9 +154,8 @@ class MonitorService:
             case Fleet(stamp_ns=stamp_ns):
                 self._fleets_new = True
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
-            case TargetPose(stamp_ns=stamp_ns):
+            case TargetPose():  # a tracker's clock may be wrong, by which the view's must not be set
                 self._targets_new = True
-                self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
             case Sighted() as sighted:
                 self._sightings.hear(sighted, now_ns)
             case Body() as body:
@@ -259,9 +260,11 @@ class MonitorService:
             if trails_due:
                 self._drawing.trails("vehicles", self._vehicle_trails.advance(points.ids, points.positions))
             self._draw_routes(now_ns, vehicles)
+        if now_ns >= self._targets_due_ns and (lost := self.recorder.trackings.lost(now_ns)) != self._lost:
+            self._lost, self._targets_new = lost, True
         if self._targets_new and (trails_due or now_ns >= self._targets_due_ns):
             self._targets_new, self._targets_due_ns = False, now_ns + _TARGETS_NS
-            targets = target_points(self._mesh, self.recorder.observed.targets())
+            targets = target_points(self._mesh, self.recorder.observed.targets(), self._lost)
             feet = poles(self._mesh, targets)
             self._drawing.targets(targets, feet, label_places(self._mesh, targets))
             if trails_due:
