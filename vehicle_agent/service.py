@@ -16,6 +16,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
@@ -55,10 +56,12 @@ from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.target_bodies import TargetBodies
 from vehicle_agent.zones import ZonesAround
 
 log = logging.getLogger(__name__)
 
+_LONGEST_AGE_NS = 10 * NS_PER_S
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least."""
 
@@ -107,6 +110,7 @@ class AgentService:
         """What plug-ins did wrong and nobody has been told yet."""
         world = SensorWorld(grid, truth, scenario.vehicles.sense_range_m, setup.id, scenario.seed)
         sensor = sensor_of(named_plugin(scenario, "vehicles.sensor"), world, self._faults.append)
+        self._target_bodies = TargetBodies(scenario, grid)
         self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
         self._detector = TargetDetector(
             grid,
@@ -187,6 +191,7 @@ class AgentService:
 
     def tick(self, now_ns: int) -> None:
         self._now_ns = now_ns
+        self._agent.bodies.tick(now_ns)
         for heard in (*self._bus.collected(POSE), *self._bus.collected(TRUE_POSE)):
             self._hear_pose(heard, now_ns)
         self._member.tick(now_ns)
@@ -277,13 +282,16 @@ class AgentService:
             counts = self._agent.hear_pose(pose, now_ns)
             if counts is not None:  # for the simulated sensor of targets it is the truth
                 self._detector.set_truth(counts, now_ns)
+                self._hear_target_bodies(counts, now_ns)
 
     def _hear_bodies(self, now_ns: int) -> None:
         bodies = self._agent.bodies
-        bodies.tick(now_ns)
         for heard in self._bus.collected(BODY):
             assert isinstance(heard.message, Body)
             bodies.hear(heard.message, now_ns)
+            age_ns = now_ns - heard.message.stamp_ns
+            if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree
+                self.counters.observe("body_ms", age_ns / 1e6)
         self._agent.bodies_moved()
         self.counters.counts["bodies_refused"] = bodies.refused
         self.counters.counts["detours"] = self._agent.detours.found
@@ -295,6 +303,11 @@ class AgentService:
         pose = self._untracked.hear(sighted, now_ns)
         if pose is not None:
             self._agent.see_target(pose, now_ns)
+            self._hear_target_bodies(pose, now_ns)
+
+    def _hear_target_bodies(self, pose: TargetPose, now_ns: int) -> None:
+        for body in self._target_bodies.bodies_of(pose, now_ns):
+            self._agent.bodies.hear(body, now_ns)
 
     def _planners(self) -> dict[str, int]:
         """Target -> incarnation of its living planner, or of the first of its standbys that lives."""

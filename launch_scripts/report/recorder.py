@@ -377,7 +377,7 @@ class Recorder:
 
 ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
 """What planners count of poses that do not count, or look wrong."""
-TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "tick_ms")
+TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 
 
