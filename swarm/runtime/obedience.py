@@ -26,7 +26,7 @@ class Obedience:
     A process that starts asks keepers for their book; where none answers, everybody; where nobody answers, it goes
     on without. Later it hears keepers once a second.
 
-    obeys  whether the process goes by an order that it knows; called at ticks
+    obeys  whether the process goes by an order that it knows
 
     book   the orders
     known  whether a book was told, or nobody is there who could: until then nothing moves, as the swarm may be
@@ -69,16 +69,21 @@ class Obedience:
                     event.end()
                 else:
                     self._waiting.append(event)
+                    self._answer()
             case _:
                 return False
         return True
 
     def tick(self, now_ns: int) -> None:
-        """Answer those whose order is obeyed now, and leave those who ask no more."""
+        """Ask again what is ordered if nobody has told, and answer those whose order is obeyed by now."""
         if not self.known and now_ns >= self._ask_due_ns:
             self.known = self._asks >= _ASKS
             if not self.known:
                 self._ask(now_ns)
+        self._answer()
+
+    def _answer(self) -> None:
+        """Answer those whose order is obeyed now, and leave those who ask no more."""
         left: list[Asked] = []
         for asked in self._waiting:
             assert isinstance(asked.request, Obey)

@@ -81,7 +81,6 @@ def test_a_pause_outlives_an_agent_that_is_killed(running: LiveSwarm) -> None:
 
 
 def test_an_added_target_gets_a_planner_and_is_chased(running: LiveSwarm) -> None:
-    began_s = time.monotonic()
     assert order(running, "target", "add", "x", "--at", "48,64", "--walk", "still")["silent"] == []
 
     def routed() -> bool:
@@ -89,7 +88,6 @@ def test_an_added_target_gets_a_planner_and_is_chased(running: LiveSwarm) -> Non
         return found.returncode == 0 and "to x in" in found.stdout
 
     eventually(routed, 40, "a route to the new target")
-    print(f"route to an added target after {time.monotonic() - began_s:.1f} s")
     assert order(running, "group", "all", "targets", "x")["silent"] == []
     removed = order(running, "target", "remove", "x")
     assert removed["given"]["off"]
