@@ -245,7 +245,9 @@ class AgentService:
         orders.tick(now_ns)
 
     def _obeys(self, order: Obey) -> bool:
-        return order.subject is not None or self._sync.holds(order.author, order.sets, self._now_ns)
+        if order.subject is not None:
+            return self._obeyed_version == self._obedience.book.version
+        return self._sync.holds(order.author, order.sets, self._now_ns)
 
     # --- places ---------------------------------------------------------------------------------------------
 
