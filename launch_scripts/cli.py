@@ -332,6 +332,7 @@ _mount(
 )
 _mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swarm terrain --help`.")
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
+_mount("vehicle", "launch_scripts.commands.guests", "Add and remove vehicles. See `swarm vehicle --help`.")
 _mount(
     "deploy",
     "launch_scripts.commands.deploy",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, load_homes
-from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
@@ -23,6 +23,7 @@ from swarm.ranks import job_of
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
+from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
@@ -31,6 +32,7 @@ from swarm.wire.topics import (
     COST,
     FLEET,
     FOLLOWED,
+    LEAVE,
     POSE,
     PUSHED_ROUTE,
     ROUTE,
@@ -42,8 +44,9 @@ from vehicle_agent.assignment import AskCosts
 from vehicle_agent.chasers import ChasersReport
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
+from vehicle_agent.entering import Entering
 from vehicle_agent.fleet import FleetReport, directions_of
-from vehicle_agent.placement import spawn_cells
+from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import TruthSensor
@@ -71,9 +74,10 @@ class AgentService:
         store: PromiseStore,
     ) -> None:
         scenario = setup.scenario
-        plan = _plan_of(setup)
+        plan = _plan_of(setup) if setup.added is None else setup.added.plan
         grid = terrain.grid
-        spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth, load_homes(setup, terrain, truth))
+        homes = load_homes(setup, terrain, truth)
+        spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth, homes)
         self._member = Member(setup.info(grid, terrain.digest), bus, post)
         self.counters = self._member.counters
         for name in ("reroute_requests", "routes_received", "marks", "blocked_ticks"):
@@ -103,7 +107,9 @@ class AgentService:
             group,
             scenario.vehicles.sense_range_m,
         )
-        self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
+        self._right_of_way = RightOfWaySync(
+            setup, grid, spawns, store, bus, post, self._place, self._warn, plan.vehicle_ids
+        )
         self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings)
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
@@ -111,12 +117,25 @@ class AgentService:
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
         self._roster = Roster()
         self._now_ns = 0
+        self.when_over: Callable[[], None] | None = None
+        """Called once all vehicles of an added agent have left."""
+        self._removed: set[str] = set()
+        """Vehicles that an operator has let leave."""
+        self._entering: Entering | None = None
+        if setup.added is not None:
+            cells = entry_cells(setup.added, grid, homes, setup.incarnation)
+            self._entering = Entering(plan.vehicle_ids, cells, self._agent.holdings)
         self._fleet = FleetReport(self._author, group)
         self._chasers = ChasersReport(self._author)
 
     @property
     def agent(self) -> Agent:
         return self._agent
+
+    @property
+    def over(self) -> bool:
+        """Whether all vehicles of an agent that was added have left."""
+        return self._entering is not None and self._entering.over and self._agent.holdings.gone
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role="planner")
@@ -129,6 +148,7 @@ class AgentService:
                 self._bus.subscribe(SIGHTED, self._post, target=target)
         self._bus.subscribe(PUSHED_ROUTE, self._post, agent=self._setup.id)
         self._right_of_way.start(now_ns)
+        self._bus.serve(LEAVE, self._post, agent=self._setup.id)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
@@ -137,6 +157,9 @@ class AgentService:
             return
         agent = self._agent
         match event:
+            case Asked(topic=topic, request=RemoveVehicles() as request) if topic is LEAVE:
+                event.answer(self._remove(request.vehicles), agent=self._setup.id)
+                event.end()
             case Heard(message=Sighted() as sighted):
                 self._hear_sighted(sighted, now_ns)
             case Heard(message=PushedRoute() as pushed):
@@ -169,6 +192,8 @@ class AgentService:
         self._sync.tick(now_ns)
         agent = self._agent
         self._right_of_way.hear_granted(now_ns)
+        if self._entering is not None:
+            self._entering.tick(self._right_of_way.core.informed, now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
         agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
@@ -192,8 +217,13 @@ class AgentService:
             self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
         self._gauge()
+        if self.over and self.when_over is not None:
+            self.when_over()
 
     def stop(self, now_ns: int) -> None:
+        if self._entering is not None:
+            self._remove([])  # whoever ends this process takes its vehicles away; one that is killed leaves them
+            self._right_of_way.tick(self._agent.wishes, now_ns)
         self._member.publish_stats(now_ns)
 
     # --- places ---------------------------------------------------------------------------------------------
@@ -202,6 +232,18 @@ class AgentService:
         if vehicles:
             self._agent.place(vehicles)
             log.info("%d vehicles have their places", len(self._agent.vehicles))
+
+    def _remove(self, asked: Sequence[str]) -> Removed:
+        """Let vehicles leave, all if none is named; of those that have left already say how far it is."""
+        ours = self._agent.plan.vehicle_ids
+        left = [id for id in ours if id in asked or not asked]
+        self._agent.remove([id for id in left if id not in self._removed])
+        self._removed.update(left)
+        if self._entering is not None:
+            self._entering.remove(left)
+        held = sum(self._agent.holdings.is_granted(id) for id in left)
+        unknown = sorted(set(asked).difference(ours))
+        return Removed(agent=self._setup.id, left=left, unknown=unknown, held=held)
 
     def _warn(self, kind: str, text: str) -> None:
         log.warning("%s: %s", kind, text)
