@@ -164,6 +164,8 @@ def run_role(
         network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, part.connect))
         scenario = msgspec.structs.replace(scenario, network=network)
     ids = [spec.id for spec in processes_of(scenario, (role,))]
+    if joins is not None:
+        added_agent(scenario, id or "added0", joins.group, joins.count, joins.at)  # refused before anybody is asked
     if role == "keeper" or (joins is not None and id):
         _check_id(id)
     elif joins is not None and scenario.network.tls is not None:
