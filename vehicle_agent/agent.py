@@ -166,6 +166,13 @@ class Agent:
             self._look_from[cell] = None
             self._unassigned = True
 
+    def remove(self, vehicles: Sequence[str]) -> None:
+        """These leave the map: their cells are given back."""
+        for id in vehicles:
+            self.holdings.leave(id)
+            for known in (self.vehicles, self.wishes, self._wished, self._left_s):
+                known.pop(id, None)
+
     def stand_down(self) -> None:
         """Another process drives the vehicles now."""
         self.vehicles.clear()
