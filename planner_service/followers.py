@@ -9,14 +9,11 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
+from swarm.grid import GridSpec, Window, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.routes import Route, RouteStatus
 
-_STEP_ROW = np.array(STEP_ROW, np.int64)
-_STEP_COL = np.array(STEP_COL, np.int64)
-_NOWHERE = np.empty(0, np.int64)
 _NOWHERE_BOUNDS = (0, 0, 0, 0)
 
 
@@ -26,7 +23,7 @@ class Follower:
 
     cell       on its path, by its agent's last report or its own request: where a new route for it begins
     route      what it was given last; None if nothing was, by this incarnation of the planner
-    rows, cols of the cells of that route
+    cells      of that route
     bounds     first row and column of that route and the cells next to it, and the first behind them
     stale      there may be a better route than the one it has
     push_ns    it is not pushed another one before
@@ -36,8 +33,7 @@ class Follower:
     max_cells: int
     heard_ns: int
     route: Route | None = None
-    rows: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
-    cols: NDArray[np.int64] = field(default_factory=lambda: _NOWHERE)
+    cells: list[int] = field(default_factory=list)
     bounds: tuple[int, int, int, int] = _NOWHERE_BOUNDS
     stale: bool = False
     push_ns: int = 0
@@ -122,17 +118,18 @@ class Followers:
 
     def sent(self, follower: Follower, route: Route, push_ns: int) -> None:
         follower.route, follower.stale, follower.push_ns = route, False, push_ns
-        rows, cols = follower.rows, follower.cols = route_cells(self._grid, route)
-        follower.bounds = _NOWHERE_BOUNDS
-        if len(rows):
-            row0, col0, row1, col1 = int(rows.min()), int(cols.min()), int(rows.max()), int(cols.max())
-            follower.bounds = (row0 - 1, col0 - 1, row1 + 2, col1 + 2)
+        if route.status is not RouteStatus.OK:
+            follower.cells, follower.bounds = [], _NOWHERE_BOUNDS
+            return
+        cells = follower.cells = walk(self._grid, route.start, route.directions)
+        rows, cols = [cell // self._grid.cols for cell in cells], [cell % self._grid.cols for cell in cells]
+        follower.bounds = (min(rows) - 1, min(cols) - 1, max(rows) + 2, max(cols) + 2)
 
     def forget_routes(self) -> None:
         """Another planner has given routes meanwhile: whatever is given next is news to every follower."""
         for follower in self._by_id.values():
             follower.route, follower.stale, follower.push_ns = None, True, 0
-            follower.rows, follower.cols, follower.bounds = _NOWHERE, _NOWHERE, _NOWHERE_BOUNDS
+            follower.cells, follower.bounds = [], _NOWHERE_BOUNDS
 
     def _register(self, vehicle: str, follower: Follower) -> Follower:
         if len(self._by_id) >= CAPACITY:
@@ -161,7 +158,7 @@ class Followers:
         each = np.array([(w.row0, w.col0, w.row1, w.col1) for w in changed], np.int64).T
         near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
         for n, m in np.argwhere(near).tolist():
-            fresh[n].stale = fresh[n].stale or _crosses(fresh[n], changed[m])
+            fresh[n].stale = fresh[n].stale or self._crosses(fresh[n], changed[m])
 
     def due(self, now_ns: int) -> Iterable[tuple[str, Follower]]:
         """Followers with a stale route that may be pushed another one; of too many, those that waited longest."""
@@ -177,35 +174,17 @@ class Followers:
             return True
         if route.status is not RouteStatus.OK:
             return False
-        row, col = self._grid.row_col(route.start)
-        at = np.flatnonzero((follower.rows == row) & (follower.cols == col))
-        if not len(at):
+        if route.start not in follower.cells:
             return True
-        rest = old.directions[int(at[0]) :]
+        rest = old.directions[follower.cells.index(route.start) :]
         # An extension of the same route is not pushed until half of the old one is driven.
         if old.remaining_s > 0 and route.remaining_s > 0 and 2 * len(rest) >= len(route.directions):
             return not route.directions.startswith(rest)
         return rest != route.directions
 
-
-def route_cells(grid: GridSpec, route: Route) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(rows, cols) of the cells of a route, its start included."""
-    if route.status is not RouteStatus.OK:
-        return _NOWHERE, _NOWHERE
-    row, col = grid.row_col(route.start)
-    codes = np.frombuffer(route.directions, np.uint8)
-    rows, cols = np.empty(len(codes) + 1, np.int64), np.empty(len(codes) + 1, np.int64)
-    rows[0], cols[0] = row, col
-    rows[1:] = row + np.cumsum(_STEP_ROW[codes])
-    cols[1:] = col + np.cumsum(_STEP_COL[codes])
-    return rows, cols
-
-
-def _crosses(follower: Follower, window: Window) -> bool:
-    """Whether the route passes through a window or next to it: a diagonal step depends on the cells beside it."""
-    rows, cols = follower.rows, follower.cols
-    return bool(
-        (
-            (rows >= window.row0 - 1) & (rows <= window.row1) & (cols >= window.col0 - 1) & (cols <= window.col1)
-        ).any()
-    )
+    def _crosses(self, follower: Follower, window: Window) -> bool:
+        """Whether the route passes through a window or next to it: a diagonal step depends on the cells beside
+        it."""
+        rows, cols = np.divmod(np.array(follower.cells, np.int64), self._grid.cols)
+        inside = (rows >= window.row0 - 1) & (rows <= window.row1)
+        return bool((inside & (cols >= window.col0 - 1) & (cols <= window.col1)).any())

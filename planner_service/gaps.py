@@ -89,15 +89,13 @@ class GapStatistics:
 
     def _rest(self, follower: Follower, pace: NDArray[np.float32]) -> tuple[float, int] | None:
         """(cost, last cell) of the rest of a follower's route; None if it has left the route or has none."""
-        row, col = divmod(follower.cell, self._cols)
-        at = np.flatnonzero((follower.rows == row) & (follower.cols == col))
-        if not len(at):
+        if follower.cell not in follower.cells:
             return None
-        rows, cols = follower.rows[int(at[0]) :], follower.cols[int(at[0]) :]
+        cells = np.array(follower.cells[follower.cells.index(follower.cell) :], np.int64)
+        rows, cols = np.divmod(cells, self._cols)
         diagonal = (np.diff(rows) != 0) & (np.diff(cols) != 0)
         metres = np.where(diagonal, self._diagonal_m, self._straight_m)
         paces = pace[rows[1:], cols[1:]].astype(np.float64)
-        cells = rows * self._cols + cols
         if self._climb is not None:
             paces *= self._climb.along(cells[:-1], cells[1:])
         return float(((paces + self._length_weight) * metres).sum()), int(cells[-1])

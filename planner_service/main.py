@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from contextlib import closing
 
@@ -19,6 +20,7 @@ from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, end_with
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 
 log = logging.getLogger(__name__)
 
@@ -36,12 +38,13 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, kept_key(scenario))
     clock = MonotonicClock()
     inbox = Inbox()
+    network = scenario.network
     with (
-        open_bus(scenario.network, patient=True) as bus,
-        closing(ThreadWorker("grow-tree", inbox, clock)) as worker,
+        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
+        closing(ThreadWorker("grow-tree", inbox)) as worker,
     ):
         service = PlannerService(
-            setup, terrain, bus, inbox.post, worker, clock.now_ns, lambda: kernels.complete, prepared
+            setup, terrain, bus, inbox.post, worker, time.thread_time_ns, lambda: kernels.complete, prepared
         )
         process = Process(service, inbox, clock, scenario.planner.tick_hz)
         process.stop_on_signals()

@@ -122,6 +122,11 @@ class TargetTree:
         only_whole = self._costs.directed or not self._all_kernels()
         return whole_trees_only(self._row) if only_whole else self._row
 
+    def set_budget(self, cpu_budget: float) -> None:
+        """The share of one core that this tree may take from now on, under `auto`."""
+        self._budget_ns = cpu_budget * 1e9 / self._config.tick_hz
+        self._choose_row()
+
     def share(self, cell_cost: Floats) -> None:
         """Begin with the cell costs of the map as it is before any mark, which other processes share; `update` is
         told all changes since. Before the first `update`."""

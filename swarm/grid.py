@@ -209,11 +209,14 @@ def walk(grid: GridSpec, start: int, directions: bytes) -> list[int]:
     Raises ValueError on a code outside 0..7 and OutsideGridError where the route leaves the grid.
     """
     row, col = grid.row_col(start)
+    if max(directions, default=0) > 7:
+        raise ValueError(f"direction code {max(directions)} is not in 0..7")
+    rows, cols = grid.rows, grid.cols
     cells = [start]
     for direction in directions:
-        if direction > 7:
-            raise ValueError(f"direction code {direction} is not in 0..7")
         row += STEP_ROW[direction]
         col += STEP_COL[direction]
-        cells.append(grid.cell(row, col))
+        if not (0 <= row < rows and 0 <= col < cols):
+            grid.cell(row, col)  # raises
+        cells.append(row * cols + col)
     return cells

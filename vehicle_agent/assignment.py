@@ -218,6 +218,14 @@ class Assignment:
         self._costs_s: dict[str, NDArray[np.float32]] = {}
         """Target -> the costs that its planner answered to the open request."""
 
+    def set_targets(self, targets: Sequence[str]) -> None:
+        """Those that the vehicles may go for from now on."""
+        self._targets = targets
+
+    def set_period(self, reassign_s: float) -> None:
+        """How often vehicles ask from now on."""
+        self._reassign_ns = int(reassign_s * NS_PER_S)
+
     def due(self, now_ns: int) -> bool:
         return now_ns >= self._due_ns and self._open is None
 

@@ -12,14 +12,15 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, He
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
+from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.host import AskKnown
+from swarm.right_of_way.plots import Plots
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
 from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE
 from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.traffic.holdings import Tell, Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
-from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
 

@@ -22,12 +22,16 @@ from swarm.liveness import Roster
 from swarm.plugins.find import named_plugin
 from swarm.ranks import job_of
 from swarm.runtime.membership import Member
+from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
+from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
 from swarm.wire.topics import (
+    BODY,
     CHASERS,
     COST,
     FLEET,
@@ -40,6 +44,7 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of
+from vehicle_agent.bodies import Bodies
 from vehicle_agent.chasers import ChasersReport
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.places import Places
@@ -50,6 +55,7 @@ from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.zones import ZonesAround
 
 log = logging.getLogger(__name__)
 
@@ -109,16 +115,22 @@ class AgentService:
             scenario.vehicles.sense_range_m,
         )
         self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
+        bodies = Bodies(grid, scenario.cost.vehicle_radius_m)
         targets = plan.group.targets or tuple(scenario.target_ids)
         assigned = AssignmentWorld(setup.id, group, targets, scenario.seed)
         assigner = assigner_of(named_plugin(scenario, "vehicles.assignment"), assigned, self._faults.append)
         driven = DynamicsWorld(setup.id, grid, scenario.seed)
         dynamics = dynamics_of(named_plugin(scenario, "vehicles.dynamics"), driven, self._faults.append)
-        self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings, assigner, dynamics)
+        self._agent = Agent(
+            plan, scenario, local, sensor, self._right_of_way.core.holdings, bodies, assigner, dynamics
+        )
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
+        self._zones = ZonesAround(self._replica, self._cost_map)
+        self._obedience = Obedience(setup, bus, post, self._obeys)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
+        self._obeyed_version = 0
         self._roster = Roster()
         self._now_ns = 0
         self._fleet = FleetReport(self._author, group)
@@ -132,7 +144,9 @@ class AgentService:
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
         self._sync.start(now_ns)
+        self._obedience.start(now_ns)
         self._bus.collect(POSE)
+        self._bus.collect(BODY)
         if self._untracked.targets:
             self._bus.collect(TRUE_POSE)
             for target in sorted(self._untracked.targets):
@@ -143,7 +157,7 @@ class AgentService:
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if self._right_of_way.handle(event, now_ns):
+        if self._right_of_way.handle(event, now_ns) or self._obedience.handle(event, now_ns):
             return
         agent = self._agent
         match event:
@@ -181,12 +195,16 @@ class AgentService:
         self._right_of_way.hear_granted(now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
+        self._zones.update(agent.places, now_ns)
+        agent.set_ways_out(self._zones.ways_out)
+        self._obey(now_ns)
         agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
         if agent.places:
             self._sync.enter(self._near_marks.update(agent.places))
+        self._hear_bodies(now_ns)
         agent.begin_drive(now_ns)
-        while (findings := agent.drive()) is not None:
-            if len(findings):
+        while (found := agent.drive()) is not None:
+            if len(findings := self._zones.without(found)):
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._cost_map.take_dirty(), now_ns)
@@ -206,6 +224,23 @@ class AgentService:
 
     def stop(self, now_ns: int) -> None:
         self._member.publish_stats(now_ns)
+
+    def _obey(self, now_ns: int) -> None:
+        """Go by what is ordered."""
+        orders, agent = self._obedience, self._agent
+        agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
+        if self._obeyed_version != orders.book.version:
+            self._obeyed_version = orders.book.version
+            scenario, book = self._setup.scenario, orders.book
+            agent.set_targets(book.targets_of(agent.plan.group.name, scenario), now_ns)
+            agent.set_pace(
+                book.setting("time_scale", scenario.time_scale),
+                book.setting("vehicles.reassign_s", scenario.vehicles.reassign_s),
+            )
+        orders.tick(now_ns)
+
+    def _obeys(self, order: Obey) -> bool:
+        return order.subject is not None or self._sync.holds(order.author, order.sets, self._now_ns)
 
     # --- places ---------------------------------------------------------------------------------------------
 
@@ -236,14 +271,28 @@ class AgentService:
     def _hear_pose(self, heard: Heard, now_ns: int) -> None:
         pose = heard.message
         assert isinstance(pose, TargetPose)
-        self._detector.set_truth(pose, now_ns)
-        if heard.topic is POSE and pose.target not in self._untracked.targets:
-            self._agent.hear_pose(pose, now_ns)
+        # A tracker's pose is the truth for the simulated sensor of targets only if it counts.
+        tracked = pose.target not in self._untracked.targets
+        if heard.topic is TRUE_POSE or (tracked and self._agent.hear_pose(pose, now_ns)):
+            self._detector.set_truth(pose, now_ns)
+
+    def _hear_bodies(self, now_ns: int) -> None:
+        bodies = self._agent.bodies
+        bodies.tick(now_ns)
+        for heard in self._bus.collected(BODY):
+            assert isinstance(heard.message, Body)
+            bodies.hear(heard.message, now_ns)
+        self._agent.bodies_moved()
+        self.counters.counts["bodies_refused"] = bodies.refused
+        self.counters.counts["detours"] = self._agent.detours.found
+        for text in bodies.complaints:
+            self._warn("body", text)
+        bodies.complaints.clear()
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
         pose = self._untracked.hear(sighted, now_ns)
         if pose is not None:
-            self._agent.set_pose(pose, now_ns)
+            self._agent.see_target(pose, now_ns)
 
     def _planners(self) -> dict[str, int]:
         """Target -> incarnation of its living planner, or of the first of its standbys that lives."""

@@ -113,6 +113,7 @@ def _print_cost(reply: CostReply, row: int, col: int) -> None:
         typer.echo("no_target: the planner does not know where its target is")
     elif math.isfinite(cost_s):
         typer.echo(f"from row {row}, col {col} to {reply.target} in {cost_s:.1f} s")
+        _print_pose(reply)
     else:
         typer.echo(
             f"unreachable: row {row}, col {col} has no way to {reply.target}, is lethal or outside of the terrain"
@@ -141,6 +142,18 @@ def _print_route(reply: RouteReply, took_ms: float) -> None:
     typer.echo(
         f"tree {reply.tree_age_ms:.0f} ms old, map version {reply.map_version}, answered in {took_ms:.1f} ms"
     )
+    _print_pose(reply)
+
+
+def _print_pose(reply: RouteReply | CostReply) -> None:
+    """Say how old the pose is that the answer goes by."""
+    if reply.pose_age_s is None:
+        return
+    if reply.tracker_lost:
+        where = f"{reply.target} is lost: nobody tracks it, and this is where it was {reply.pose_age_s:.1f} s ago"
+        typer.secho(where, fg="yellow")
+    else:
+        typer.echo(f"pose {reply.pose_age_s:.1f} s old")
 
 
 def _strides(directions: bytes) -> str:
@@ -272,7 +285,9 @@ def _print_status(
         console.print(f"author {author} exceeds its quota; its marks are delayed", style="yellow")
     if planners:
         trees = Table(
-            "target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap", pad_edge=False
+            *("target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap"),
+            *("pose s", "tracker"),
+            pad_edge=False,
         )
         for id, planner in sorted(planners.items()):
             gap = "-" if planner.gap_mean is None else f"{planner.gap_mean:.3f}"
@@ -285,5 +300,8 @@ def _print_status(
                 str(planner.window_growths),
                 str(planner.routes_served),
                 gap,
+                "-" if planner.pose_age_s is None else f"{planner.pose_age_s:.1f}",
+                "lost" if planner.tracker_lost else planner.tracker or "-",
+                style="yellow" if planner.tracker_lost else None,
             )
         console.print(trees)

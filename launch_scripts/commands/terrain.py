@@ -16,7 +16,7 @@ from rich.table import Table
 from launch_scripts.commands.shared_options import AsJson
 from launch_scripts.launcher.progress import progress
 from shared_map.arrays import Bytes
-from shared_map.terrain.layers import TerrainClass, slope_deg
+from shared_map.terrain.layers import TerrainClass
 from swarm.config.scenario import Scenario, TerrainConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
 
@@ -85,19 +85,23 @@ def info(
     fill: Fill = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say what a terrain file holds, and what was done to bring it onto a metric grid.
+    """Say what a terrain file or a scenario holds, and what was done to bring it onto a metric grid.
 
-    Reads .tif, .tiff, .hgt, .vrt, .asc, .npz, MovingAI .map, ROS map_server
-    .yaml or .yml, and .png with --resolution-m and --height-scale. The lines after the table say
-    what was done to the file, and what you should know about it.
+    Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
+    these in a .zip, .asc, .npz, MovingAI .map, ROS map_server .yaml or .yml,
+    and .png with --resolution-m and --height-scale. The lines after the table
+    say what was done to the file, and what you should know about it; those
+    with a ! what looks wrong. Costs are those of the scenario, of a file
+    those of an empty one.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
     """
-    from shared_map.terrain.importers.sources import load_source
+    from shared_map.terrain.terrain import build_terrain
+    from shared_map.terrain.terrain_report import doubts_about, facts_of
 
     if file.endswith(".toml"):
-        config = _scenario(file).terrain
+        scenario = _scenario(file)
     else:
         nodata = "fill" if fill else "lethal"
         raw = {
@@ -107,41 +111,23 @@ def info(
             "height_scale": height_scale,
             "nodata": nodata,
         }
-        config = msgspec.convert(raw, TerrainConfig)
+        scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig))
     with progress() as tell:
-        source = load_source(config, 1, tell)
-    facts = _facts(source.grid, source.elevation_m)
-    if source.factor is not None:
-        facts["lethal_share"] = round(float(np.isinf(source.factor).mean()), 4)
+        terrain = build_terrain(scenario, tell)
+    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid)}
+    doubts = doubts_about(facts)
     if as_json:
-        console.print_json(json.dumps({**facts, "notes": source.notes}))
+        console.print_json(json.dumps({**facts, "notes": terrain.notes, "doubts": doubts}))
         return
     table = Table(show_header=False, box=None)
     for key, value in facts.items():
-        table.add_row(key, str(value))
+        shown = ", ".join(f"{k} {v:.1%}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+        table.add_row(key, shown)
     console.print(table)
-    for note in source.notes:
+    for note in terrain.notes:
         console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _facts(grid: GridSpec, elevation_m: Any) -> dict[str, Any]:
-    facts: dict[str, Any] = {
-        "rows": grid.rows,
-        "cols": grid.cols,
-        "resolution_m": grid.resolution_m,
-        "width_m": round(grid.cols * grid.resolution_m, 1),
-        "height_m": round(grid.rows * grid.resolution_m, 1),
-        "crs": _crs_name(grid),
-        "voids": int(np.isnan(elevation_m).sum()),
-    }
-    known = elevation_m[~np.isnan(elevation_m)]
-    if known.size:
-        facts["lowest_m"], facts["highest_m"] = round(float(known.min()), 1), round(float(known.max()), 1)
-        stride = -(-max(grid.rows, grid.cols) // 2048)
-        slopes = slope_deg(np.ascontiguousarray(elevation_m[::stride, ::stride]), grid.resolution_m * stride)
-        for name, share in (("slope_median_deg", 50), ("slope_95_deg", 95), ("slope_max_deg", 100)):
-            facts[name] = round(float(np.nanpercentile(slopes, share)), 1)
-    return facts
+    for doubt in doubts:
+        console.print(f"! {doubt}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _crs_name(grid: GridSpec) -> str:
@@ -149,14 +135,16 @@ def _crs_name(grid: GridSpec) -> str:
         return grid.crs
     import rasterio
 
-    from shared_map.terrain.importers.rasters import crs_name
+    from shared_map.terrain.importers.georeference import crs_name
 
     return crs_name(rasterio.CRS.from_user_input(grid.crs))
 
 
 @app.command()
 def cost(
-    scenario: Annotated[str, typer.Argument(help="A scenario file or the name of a built-in one.")],
+    scenario: Annotated[
+        str, typer.Argument(help="A scenario file, the name of a built-in one, or a terrain file.")
+    ],
     out: Annotated[Path | None, typer.Option(help="Write seconds per metre as GeoTIFF; lethal is -1.")] = None,
     picture: PictureOption = None,
 ) -> None:

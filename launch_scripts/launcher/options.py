@@ -14,10 +14,11 @@ from pathlib import Path
 import msgspec
 
 from launch_scripts.process_table import certificate_name
+from shared_map.terrain.importers.sources import is_terrain
 from swarm.bus.endpoints import host_port
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.load import check_endpoint, load_scenario
-from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
+from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TerrainConfig, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
 from swarm.wire.fields import check_id
 
@@ -25,8 +26,11 @@ SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
 def find_scenario(name: str) -> Scenario:
-    """Loads a built-in scenario by name, or one from a file."""
+    """Loads a built-in scenario by name, or one from a file. A file of elevation stands for a scenario on it that
+    says nothing else."""
     path = Path(name)
+    if path.is_file() and is_terrain(path):
+        return Scenario(name=path.stem, terrain=TerrainConfig(source=name))
     if path.suffix == ".toml" or path.is_file():
         return load_scenario(path)
     built_in = SCENARIOS / f"{name}.toml"

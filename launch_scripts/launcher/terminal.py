@@ -35,6 +35,8 @@ REPORTED = {
     "lost": "lost at the end",
     "collisions": "collisions",
     "lethal_entries": "lethal cells entered",
+    "driven_into": "bodies driven into",
+    "hit_by_bodies": "vehicles hit by bodies",
     "gap": "gap to the optimum",
     "growth_ms": "growing a tree, ms",
     "route_query_ms": "asking for a route, ms",

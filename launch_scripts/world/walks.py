@@ -65,6 +65,15 @@ class TrueTerrain:
     def _passable(self, row: int, col: int) -> bool:
         return self.pace_s_per_m.item(row, col) < math.inf
 
+    def nearest(self, cell: int) -> int:
+        """The passable cell nearest to a cell, which may be itself."""
+        if not self.lethal(cell):
+            return cell
+        rows, cols = np.nonzero(np.isfinite(self.pace_s_per_m))
+        row, col = divmod(cell, self.grid.cols)
+        best = int(((rows - row) ** 2 + (cols - col) ** 2).argmin())
+        return int(rows[best]) * self.grid.cols + int(cols[best])
+
     def random_home(self, chance: random.Random) -> int:
         return self._home.cell(chance.randrange(len(self._home)))
 

@@ -45,7 +45,7 @@ from swarm.runtime.role import RoleSetup
 if TYPE_CHECKING:
     from shared_map.terrain.importers.sources import Source
 
-FORMAT = 2
+FORMAT = 3
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
 _META = "terrain.json"
 _ALL_LETHAL = "every cell of the terrain is lethal, no vehicle could stand anywhere:"

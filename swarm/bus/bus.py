@@ -154,7 +154,7 @@ class LinkChanged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorkDone:
-    """A job given to a `Worker` is done, after `took_ns`."""
+    """A job given to a `Worker` is done, in `took_ns` of CPU time."""
 
     tag: str
     result: object

@@ -15,12 +15,14 @@ from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import (
     MOST_TARGETS,
+    RESERVED_GROUP,
     WHOLE_TREE_STRATEGIES,
     PlannerConfig,
     Scenario,
     Strategy,
     TlsConfig,
     ZoneConfig,
+    ids_of,
 )
 from swarm.errors import ConfigError
 from swarm.ranks import split_rank
@@ -51,6 +53,9 @@ def _check(scenario: Scenario, source: str) -> None:
     doubled = sorted(id for id, times in Counter(ids).items() if times > 1)
     if doubled:
         raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    rovers = Counter(id for rover in scenario.rovers for id in ids_of(rover))
+    if rovers and rovers.most_common(1)[0][1] > 1:
+        raise ConfigError(f"{source}: rovers: two rovers are called {rovers.most_common(1)[0][0]!r}; rename one")
     for id in ids:
         if split_rank(id)[1]:  # planner and standby of two targets would share an id
             raise ConfigError(f"{source}: targets: {id!r} is what a standby of another target is called; rename it")
@@ -71,6 +76,8 @@ def _check(scenario: Scenario, source: str) -> None:
     if len(set(names)) < len(names):
         raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
     for name in names:
+        if name.split(".")[0] == RESERVED_GROUP:
+            raise ConfigError(f"{source}: groups: {name!r} is not free: zones of operators are marks of that name")
         longer = [other for other in names if other.startswith(f"{name}.")]
         if longer:  # the id of an author begins with its group and a point
             raise ConfigError(

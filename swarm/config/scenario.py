@@ -26,6 +26,8 @@ Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Point = tuple[Metres, Metres]
 Polygon = Annotated[tuple[Point, ...], Meta(min_length=3, max_length=10_000)]
 
+RESERVED_GROUP = "operator"
+"""No group is called so: zones are marks of this one, which every group hears."""
 MOST_TARGETS = 1000
 """Of all entries together."""
 
@@ -99,20 +101,24 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Where elevation and photo come from.
 
-    source        "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .hgt, .vrt, .asc, .npz, .png, .map
-                  (MovingAI), .yaml or .yml (ROS)
-    photo         a colour GeoTIFF on the same ground, or nothing
-    labels        a TOML file of labelled polygons and points, from which to learn what the photo shows
-    resolution_m  cell size to bring everything to; the source's own if not given
-    crs           coordinate system of the source where the file does not say it, such as "EPSG:32632"
-    height_scale  metres per unit of height, where the file does not say it (.png)
-    nodata        voids are lethal, or filled from their surroundings
-    roads         how many roads to lay between seeded places, as there is no map of them
-    rows          synthetic: cells from north to south
-    cols          synthetic: cells from west to east
-    relief_m      synthetic: height of the highest cell above the lowest
-    rivers        synthetic: how many rivers cross the terrain
-    hidden        what is true of the terrain and missing from the map
+    source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2,
+                   .nc, .vrt, one of these in a .zip, .asc, .npz, .png, .map (MovingAI), .yaml or .yml (ROS)
+    photo          a colour GeoTIFF on the same ground, or nothing
+    labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
+    resolution_m   cell size to bring everything to; the source's own if not given
+    crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
+    height_scale   metres per unit of height, where the file does not say it (.png)
+    nodata         voids are lethal, or filled from their surroundings
+    nodata_values  heights, as they are stored in the source, that stand for no height beside those that it declares
+    level_is       what level ground of a file is taken for where no photo shows it: elevation models are levelled
+                   on lakes and the sea
+    water_below_m  ground of a file lower than this is water where no photo shows it; 0 for a coast
+    roads          how many roads to lay between seeded places, as there is no map of them
+    rows           synthetic: cells from north to south
+    cols           synthetic: cells from west to east
+    relief_m       synthetic: height of the highest cell above the lowest
+    rivers         synthetic: how many rivers cross the terrain
+    hidden         what is true of the terrain and missing from the map
     """
 
     source: Annotated[str, Meta(min_length=1)] = "jacksboro"
@@ -122,6 +128,9 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     crs: str | None = None
     height_scale: Positive | None = None
     nodata: Literal["lethal", "fill"] = "lethal"
+    nodata_values: Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(max_length=20)] = ()
+    level_is: Literal["water", "ground"] = "water"
+    water_below_m: Annotated[float, Meta(ge=-20_000, le=20_000)] | None = None
     roads: Annotated[int, Meta(ge=0, le=200)] = 0
     rows: Annotated[int, Meta(ge=1, le=16384)] = 256
     cols: Annotated[int, Meta(ge=1, le=16384)] = 256
@@ -202,6 +211,22 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     def is_simulated(self) -> bool:
         """Whether the run moves it; the pose of an external target comes from another process."""
         return self.walk != "external"
+
+
+class RoverConfig(Section, frozen=True, kw_only=True):
+    """A simulated outside vehicle, or `count` alike: it says where it is, speaks no right of way and looks out for
+    nobody. Ids as those of targets.
+
+    name           id of the rover, or what the ids begin with
+    count          how many rovers
+    speed_m_per_s  its speed, on any ground
+    radius_m       what vehicles keep away from, around its middle
+    """
+
+    name: Name = "r"
+    count: Annotated[int, Meta(ge=1, le=256)] = 1
+    speed_m_per_s: NotNegative = 2.0
+    radius_m: Annotated[float, Meta(ge=0, le=100)] = 1.0
 
 
 class GroupConfig(Section, frozen=True, kw_only=True):
@@ -345,7 +370,7 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
                        not answer; while no router listens, processes wait
     tls                certificates, for endpoints beyond loopback
     admit              names in certificates that a router lets take part, beside those of the scenario's processes:
-                       router.north, keeper.east, operator.anna
+                       router.north, keeper.east, operator.anna, rover.all.r1
     revoked            names in certificates that a router denies everything
     """
 
@@ -384,6 +409,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     cost           how terrain becomes pace
     targets        what is chased
     groups         which vehicles there are
+    rovers         simulated outside vehicles that the swarm's must not drive into
     vehicles       how vehicles behave
     planner        how a planner keeps its tree
     standbys       which processes stand by
@@ -401,6 +427,7 @@ class Scenario(Section, frozen=True, kw_only=True):
     cost: CostConfig = CostConfig()
     targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1, max_length=MOST_TARGETS)] = (TargetConfig(),)
     groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1, max_length=256)] = (GroupConfig(),)
+    rovers: Annotated[tuple[RoverConfig, ...], Meta(max_length=256)] = ()
     vehicles: VehicleConfig = VehicleConfig()
     planner: PlannerConfig = PlannerConfig()
     standbys: StandbyConfig = StandbyConfig()
@@ -423,8 +450,8 @@ class Scenario(Section, frozen=True, kw_only=True):
         return sum(group.vehicles for group in self.groups)
 
 
-def ids_of(target: TargetConfig) -> list[str]:
-    """Ids of a target: `name` for one, `name0, name1, ...` for several."""
-    if target.count == 1:
-        return [target.name]
-    return [f"{target.name}{n}" for n in range(target.count)]
+def ids_of(some: TargetConfig | RoverConfig) -> list[str]:
+    """Ids of a target or rover: `name` for one, `name0, name1, ...` for several."""
+    if some.count == 1:
+        return [some.name]
+    return [f"{some.name}{n}" for n in range(some.count)]

@@ -4,12 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec
-
-_STEP_ROW = np.array(STEP_ROW, np.int64)
-_STEP_COL = np.array(STEP_COL, np.int64)
 _SKIPPED_CELLS = 24
 """A vehicle that others push may come back to its route so far on."""
 
@@ -52,8 +46,9 @@ class Follower:
         """The smallest (row, col) and the greatest of all its cells in a grid of so many columns; of no cells a
         rectangle that holds nothing."""
         if self._bounds is None:
-            rows, east = np.divmod(np.array(self._cells or [0], np.int64), cols)
-            self._bounds = (int(rows.min()), int(east.min()), int(rows.max()), int(east.max()))
+            rows = [cell // cols for cell in self._cells or (0,)]
+            east = [cell % cols for cell in self._cells or (0,)]
+            self._bounds = (min(rows), min(east), max(rows), max(east))
         return self._bounds if self._cells else (1, 1, 0, 0)
 
     def moved(self, cell: int) -> None:
@@ -93,20 +88,3 @@ class Follower:
         self._set(self._cells[:keep], self._at)
         self.partial = False
         return True
-
-
-def route_cells(grid: GridSpec, start: int, directions: bytes) -> tuple[int, ...] | None:
-    """The cells of a route as planners send it, `start` first; None if it leaves the grid or has a wrong
-    direction."""
-    if not 0 <= start < grid.cells:
-        return None
-    codes = np.frombuffer(directions, np.uint8)
-    if len(codes) == 0:
-        return (start,)
-    if int(codes.max()) >= len(STEP_ROW):
-        return None
-    rows = start // grid.cols + np.cumsum(_STEP_ROW[codes])
-    cols = start % grid.cols + np.cumsum(_STEP_COL[codes])
-    if not ((rows >= 0) & (rows < grid.rows) & (cols >= 0) & (cols < grid.cols)).all():
-        return None
-    return (start, *(rows * grid.cols + cols).tolist())

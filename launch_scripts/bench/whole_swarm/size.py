@@ -12,7 +12,7 @@ from swarm.errors import ConfigError
 
 CELLS_PER_VEHICLE = 262.144
 """As `thousand` has it: 512 x 512 cells for 1,000 vehicles."""
-_VEHICLES_AN_AGENT = 100
+_VEHICLES_AN_AGENT = 200
 _FEWEST_AGENTS, _MOST_AGENTS = 4, 40
 _MOST_PER_AGENT = 1000
 _MOST_VEHICLES = 100_000
@@ -107,7 +107,8 @@ def size_of(
 ) -> Size:
     """The size with everything that is not given. Raises ConfigError, which names the option.
 
-    agents, per_agent  at most one of them; by default an agent for each hundred vehicles, at least 4 and at most 40
+    agents, per_agent  at most one of them; by default an agent for each two hundred vehicles, 4 at least and 40 at
+                       most
     side               by default as many cells a vehicle as `thousand` has
     """
     _between("--vehicles", vehicles, 1, _MOST_VEHICLES)

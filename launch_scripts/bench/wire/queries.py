@@ -52,7 +52,7 @@ def planner_peer(network: NetworkConfig, pipe: Connection) -> None:
     terrain = terrain_of_pace(np.random.default_rng(1).uniform(0.1, 1.0, (_SIDE, _SIDE)).astype(np.float32))
     scenario = Scenario(network=network, targets=(TargetConfig(name=_TARGET),))
     setup = RoleSetup(scenario, "bench", "planner", _TARGET, time.time_ns(), time.time_ns())
-    with open_bus(network) as bus, closing(ThreadWorker("grow-tree", inbox, clock)) as worker:
+    with open_bus(network) as bus, closing(ThreadWorker("grow-tree", inbox)) as worker:
         service = PlannerService(setup, terrain, bus, inbox.post, worker, clock.now_ns)
         payloads: list[bytes] = []
 

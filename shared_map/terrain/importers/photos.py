@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
-from shared_map.terrain.importers.rasters import bounds_in, crs_of, opened, resampling
+from shared_map.terrain.importers.georeference import bounds_in, crs_of, resampling
+from shared_map.terrain.importers.rasters import opened
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

@@ -7,10 +7,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.terrain.importers.raster_kinds import is_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.input_files import FileKind, check_bytes
@@ -31,6 +33,7 @@ class Source:
     classes      uint8 (rows, cols), TerrainClass
     photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
     factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
+    level        bool (rows, cols), level ground as the file has it, before any resampling; None if nobody looked
     notes        where it comes from and what was done to it, for people
     """
 
@@ -40,6 +43,7 @@ class Source:
     photo: Bytes | None = None
     seen: Bools | None = None
     factor: Floats | None = None
+    level: Bools | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -79,11 +83,11 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
     source = _without_voids(source, config)
     if config.photo is not None:
         source = _with_photo(source, Path(config.photo), config, progress)
-    if source.photo is None:
-        if config.labels is not None:
-            raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
-        return source
-    return _classified(source, config, seed, progress)
+    if source.photo is not None:
+        source = _classified(source, config, seed, progress)
+    elif config.labels is not None:
+        raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
+    return _with_water(source, config)
 
 
 # --- built in -----------------------------------------------------------------------------------------------
@@ -111,9 +115,7 @@ def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     classes = cover(elevation_m, grid.resolution_m, seed)
     # Lakes are level in the file's own whole metres, no longer after resampling.
     wet = flat_water(plain.heights)
-    at_row = (np.arange(grid.rows) + 0.5) * (wet.shape[0] / grid.rows)
-    at_col = (np.arange(grid.cols) + 0.5) * (wet.shape[1] / grid.cols)
-    classes[wet[np.ix_(at_row.astype(np.intp), at_col.astype(np.intp))]] = TerrainClass.WATER
+    classes[wet[_nearest(wet.shape[0], wet.shape[1], grid)]] = TerrainClass.WATER
     origin = "Jacksboro fault, Tennessee: USGS 3 arc seconds, public domain, from matplotlib's sample data"
     return Source(grid, elevation_m, classes, notes=(origin, note))
 
@@ -138,9 +140,9 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     if path.is_dir():
         raise TerrainError(f"terrain {path} is a folder; give a file: {FILE_KINDS}")
     suffix = path.suffix.lower()
-    if suffix not in _READERS:
+    if suffix not in _READERS and not is_raster(path):
         raise TerrainError(f"terrain {path}: {suffix or 'a file without ending'} is unknown; give {FILE_KINDS}")
-    return _READERS[suffix](path, config, progress)
+    return _READERS.get(suffix, _raster)(path, config, progress)
 
 
 def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
@@ -149,7 +151,7 @@ def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     _check_hgt(path)
     raster = read_elevation(path, config, progress)
     classes = np.zeros(raster.elevation_m.shape, np.uint8)
-    return Source(raster.grid, raster.elevation_m, classes, notes=(str(path), *raster.notes))
+    return Source(raster.grid, raster.elevation_m, classes, level=raster.level, notes=(str(path), *raster.notes))
 
 
 def _check_hgt(path: Path) -> None:
@@ -165,7 +167,8 @@ def _check_hgt(path: Path) -> None:
 
 def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A grey image of heights: needs to be told how many metres a grey level and a cell are."""
-    from shared_map.terrain.importers.rasters import check_size, opened
+    from shared_map.terrain.importers.georeference import check_size
+    from shared_map.terrain.importers.rasters import opened
 
     if config.resolution_m is None or config.height_scale is None:
         raise TerrainError(
@@ -176,10 +179,29 @@ def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         if dataset.count not in (1, 2):
             raise TerrainError(f"terrain {path} has {dataset.count} colour bands; heights are one grey band")
         check_size(dataset.height, dataset.width, f"terrain {path}")
-        heights = dataset.read(1).astype(np.float32) * np.float32(config.height_scale)
+        stored = dataset.read(1).astype(np.float32)
+    heights, found, told = _looked_at(stored, config.height_scale, config)
     grid = GridSpec(heights.shape[0], heights.shape[1], config.resolution_m)
-    notes = (str(path), f"{config.height_scale:g} m per grey level, {config.resolution_m:g} m per pixel")
-    return Source(grid, heights, np.zeros(heights.shape, np.uint8), notes=notes)
+    notes = (str(path), f"{config.height_scale:g} m per grey level, {config.resolution_m:g} m per pixel", *told)
+    return Source(grid, heights, np.zeros(heights.shape, np.uint8), level=found, notes=notes)
+
+
+def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
+    """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
+    from shared_map.terrain.importers.level_ground import (
+        level_ground,
+        notes_of_level,
+        notes_of_voids,
+        undeclared_voids,
+    )
+
+    heights = stored.astype(np.float32)
+    heights[np.isin(heights, np.array(config.nodata_values, np.float32))] = np.nan
+    voids = undeclared_voids(heights)
+    heights[np.isin(heights, np.array(voids, np.float32))] = np.nan
+    heights *= np.float32(scale)
+    found = level_ground(heights)
+    return heights, found.mask, [*notes_of_voids(voids), *notes_of_level(found, config)]
 
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
@@ -187,9 +209,8 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
     plain = read_asc(path) if path.suffix.lower() == ".asc" else read_npz(path)
     assert plain.heights is not None
-    heights, step, photo = plain.heights, plain.step, plain.photo
-    if config.height_scale is not None:
-        heights = heights * np.float32(config.height_scale)
+    step, photo = plain.step, plain.photo
+    heights, level, told = _looked_at(plain.heights, config.height_scale or 1.0, config)
     if step == (0.0, 0.0):
         if config.resolution_m is None:
             raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
@@ -204,16 +225,23 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     else:
         heights, grid, note = _from_metres(heights, step, plain.west, plain.north, config, str(path))
     if photo is not None and photo.shape[:2] != heights.shape:
-        at_row = ((np.arange(grid.rows) + 0.5) * photo.shape[0] / grid.rows).astype(np.intp)
-        at_col = ((np.arange(grid.cols) + 0.5) * photo.shape[1] / grid.cols).astype(np.intp)
-        photo = photo[np.ix_(at_row, at_col)]
-    return Source(grid, heights, np.zeros(heights.shape, np.uint8), photo, notes=(str(path), note))
+        photo = photo[_nearest(photo.shape[0], photo.shape[1], grid)]
+    classes = np.zeros(heights.shape, np.uint8)
+    level = level[_nearest(level.shape[0], level.shape[1], grid)]
+    return Source(grid, heights, classes, photo, level=level, notes=(str(path), note, *told))
+
+
+def _nearest(rows: int, cols: int, grid: GridSpec) -> tuple[Any, ...]:
+    """Which of rows x cols cells over the same ground lie nearest to each cell of a grid."""
+    at_row = ((np.arange(grid.rows) + 0.5) * rows / grid.rows).astype(np.intp)
+    at_col = ((np.arange(grid.cols) + 0.5) * cols / grid.cols).astype(np.intp)
+    return np.ix_(at_row, at_col)
 
 
 def _geographic(crs: str | None) -> bool:
     if crs is None:
         return False
-    from shared_map.terrain.importers.rasters import crs_of
+    from shared_map.terrain.importers.georeference import crs_of
 
     return bool(crs_of(None, crs, "terrain").is_geographic)
 
@@ -243,6 +271,13 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".tiff": _raster,
     ".hgt": _raster,
     ".vrt": _raster,
+    ".img": _raster,
+    ".bil": _raster,
+    ".flt": _raster,
+    ".dem": _raster,
+    ".nc": _raster,
+    ".dt2": _raster,
+    ".zip": _raster,
     ".asc": _heights,
     ".npz": _heights,
     ".png": _png,
@@ -250,8 +285,13 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".yaml": _map,
     ".yml": _map,
 }
-"""Ending -> reader. A new kind of file is a row here."""
+"""Ending -> reader. A new kind of file is a row here; a raster of any other name is known by how it begins."""
 FILE_KINDS = ", ".join(_READERS)
+
+
+def is_terrain(path: Path) -> bool:
+    """Whether a file is named as one that holds a terrain, or begins as a raster."""
+    return path.suffix.lower() in _READERS or is_raster(path)
 
 
 # --- onto the grid ------------------------------------------------------------------------------------------
@@ -330,6 +370,22 @@ def _without_voids(source: Source, config: TerrainConfig) -> Source:
     hint = "; crop the file, or set terrain.nodata = 'fill'" if share > 0.05 else ""
     note = f"{count} voids ({share:.1%} of the cells) are lethal{hint}"
     return replace(source, elevation_m=elevation_m, notes=(*source.notes, note))
+
+
+def _with_water(source: Source, config: TerrainConfig) -> Source:
+    """What is level in the file, or lower than the scenario says, is water where nothing else shows what it is."""
+    water = np.zeros(source.classes.shape, np.bool_)
+    if source.level is not None and config.level_is == "water":
+        water |= source.level
+    notes = source.notes
+    if config.water_below_m is not None:
+        with np.errstate(invalid="ignore"):
+            low = source.elevation_m < np.float32(config.water_below_m)
+        water |= low
+        notes = (*notes, f"{low.mean():.1%} of the cells are lower than {config.water_below_m:g} m: water")
+    classes = source.classes.copy()
+    classes[water & (classes == TerrainClass.UNKNOWN)] = TerrainClass.WATER
+    return replace(source, classes=classes, notes=notes)
 
 
 def _with_photo(source: Source, path: Path, config: TerrainConfig, progress: Progress) -> Source:

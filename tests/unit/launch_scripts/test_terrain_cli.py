@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from launch_scripts.commands import terrain_picture
 from launch_scripts.commands.terrain import app
 from shared_map.terrain.importers.sources import load_source
-from shared_map.terrain.terrain import terrain_of_pace
+from shared_map.terrain.terrain import build_terrain, terrain_of_pace
+from swarm.config.load import load_scenario
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import SwarmError
 
@@ -39,6 +40,23 @@ def test_what_synth_writes_is_what_info_reads(made: Path) -> None:
     assert (facts["rows"], facts["cols"], facts["resolution_m"], facts["voids"]) == (300, 280, 30.0, 0)
     assert facts["highest_m"] - facts["lowest_m"] == pytest.approx(400, abs=60)
     assert "resolution_m" in run("info", "jacksboro")
+
+
+def test_info_tells_of_the_scenarios_own_landscape_what_it_costs_and_what_looks_wrong(tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text('seed = 9\n[terrain]\nsource = "synthetic"\nrivers = 1\n[cost]\nmax_slope_deg = 3\n')
+    facts = json.loads(run("info", file, "--json"))
+    terrain = build_terrain(load_scenario(file))
+    assert facts["highest_m"] == pytest.approx(float(terrain.elevation_m.max()), abs=0.1)
+    assert facts["lethal_share"] == pytest.approx(float(terrain.lethal.mean()), abs=1e-4)
+    assert 0 < facts["class_shares"]["water"] < 0.2
+    assert 0 < facts["largest_part_share"] <= 1
+    assert any("cost.max_slope_deg" in doubt for doubt in facts["doubts"])
+    assert "! " in run("info", file)
+
+
+def test_a_terrain_file_stands_for_a_scenario_on_it(made: Path) -> None:
+    assert "300 x 280 cells of 30 m" in run("cost", made / "dem.tif")
 
 
 def test_synth_makes_the_same_again_from_a_seed(made: Path, tmp_path: Path) -> None:

@@ -7,14 +7,13 @@ import math
 import numpy as np
 from support.scripted_planner import COLS, GRID, World
 
-from planner_service.followers import route_cells
-from planner_service.planner import FOLLOWER_LEASE_NS
+from planner_service.planner import FOLLOWER_LEASE_NS, GOOD_GAP
 from planner_service.update import Update
 from swarm.clock import NS_PER_S
 from swarm.grid import Window, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute
-from swarm.wire.routes import Route, RouteStatus
+from swarm.wire.routes import RouteStatus
 
 
 def test_a_person_asks_by_row_and_col(ready: World) -> None:
@@ -39,7 +38,17 @@ def test_asking_again_gives_the_same_answer(ready: World) -> None:
     assert ready.ask(3, 4, force=True) == ready.ask(3, 4, force=True)
 
 
+def test_nothing_is_forced_for_routes_that_are_proven_good(ready: World) -> None:
+    ready.tree.gap = GOOD_GAP - 0.01
+    ready.ask(3, 4, force=True)
+    assert ready.tree.named("force") == []
+    ready.tree.gap = GOOD_GAP + 0.01
+    ready.ask(3, 4, force=True)
+    assert ready.tree.named("force") == [("force", [3, 4])]
+
+
 def test_the_range_is_forced_once_between_two_changes_of_the_tree(ready: World) -> None:
+    ready.tree.gap = 2.0
     ready.ask(3, 4, force=True)
     ready.ask(4, 5, 3, force=True)
     ready.ask(4, 9)
@@ -151,11 +160,3 @@ def test_after_a_restart_those_who_report_to_follow_are_pushed_routes_without_as
     (push,) = world.tick()
     assert isinstance(push, PushedRoute)
     assert push.vehicle == "v"
-
-
-def test_the_cells_of_a_route_are_those_walked() -> None:
-    start, directions = GRID.cell(5, 5), bytes([0, 1, 2, 3, 4, 5, 6, 7, 2])
-    rows, cols = route_cells(GRID, Route(status=RouteStatus.OK, start=start, directions=directions, cost_s=1.0))
-    assert [GRID.cell(r, c) for r, c in zip(rows.tolist(), cols.tolist(), strict=True)] == walk(
-        GRID, start, directions
-    )

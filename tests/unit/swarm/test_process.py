@@ -18,12 +18,12 @@ from swarm.runtime.process import Process, ThreadWorker
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.topics import NOTE, POSE
+from swarm.wire.topics import NOTE, TRUE_POSE
 
 
 def pose(target: str, seq: int) -> Heard:
     message = TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
-    return Heard(POSE, {"target": target}, message)
+    return Heard(TRUE_POSE, {"target": target}, message)
 
 
 def note(text: str) -> Heard:
@@ -249,8 +249,8 @@ def test_a_process_ticks_at_its_rate_and_stops_from_another_thread():
 
 
 def test_a_worker_gives_its_result_back_as_an_event():
-    inbox, clock = Inbox(), MonotonicClock()
-    worker = ThreadWorker("w", inbox, clock)
+    inbox = Inbox()
+    worker = ThreadWorker("w", inbox)
     worker.submit("grow", lambda: 42, inbox.post)
     done = inbox.take(5.0)
     assert isinstance(done, WorkDone)
@@ -264,7 +264,7 @@ def test_a_worker_gives_its_result_back_as_an_event():
 
 def test_closing_a_worker_waits_for_no_job_and_begins_no_other():
     inbox, began, release = Inbox(), threading.Event(), threading.Event()
-    worker = ThreadWorker("w", inbox, MonotonicClock())
+    worker = ThreadWorker("w", inbox)
     worker.submit("kernel", lambda: (began.set(), release.wait(10.0)), inbox.post)
     worker.submit("forgotten", lambda: 1 // 0, inbox.post)
     assert began.wait(5.0)
@@ -363,7 +363,7 @@ from swarm.runtime.process import Inbox, Process, ThreadWorker
 from swarm.runtime.stats import Counters
 
 inbox, clock, began = Inbox(), MonotonicClock(), threading.Event()
-worker = ThreadWorker("kernel", inbox, clock)
+worker = ThreadWorker("kernel", inbox)
 
 class Working:
     counters = Counters()

@@ -1,0 +1,93 @@
+"""What people should know of a terrain before anything drives on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from shared_map.arrays import Bools
+from shared_map.terrain.layers import TerrainClass, slope_deg
+from shared_map.terrain.terrain import Terrain
+
+_MOST_SIDE = 2048
+"""Slopes and parts of larger terrains are taken from every second, third, ... cell."""
+_MUCH_LETHAL, _SCATTERED = 0.5, 0.8
+_STEEP_DEG = 60.0
+
+
+def facts_of(terrain: Terrain) -> dict[str, Any]:
+    """Numbers of a terrain, by name; shares are of all cells."""
+    grid, elevation_m, pace = terrain.grid, terrain.elevation_m, terrain.pace_s_per_m
+    facts: dict[str, Any] = {
+        "rows": grid.rows,
+        "cols": grid.cols,
+        "resolution_m": grid.resolution_m,
+        "width_m": round(grid.cols * grid.resolution_m, 1),
+        "height_m": round(grid.rows * grid.resolution_m, 1),
+        "crs": grid.crs,
+        "west_m": round(grid.west_m, 2),
+        "north_m": round(grid.north_m, 2),
+        "voids": int(np.isnan(elevation_m).sum()),
+    }
+    stride = -(-max(grid.rows, grid.cols) // _MOST_SIDE)
+    known = elevation_m[~np.isnan(elevation_m)]
+    if known.size:
+        facts["lowest_m"], facts["highest_m"] = round(float(known.min()), 1), round(float(known.max()), 1)
+        slopes = slope_deg(np.ascontiguousarray(elevation_m[::stride, ::stride]), grid.resolution_m * stride)
+        for name, share in (("slope_median_deg", 50), ("slope_95_deg", 95), ("slope_max_deg", 100)):
+            facts[name] = round(float(np.nanpercentile(slopes, share)), 1)
+    lethal = np.isinf(pace)
+    facts["lethal_share"] = round(float(lethal.mean()), 4)
+    counts = np.bincount(terrain.classes.reshape(-1), minlength=max(TerrainClass) + 1)
+    facts["class_shares"] = {
+        kind.name.lower(): round(float(counts[kind] / grid.cells), 4) for kind in TerrainClass if counts[kind]
+    }
+    finite = pace[~lethal]
+    for name, quantile in (("pace_least_s_per_m", 0.0), ("pace_median_s_per_m", 0.5), ("pace_most_s_per_m", 1.0)):
+        facts[name] = float(f"{np.quantile(finite, quantile):.4g}")
+    facts["largest_part_share"] = round(_largest_part(~lethal[::stride, ::stride]), 4)
+    return facts
+
+
+def _largest_part(passable: Bools) -> float:
+    """The largest connected part of the passable cells, as a share of them."""
+    from scipy import ndimage
+
+    labels, count = ndimage.label(passable, np.ones((3, 3), np.int8))
+    return float(np.bincount(labels.reshape(-1))[1:].max() / passable.sum()) if count else 0.0
+
+
+def doubts_about(facts: dict[str, Any]) -> list[str]:
+    """What looks wrong, each with the setting that answers it."""
+    doubts = []
+    if facts["lethal_share"] > _MUCH_LETHAL:
+        doubts.append(
+            f"{facts['lethal_share']:.0%} of the cells are lethal; if that is too much, look at cost.max_slope_deg,"
+            " terrain.level_is and terrain.nodata"
+        )
+    if facts["largest_part_share"] < _SCATTERED:
+        doubts.append(
+            f"the passable ground is in parts: the largest has {facts['largest_part_share']:.0%} of it, and"
+            " vehicles of one part reach no other"
+        )
+    if facts.get("slope_median_deg", 0.0) > _STEEP_DEG:
+        doubts.append(
+            f"half of the ground is steeper than {facts['slope_median_deg']:g} degrees; are heights in metres"
+            " (terrain.height_scale), and cells (terrain.crs)?"
+        )
+    if facts.get("lowest_m") == facts.get("highest_m") and facts["voids"] < facts["rows"] * facts["cols"]:
+        doubts.append("all heights are the same: slopes cost nothing here")
+    return doubts
+
+
+def said_of(terrain: Terrain) -> list[str]:
+    """What a run says of its terrain before anything drives: numbers, how it was made, what looks wrong."""
+    grid, lethal = terrain.grid, float(np.isinf(terrain.pace_s_per_m).mean())
+    water = float((terrain.classes == TerrainClass.WATER).mean())
+    size = f"{grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m"
+    return [
+        f"terrain: {size}, {lethal:.1%} lethal, {water:.1%} water",
+        *(f"- {note}" for note in terrain.notes),
+        *(f"! {doubt}" for doubt in doubts_about(facts_of(terrain))),
+    ]
