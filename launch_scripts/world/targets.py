@@ -19,7 +19,7 @@ from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
-from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
+from swarm.config.plugin_names import walk_named_by
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.order_book import OrderBook
@@ -139,8 +139,8 @@ class TargetWorld:
             cell = self._grid.cell(*config.start)
             if self._terrain.lethal(cell):
                 raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
-        named = NamedPlugin(PLUGIN_KINDS["walk"], key, config.walk, config.walk_options)
-        plugin = find_plugin(named, scenario.plugin_folder)
+        # An order names a built-in walk by its type: nothing that comes over the network is imported.
+        plugin = find_plugin(walk_named_by(config, key), scenario.plugin_folder)
         world = WalkWorld(id, self._terrain, chance, self._budget)
         walk = walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
         walker = Walker(id, walk, slowness_of(config, scenario.cost), cell)
