@@ -10,6 +10,7 @@ from planner_service.actions import Action, FindCorridors, GrowTree, Refusal, Te
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
+from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.tree.corridors import CorridorSearch
 from shared_map.cost_map import CostMap
@@ -21,6 +22,7 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
+from swarm.plugins.find import named_plugin
 from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
@@ -73,7 +75,13 @@ class PlannerService:
         self._sightings = Sightings(filter)
         self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
-        tree = TargetTree(terrain.grid, scenario.planner, terrain.climb, all_kernels, has_worker=True)
+        self._faults: list[str] = []
+        """What the strategy's plug-in did wrong and nobody has been told yet."""
+        world = StrategyWorld(self._target, terrain.grid, scenario.planner)
+        chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
+        tree = TargetTree(
+            terrain.grid, scenario.planner, terrain.climb, all_kernels, has_worker=True, chosen_by=chosen_by
+        )
         if prepared is not None:
             tree.share(prepared.cell_cost)
         self._planner = Planner(
@@ -162,6 +170,7 @@ class PlannerService:
         if self._planner.tree.ready and not self._served:
             self._served = True
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
+        self._member.tell_faults(self._faults, now_ns)
         self._member.tick(now_ns)
 
     def _answer(self, now_ns: int) -> None:
@@ -194,7 +203,7 @@ class PlannerService:
 
     def _obeys(self, order: Obey) -> bool:
         if order.subject is not None:
-            return True
+            return self._obeyed_version == self._obedience.book.version
         return self._sync.holds(order.author, order.sets, self._now_ns) and self._planner.knows_map
 
     def stop(self, now_ns: int) -> None:

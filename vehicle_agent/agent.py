@@ -18,12 +18,13 @@ from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec, Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish
-from swarm.runtime.tracking import Trackings, Verdict
+from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
-from vehicle_agent.assignment import AskCosts, Assignment
+from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
 from vehicle_agent.bodies import Bodies
+from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.detours import Detours
@@ -81,6 +82,8 @@ class Agent:
     local_map  the agent's map
     holdings   the cells that the vehicles may stand on and enter
     bodies     what they must not drive into, though it speaks no right of way
+    assigner   which target each vehicle goes for; evenly spread if not given
+    dynamics   how fast vehicles drive; as the ground allows if not given
 
     wishes     what to ask of wardens, as of the last `decide`
     stopped    whether an operator wants a vehicle to stand
@@ -94,6 +97,8 @@ class Agent:
         sensor: Sensor,
         holdings: Holdings,
         bodies: Bodies | None = None,
+        assigner: Assigner | None = None,
+        dynamics: PluginDynamics | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
@@ -107,6 +112,7 @@ class Agent:
         self._map = local_map
         self.bodies = bodies or Bodies(local_map.grid)
         self._sensor = sensor
+        self._dynamics = dynamics
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
@@ -116,10 +122,10 @@ class Agent:
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
-        self._trackings = Trackings(local_map.grid.cells)
+        self._trackings = Trackings(local_map.grid)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
-        self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
+        self._assignment = Assignment(self.targets, assigner or Spread(), config.reassign_s, chance.random())
         self._unassigned = False
         """Whether vehicles have been placed that nobody has asked a target for yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
@@ -160,6 +166,13 @@ class Agent:
             self._look_from[cell] = None
             self._unassigned = True
 
+    def remove(self, vehicles: Sequence[str]) -> None:
+        """These leave the map: their cells are given back."""
+        for id in vehicles:
+            self.holdings.leave(id)
+            for known in (self.vehicles, self.wishes, self._wished, self._left_s):
+                known.pop(id, None)
+
     def stand_down(self) -> None:
         """Another process drives the vehicles now."""
         self.vehicles.clear()
@@ -185,6 +198,8 @@ class Agent:
         self._driven_ns = now_ns
         seconds = min(elapsed_s, _LONGEST_STEP_S) * self._time_scale
         self._left_s = dict.fromkeys(self.vehicles, seconds)
+        if self._dynamics is not None:
+            self._dynamics.begin(seconds)
 
     def drive(self) -> Findings | None:
         """Let vehicles drive until they come to another cell; returns what they find there, to be written into
@@ -218,7 +233,11 @@ class Agent:
             pace_s_per_m = float(physics[motion.head])
             if self._map.climb is not None:
                 pace_s_per_m *= self._map.climb.of_step(motion.tail, motion.head)
-            left_s = motion.advance(left_s, pace_s_per_m)
+            if self._dynamics is None:
+                left_s = motion.advance(left_s, pace_s_per_m)
+            else:
+                path = self.holdings.path(vehicle.id)
+                left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
             if vehicle.cell != before:
                 self.holdings.moved(vehicle.id, vehicle.cell)
                 vehicle.route.moved(vehicle.cell)
@@ -351,11 +370,11 @@ class Agent:
 
     # --- what is heard --------------------------------------------------------------------------------------
 
-    def hear_pose(self, pose: TargetPose, now_ns: int) -> bool:
-        """Where a tracker of a target says it is; False unless the pose counts."""
-        counts = self._trackings.hear(pose, now_ns) is Verdict.COUNTS
-        if counts:
-            self._moved(pose, now_ns)
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
+        """Where a tracker of a target says it is; returns that, with its cell, if it counts."""
+        counts = self._trackings.hear(pose, now_ns)
+        if counts is not None:
+            self._moved(counts, now_ns)
         return counts
 
     def see_target(self, pose: TargetPose, now_ns: int) -> None:

@@ -24,7 +24,7 @@ from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.ranks import ranked_id
 from swarm.runtime.stats import Histogram
-from swarm.runtime.tracking import Trackings, Verdict
+from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
@@ -115,7 +115,7 @@ class Recorder:
         self.scenario = scenario
         self.grid = grid
         self.observed = Observed(grid)
-        self.trackings = Trackings(grid.cells)
+        self.trackings = Trackings(grid)
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.ready_ns: int | None = None
@@ -140,9 +140,11 @@ class Recorder:
         self._touch(now_ns)
         match message:
             case TargetPose():
-                if self.trackings.hear(message, now_ns) is not Verdict.COUNTS:
+                counts = self.trackings.hear(message, now_ns)
+                if counts is None:
                     return
-                self._capture(message, now_ns)
+                message = counts
+                self._capture(counts, now_ns)
             case PlannerStatus(gap_max=float(gap)):
                 self._gap_max = max(gap, self._gap_max or 0.0)
             case Note():
@@ -375,7 +377,7 @@ class Recorder:
 
 ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
 """What planners count of poses that do not count, or look wrong."""
-TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "tick_ms")
+TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 
 
