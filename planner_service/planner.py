@@ -124,6 +124,11 @@ class Planner:
         if leads:
             self.followers.forget_routes()
 
+    def set_pace(self, cpu_budget: float, push_s: float) -> None:
+        """Share of a core that this planner may use, and how often it may push a vehicle newer routes."""
+        self._push_ns = int(push_s * NS_PER_S)
+        self.tree.set_budget(cpu_budget)
+
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
         if pose.target == self.target:
@@ -196,6 +201,11 @@ class Planner:
     def must_wait(self) -> bool:
         """Whether there is nothing to answer from now, and will be once the growth under way is adopted."""
         return not self.tree.ready and self._growing_since_ns is not None
+
+    @property
+    def knows_map(self) -> bool:
+        """Whether routes go by the map as it is now."""
+        return self._told is None or self._told[1] == self._cost_map.version
 
     # --- the tree -----------------------------------------------------------------------------------------------
 

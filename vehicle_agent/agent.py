@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -17,21 +17,23 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec, Window, walk
+from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
-from vehicle_agent.assignment import AskCosts, Assignment
+from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
 from vehicle_agent.bodies import Bodies
+from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.detours import Detours
-from vehicle_agent.traffic.holdings import Holdings, Wish
 from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
 _WISH_LASTS_NS = NS_PER_S
 """A wish that has not changed is made anew so often, as it tells the vehicle's age."""
+_STAYS = Wish()
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
@@ -80,8 +82,11 @@ class Agent:
     local_map  the agent's map
     holdings   the cells that the vehicles may stand on and enter
     bodies     what they must not drive into, though it speaks no right of way
+    assigner   which target each vehicle goes for; evenly spread if not given
+    dynamics   how fast vehicles drive; as the ground allows if not given
 
     wishes     what to ask of wardens, as of the last `decide`
+    stopped    whether an operator wants a vehicle to stand
     """
 
     def __init__(
@@ -92,6 +97,8 @@ class Agent:
         sensor: Sensor,
         holdings: Holdings,
         bodies: Bodies | None = None,
+        assigner: Assigner | None = None,
+        dynamics: PluginDynamics | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
@@ -99,11 +106,13 @@ class Agent:
         self.holdings = holdings
         self.wishes: dict[str, Wish] = {}
         self.blocked_ticks = 0
+        self.stopped: Callable[[str], bool] = lambda vehicle: False
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = local_map
         self.bodies = bodies or Bodies(local_map.grid)
         self._sensor = sensor
+        self._dynamics = dynamics
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
@@ -116,7 +125,7 @@ class Agent:
         self._trackings = Trackings(local_map.grid)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
-        self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
+        self._assignment = Assignment(self.targets, assigner or Spread(), config.reassign_s, chance.random())
         self._unassigned = False
         """Whether vehicles have been placed that nobody has asked a target for yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
@@ -128,6 +137,25 @@ class Agent:
         self._wished: dict[str, tuple[object, ...]] = {}
         """Vehicle under way -> what its wish was made of."""
 
+    # --- what operators order ---------------------------------------------------------------------------------
+
+    def set_targets(self, targets: Sequence[str], now_ns: int) -> None:
+        """The targets that the vehicles may go for from now on. Those that go for another get one of these."""
+        if list(targets) == self.targets:
+            return
+        self.targets = list(targets)
+        self._assignment.set_targets(self.targets)
+        for vehicle in self.vehicles.values():
+            if vehicle.target is not None and vehicle.target not in self.targets:
+                vehicle.release()
+                self._stop_soon(vehicle)
+        self._assignment.ask_soon(now_ns)
+
+    def set_pace(self, time_scale: float, reassign_s: float) -> None:
+        """Seconds on the terrain per second, and how often vehicles ask which target is the cheapest."""
+        self._time_scale = time_scale
+        self._assignment.set_period(reassign_s)
+
     # --- where vehicles start -------------------------------------------------------------------------------
 
     def place(self, vehicles: Sequence[str]) -> None:
@@ -138,11 +166,22 @@ class Agent:
             self._look_from[cell] = None
             self._unassigned = True
 
+    def remove(self, vehicles: Sequence[str]) -> None:
+        """These leave the map: their cells are given back."""
+        for id in vehicles:
+            self.holdings.leave(id)
+            for known in (self.vehicles, self.wishes, self._wished, self._left_s):
+                known.pop(id, None)
+
     def stand_down(self) -> None:
         """Another process drives the vehicles now."""
         self.vehicles.clear()
         self.wishes.clear()
         self._wished.clear()
+
+    def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
+        """Cells that only an operator's zone closes, and how many steps it is from each out of it."""
+        self._steering.ways_out = ways_out
 
     @property
     def places(self) -> list[int]:
@@ -159,6 +198,8 @@ class Agent:
         self._driven_ns = now_ns
         seconds = min(elapsed_s, _LONGEST_STEP_S) * self._time_scale
         self._left_s = dict.fromkeys(self.vehicles, seconds)
+        if self._dynamics is not None:
+            self._dynamics.begin(seconds)
 
     def drive(self) -> Findings | None:
         """Let vehicles drive until they come to another cell; returns what they find there, to be written into
@@ -182,6 +223,8 @@ class Agent:
         physics = self._map.physics.reshape(-1)
         while left_s > 0.0:
             if motion.at_rest:
+                if self.stopped(vehicle.id):
+                    return 0.0
                 path = self.holdings.path(vehicle.id)
                 if len(path) < 2 or not self._steering.passable(path[0], path[1]):
                     return 0.0
@@ -190,7 +233,11 @@ class Agent:
             pace_s_per_m = float(physics[motion.head])
             if self._map.climb is not None:
                 pace_s_per_m *= self._map.climb.of_step(motion.tail, motion.head)
-            left_s = motion.advance(left_s, pace_s_per_m)
+            if self._dynamics is None:
+                left_s = motion.advance(left_s, pace_s_per_m)
+            else:
+                path = self.holdings.path(vehicle.id)
+                left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
             if vehicle.cell != before:
                 self.holdings.moved(vehicle.id, vehicle.cell)
                 vehicle.route.moved(vehicle.cell)
@@ -261,10 +308,17 @@ class Agent:
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
             self._check_reach(vehicle)
+            stopped = self.stopped(vehicle.id)
+            if stopped:
+                self._stop_soon(vehicle)
             path = self.holdings.path(vehicle.id)
             ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)
+            if stopped:
+                self.wishes[vehicle.id] = _STAYS
+                self._wished.pop(vehicle.id, None)
+                continue
             self._wish(vehicle, path, now_ns)
             self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
         for (target_id, force), batch in asks.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from hashlib import blake2s
 
 from msgspec.structs import replace
@@ -12,14 +12,15 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, He
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
+from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.host import AskKnown
+from swarm.right_of_way.plots import Plots
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.traffic import Claim, Granted, Known, KnownRequest, Standing, Stored, Table
 from swarm.wire.topics import GRANTED, KNOWN, STANDING, STORED, TABLE
 from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.traffic.holdings import Tell, Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
-from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +41,7 @@ class RightOfWaySync:
     placed  called with the vehicles that have found their places
     warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait;
             "promises", for the file of promises
+    vehicles  of an agent that is not in `spawns`
     """
 
     def __init__(
@@ -52,9 +54,10 @@ class RightOfWaySync:
         post: Post,
         placed: Callable[[Sequence[str]], None],
         warn: Callable[[str, str], None],
+        vehicles: Collection[str] = (),
     ) -> None:
         plots = Plots(grid, list(spawns))
-        self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
+        self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved, vehicles=vehicles)
         self._id = setup.id
         self._store = store
         self._bus = bus

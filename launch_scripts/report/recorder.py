@@ -361,7 +361,7 @@ class Recorder:
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
 
 
-TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "tick_ms")
+TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 
 

@@ -16,12 +16,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from types import NoneType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
-import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
+
+from swarm.lazy_numpy import np, numpy_loaded
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 assert sys.byteorder == "little", "columns travel as little-endian bytes"
 
@@ -38,13 +41,13 @@ class Characters:
 class Column:
     """In an annotation of bytes: the values that they hold. `Bounded` checks it.
 
-    dtype        of the values; NaN is refused
+    dtype        of the values, as NumPy writes it, or the names and types of a row; NaN is refused
     per          the field of the same struct that has as many items as this column values; "" if there is none
     least, most  bounds of the values; None where the dtype has no other, or `relate` says more
     checked      false where the struct checks it itself: the statements of many sets of marks at once
     """
 
-    dtype: np.dtype[Any] | str
+    dtype: str | tuple[tuple[str, str], ...]
     per: str = ""
     least: float | None = None
     most: float | None = None
@@ -52,8 +55,8 @@ class Column:
 
     def describe(self) -> str:
         """As in the reference of the wire: "column of float32, 0 ... inf"."""
-        dtype = np.dtype(self.dtype)
-        name = f"rows of {dtype.itemsize} bytes" if dtype.names else f"column of {dtype.name}"
+        dtype = self.dtype
+        name = f"column of {name_of(dtype)}" if isinstance(dtype, str) else f"rows of {width_of(dtype)} bytes"
         return name + (f", one for each of `{self.per}`" if self.per else "")
 
 
@@ -148,6 +151,16 @@ MOST_IDS = 1 << 12
 SMALL, LARGE = Meta(max_length=MOST_VEHICLES), Meta(max_length=100_000)
 """Bounds of lists and maps: as many as an agent has vehicles, or as one request may name cells."""
 IDS = Meta(max_length=MOST_IDS)
+
+
+def width_of(dtype: str | tuple[tuple[str, str], ...]) -> int:
+    """Bytes of a value, or of a row."""
+    return int(dtype[2:]) if isinstance(dtype, str) else sum(width_of(part) for _, part in dtype)
+
+
+def name_of(dtype: str) -> str:
+    """As people say it: float32 for "<f4"."""
+    return {"u": "uint", "i": "int", "f": "float"}[dtype[1]] + str(8 * width_of(dtype))
 
 
 def pack_column(values: Any, dtype: str) -> bytes:
@@ -275,7 +288,7 @@ def _all_ids(name: str) -> Rule:
 
 def _column_rule(name: str, column: Column) -> Rule:
     get, per = attrgetter(name), attrgetter(column.per) if column.per else None
-    width, check = np.dtype(column.dtype).itemsize, _values_check(column)
+    width, check = width_of(column.dtype), _values_check(column)
 
     def rule(struct: Any) -> None:
         data = get(struct)
@@ -298,35 +311,37 @@ def _columns_rule(name: str, column: Column) -> Rule:
     return rule
 
 
-_CODES = {"<u1": "B", "<u2": "H", "<u4": "I", "<u8": "Q", "<i4": "i", "<i8": "q", "<f4": "f", "<f8": "d"}
+CODES = {"<u1": "B", "<u2": "H", "<u4": "I", "<u8": "Q", "<i4": "i", "<i8": "q", "<f4": "f", "<f8": "d"}
 _FEW = 800
 """Bytes of a column up to which a list is checked faster than an array."""
 
 
 def _values_check(column: Column) -> Callable[[str, bytes], None]:
-    dtype, least, most = np.dtype(column.dtype), column.least, column.most
-    width = dtype.itemsize
+    dtype, least, most, width = column.dtype, column.least, column.most, width_of(column.dtype)
     if least is None or most is None:
-        assert dtype.kind != "f", "a column of floats has bounds"
+        assert dtype[1] != "f", "a column of floats has bounds"
 
         def check_length(name: str, data: bytes) -> None:
             if len(data) % width:
                 raise ValueError(f"{name} has {len(data)} bytes, not a multiple of {width}")
 
         return check_length
-    code: Any = _CODES[str(column.dtype)]
+    assert isinstance(dtype, str), "rows have no bounds"
+    code: Any = CODES[dtype]
+    word = name_of(dtype)
+    expected = f"{word} of {least:g} ... {most:g}" + (", without NaN" if dtype[1] == "f" else "")
     if code == "B":
 
         def check_bytes(name: str, data: bytes) -> None:
             if max(data, default=0) > most:
-                raise ValueError(f"{name} has {max(data)}, expected {dtype.name} of {least:g} ... {most:g}")
+                raise ValueError(f"{name} has {max(data)}, expected {expected}")
 
         return check_bytes
 
     def check(name: str, data: bytes) -> None:
         if len(data) % width:
-            raise ValueError(f"{name} has {len(data)} bytes, not a column of {dtype.name}")
-        if len(data) <= _FEW:
+            raise ValueError(f"{name} has {len(data)} bytes, not a column of {word}")
+        if len(data) <= _FEW or not numpy_loaded():
             values = memoryview(data).cast(code).tolist()
             low, high, total = min(values, default=least), max(values, default=most), sum(values)
         else:
@@ -336,7 +351,6 @@ def _values_check(column: Column) -> Callable[[str, bytes], None]:
         # A list's min and max may miss a NaN, its sum does not.
         if not (least <= low and high <= most and total == total):
             worst = high if high > most else low
-            expected = f"{dtype.name} of {least:g} ... {most:g}" + (", without NaN" if dtype.kind == "f" else "")
             raise ValueError(f"{name} has {worst}, expected {expected}")
 
     return check

@@ -15,7 +15,9 @@ from swarm.wire.codec import prime
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
@@ -145,6 +147,10 @@ def _chunk(value: str | int) -> str:
 _REPLICAS = "agent keeper planner monitor"
 """Roles which hold a replica of the map."""
 
+OBEYING = "agent planner targets keeper"
+"""Roles which go by orders."""
+OBEYING_OWN = " ".join(f"{role}:role,id" for role in OBEYING.split())
+
 RUN = Topic(
     "run", "run/{role}/{id}", RunInfo, "which run and terrain a process belongs to", "asked at every start",
     access(serve=MEMBERS_OWN, ask=MEMBERS),
@@ -154,12 +160,15 @@ MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", MarkSet,
     "an author's whole set for a tile; the author and the keeper answer for it",
     "on change, at most 10 Hz a tile",
-    access(put="agent:author keeper planner", serve="agent:author keeper", ask=_REPLICAS, hear=_REPLICAS),
+    access(
+        put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
+        hear=f"{_REPLICAS} rover:author",
+    ),
     request=MarksRequest, bulk=MarkSets, buffer=8192,
 )  # fmt: skip
 DIGEST = Topic(
     "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",
-    access(put="agent:author keeper:author", hear=_REPLICAS),
+    access(put="agent:author rover:author keeper:author", hear=_REPLICAS),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 BASE_MAP = Topic(
@@ -187,8 +196,10 @@ CHASERS = Topic(
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", Standing,
     "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
-    "none is heard; each counts, as two lives of a host must not hide each other's words", "on change, else 5 Hz",
-    access(put="agent:agent", hear="agent:member"), newest=False, trusted=True, priority=Priority.INTERACTIVE,
+    "none is heard; each counts, as two lives of a host must not hide each other's words; by it an operator says "
+    "that a guest is gone", "on change, else 5 Hz",
+    access(put="agent:agent operator", hear="agent:member"), newest=False, trusted=True,
+    priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
     "table", "table/{plot}/{agent}", Table,
@@ -212,6 +223,11 @@ KNOWN = Topic(
     "asked at a start", access(serve="agent:agent", ask="agent"), request=KnownRequest, published=False,
     trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
+LEAVE = Topic(
+    "leave", "leave/{agent}", Removed, "which vehicles have left, for an operator who asks an agent to let them",
+    "asked", access(serve="agent:agent"), request=RemoveVehicles, published=False, trusted=True,
+    priority=Priority.INTERACTIVE,
+)  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
     "per new route",
@@ -221,7 +237,7 @@ FOLLOWED = Topic(
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,
     "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
-    access(put="planner", hear="agent:agent"),
+    access(put="planner", hear="agent:agent rover:agent"),
 )  # fmt: skip
 POSE = Topic(
     "pose", "target/{target}/pose", TargetPose,
@@ -268,6 +284,27 @@ LEAD = Topic(
     access(put="planner:role,id targets:role,id", hear="planner targets monitor"),
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
+ZONES = Topic(
+    "zones", "order/{keeper}/zones", Zones, "adds, removes and lists zones: areas that operators close",
+    "asked by people", access(serve="keeper:keeper"),
+    request=ZoneOrder, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+GIVE_ORDER = Topic(
+    "give-order", "order/{keeper}/give", Orders,
+    "enters an order into a keeper's book: pause, stop, whom to chase, which targets, settings", "asked by people",
+    access(serve="keeper:keeper"), request=GiveOrder, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+ORDERS = Topic(
+    "orders", "orders/{role}/{id}", Orders,
+    "what is ordered: keepers tell it, and everybody answers who starts and hears no keeper", "1 Hz, and on change",
+    access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
+    request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+OBEYED = Topic(
+    "obeyed", "obeyed/{role}/{id}", Obeyed, "that a process obeys an order, as soon as it does",
+    "asked after each order", access(serve="agent:role,id planner:role,id targets:role,id"),
+    request=Obey, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz",
     access(put=MEMBERS_OWN, hear="monitor"),
@@ -280,8 +317,9 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, FOLLOWED,
-    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, LEAVE,
+    FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER, ORDERS,
+    OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

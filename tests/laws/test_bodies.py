@@ -15,14 +15,14 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
+from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.traffic import Granted
 from vehicle_agent.agent import Agent, LocalMap
 from vehicle_agent.bodies import REACTION_S, Bodies
 from vehicle_agent.discs import Capsule
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.traffic.holdings import Holdings
-from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.steering import Steering
 
 GRID = GridSpec(9, 11, 5.0, west_m=100.0, north_m=900.0)

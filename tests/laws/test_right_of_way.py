@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.traffic_world import Faults, Process, TrafficWorld
 
-from vehicle_agent.traffic.holdings import Holdings
+from swarm.right_of_way.holdings import Holdings
 from vehicle_agent.traffic.member import Member
 from vehicle_agent.traffic.right_of_way import RightOfWay
 from vehicle_agent.traffic.warden import Warden

@@ -35,7 +35,7 @@ NAMES = {
     "agent": "agent.blue.a0",
     "targets": "targets.0",
     "tracker": "tracker.t0",
-    "rover": "rover.r1",
+    "rover": "rover.all.r1",
     "monitor": "monitor.0",
     "operator": "operator.anna",
 }
@@ -85,6 +85,8 @@ FORBIDDEN = [
     ("tracker", "put", "target/t1/pose"),
     ("rover", "put", "body/r2"),
     ("rover", "put", "target/t0/pose"),
+    ("rover", "put", "marks/0/0/all.r2.1"),
+    ("rover", "hear", "vehicle/r2/r2/route"),
     ("rover", "raise", "alive/agent/r1/1"),
     ("agent", "put", "body/r1"),
     ("outsider", "hear", "**"),

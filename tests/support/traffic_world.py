@@ -12,11 +12,12 @@ from functools import cache
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
+from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.host import AskKnown
+from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Stored, Table
-from vehicle_agent.traffic.holdings import Tell, Wish
 from vehicle_agent.traffic.member import AskPromises, Refused, Save
-from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.right_of_way import Action, AskKnown, OwnRecord, RightOfWay
+from vehicle_agent.traffic.right_of_way import Action, OwnRecord, RightOfWay
 
 MS = NS_PER_S // 1000
 TICK_NS = 100 * MS
@@ -55,24 +56,36 @@ class Process:
         self.world, self.agent, self.disk = world, agent, disk
         self.alive = True
         self.hung: list[Callable[[], None]] | None = None
-        self.rights = RightOfWay(agent, world.plots, world.spawns, disk.own, disk.saved, self.find_body)
+        self.rights = self.make_rights()
+        self.vehicles = list(world.spawns.get(agent, ()))
         # A clock of its own: it may be years off, and leaps.
         self.offset_ns = world.chance.randrange(60 * 60 * NS_PER_S)
         self.ages: dict[str, int] = {}
         self.tokens: set[Peer] = set()
 
+    def make_rights(self) -> RightOfWay:
+        world, disk = self.world, self.disk
+        return RightOfWay(self.agent, world.plots, world.spawns, disk.own, disk.saved, self.find_body)
+
     @property
     def now_ns(self) -> int:
         return self.world.now_ns + self.offset_ns
+
+    @property
+    def settled(self) -> bool:
+        return self.rights.settled
+
+    def hear_known(self, known: Known) -> None:
+        self.perform(self.rights.hear_known(known))
 
     def find_body(self, vehicle: str, cells: list[int]) -> int:
         known = self.disk.bodies.get(vehicle)
         return known if known in cells else cells[0]
 
     def begin(self) -> None:
-        if self.world.last_disk.setdefault(self.agent, self.disk) is not self.disk:
-            self.disk.bodies.clear()  # they have been driven from elsewhere since
-        self.world.last_disk[self.agent] = self.disk
+        for vehicle in list(self.disk.bodies):
+            if self.world.driver[vehicle] is not self.disk:
+                del self.disk.bodies[vehicle]  # it has been driven from elsewhere since
         self.perform(self.rights.begin(self.world.chance.getrandbits(32)))
 
     def perform(self, actions: list[Action]) -> None:
@@ -113,16 +126,20 @@ class Process:
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:
             self.disk.bodies[vehicle] = self.rights.holdings.path(vehicle)[0]
+            self.world.driver[vehicle] = self.disk
             self.world.unmoved.pop(vehicle, None)
             self.world.placed += 1
             self.world.look()
+
+    def ask_known(self, request: KnownRequest) -> list[Action]:
+        return self.rights.answer_known(request)
 
     def tick(self) -> None:
         holdings = self.rights.holdings
         self.see_tokens()
         wishes = {}
         if holdings.life and not holdings.replaced:
-            for vehicle in self.world.spawns[self.agent]:
+            for vehicle in self.vehicles:
                 if holdings.path(vehicle):
                     self.drive(vehicle)
                     wishes[vehicle] = self.wish(vehicle)
@@ -200,7 +217,8 @@ class TrafficWorld:
         self.moves: dict[str, int] = {}
         self.collisions: list[tuple[int, str, str]] = []
         self.refused: list[str] = []
-        self.last_disk: dict[str, Disk] = {}
+        self.driver: dict[str, Disk] = {}
+        """Vehicle -> the disk of the process that placed it last."""
         self.placed = self.crashes = self.takeovers = self.twins = self.messages = 0
         self.cut: set[tuple[str, str]] = set()
         self._events: list[tuple[int, int, Callable[[], None]]] = []
@@ -310,14 +328,14 @@ class TrafficWorld:
         """Ask everybody what they know of us, again and again as long as it is needed."""
 
         def answer(to: Process) -> None:
-            for action in to.rights.answer_known(KnownRequest(agent=source.agent, disk=source.disk.own.disk)):
+            for action in to.ask_known(KnownRequest(agent=source.agent, disk=source.disk.own.disk)):
                 if isinstance(action, Known):
-                    self.carry(to, source, lambda known=action: source.perform(source.rights.hear_known(known)))
+                    self.carry(to, source, lambda known=action: source.hear_known(known))
                 else:
                     to.perform([action])
 
         if source.alive:
-            for process in self.processes if first or not source.rights.settled else ():
+            for process in self.processes if first or not source.settled else ():
                 if process.agent != source.agent:
                     self.carry(source, process, lambda to=process: answer(to))
             self.at(NS_PER_S, lambda: self.ask_known(source))
@@ -327,9 +345,12 @@ class TrafficWorld:
 
     # --- what goes wrong ------------------------------------------------------------------------------------
 
+    def process_of(self, agent: str, disk: Disk) -> Process:
+        return Process(self, agent, disk)
+
     def start(self, agent: str, disk: Disk) -> None:
         """Start a process, which begins a life."""
-        process = Process(self, agent, disk)
+        process = self.process_of(agent, disk)
         self.processes.append(process)
         self.begin(process)
 
@@ -399,7 +420,7 @@ class TrafficWorld:
                 if (process is somebody) == alone:
                     process.offset_ns += chance.randrange(5 * NS_PER_S)
         if chance.random() < faults.cuts / 10:
-            names = list(self.spawns)
+            names = list(self.disks)
             side = set(chance.sample(names, chance.randint(1, -(-len(names) // 2))))
             one_way = chance.random() < 0.4
             pairs = {

@@ -14,6 +14,7 @@ from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.messages.bodies import LONGEST_LEASE_S, Body
 from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, Zone, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
@@ -172,6 +173,13 @@ stands = st.builds(
     better=st.integers(0, 8), age_ms=milliseconds,
 )  # fmt: skip
 
+names = st.text("abXY09_-", min_size=1, max_size=40)
+orders = st.builds(
+    Order, subject=st.sampled_from(["pause", "vehicle", "group", "target", "set"]), name=ids, stamp_ns=naturals,
+    off=st.booleans(), targets=st.lists(ids, max_size=3), value=st.none() | finite,
+    cell=st.none() | st.integers(0, (1 << 32) - 1), added=st.booleans(),
+)  # fmt: skip
+
 MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     RunInfo: st.builds(
         RunInfo, run_id=texts, role=ids, id=ids, incarnation=naturals, scenario=texts, terrain=texts, rows=sides,
@@ -264,6 +272,33 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
             texts, st.dictionaries(st.integers(ZERO_BUCKET, TOP_BUCKET), counts, max_size=3), max_size=2
         ),
     ),
+    ZoneOrder: st.builds(
+        ZoneOrder, action=st.sampled_from(["add", "remove"]), name=names, kind=st.just("pace"),
+        pace_s_per_m=st.floats(0.1, 100), polygon=st.lists(st.tuples(metres, metres), min_size=3, max_size=5),
+        lasts_s=st.none() | st.floats(1e-3, 1e9),
+    ),
+    Zones: st.builds(
+        Zones, keeper=ids, changed=names,
+        zones=st.lists(
+            st.builds(
+                Zone, name=names, kind=st.just("pace"), pace_s_per_m=st.none() | st.floats(0.1, 100), cells=counts,
+                window=st.just([0, 1, 2, 3]), until_ns=st.none() | naturals,
+            ), max_size=2,
+        ),
+    ),
+    GiveOrder: st.builds(
+        GiveOrder, subject=st.sampled_from(["pause", "vehicle", "group", "target", "set"]), name=ids,
+        off=st.booleans(), targets=st.lists(ids, max_size=3), value=st.none() | finite,
+        cell=st.integers(0, (1 << 32) - 1), new=st.booleans(), speed_m_per_s=st.floats(0, 1e4),
+    ),
+    Orders: st.builds(Orders, role=ids, id=ids, orders=st.lists(orders, max_size=3), given=st.none() | orders),
+    Obey: st.builds(
+        Obey, author=ids, sets=st.lists(st.tuples(tiles, naturals, naturals), max_size=3).map(
+            lambda rows: np.array(rows, DIGEST_ROW).tobytes()
+        ),
+        subject=st.none() | st.just("pause"), name=ids, stamp_ns=naturals,
+    ),
+    Obeyed: st.builds(Obeyed, role=ids, id=ids, incarnation=naturals),
     Beat: st.builds(Beat, role=ids, id=ids, incarnation=naturals, ready=st.booleans(), leads=st.booleans()),
     Note: st.builds(Note, role=ids, id=ids, stamp_ns=naturals, kind=texts, text=texts, cell=optional_cells),
 }  # fmt: skip
@@ -351,6 +386,17 @@ EXAMPLES: tuple[Message, ...] = (
         role="agent", id="a0", incarnation=7, stamp_ns=10, counts={"marks": 3}, gauges={"lost": 0.0},
         histograms={"tick_ms": {-3: 4}},
     ),
+    ZoneOrder(action="add", name="z", polygon=[(2.0, 3.0), (2.0, 8.0), (6.0, 8.0)], lasts_s=60.0),
+    Zones(
+        keeper="0", changed="z", sets=np.array([(3, 1, 1 << 16)], DIGEST_ROW).tobytes(),
+        zones=[
+            Zone(name="z", kind="lethal", pace_s_per_m=None, cells=10, window=[2, 3, 6, 8], until_ns=90),
+        ],
+    ),
+    GiveOrder(subject="target", name="x", cell=9, walk="still", new=True),
+    Orders(role="keeper", id="0", orders=[Order(subject="pause", name="", stamp_ns=10)]),
+    Obey(author="operator.z", sets=np.array([(3, 1, 1 << 16)], DIGEST_ROW).tobytes()),
+    Obeyed(role="agent", id="a0", incarnation=7),
     Beat(role="planner", id="t0.r1", incarnation=7, ready=True, leads=False),
     Note(role="agent", id="a0", stamp_ns=10, kind="closure", text="road closed", cell=9),
 )  # fmt: skip

@@ -128,6 +128,13 @@ class Vehicle:
             self.state = VehicleState.WAITING
         self._need_route(Reason.ASSIGNED, now_ns)
 
+    def release(self) -> None:
+        """Go for no target any more, until another is assigned."""
+        self.target = self.asked = self._need = None
+        self.in_reach = self.planner_gone = False
+        self.route.drop()
+        self.state = VehicleState.IDLE
+
     def no_way(self) -> None:
         """Every planner has answered, and none knows a route from here."""
         if not self.in_reach and not self.route.left:

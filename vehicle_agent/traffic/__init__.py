@@ -1,1 +1,1 @@
-"""Right of way between vehicles of all agents: reservations, territory, deadlocks, resumption."""
+"""Right of way for those who decide it: members and wardens of plots, and where vehicles would go next."""

@@ -10,9 +10,10 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
+from swarm.right_of_way.lives import BEAT_NS, FURTHEST_EPOCH
+from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Granted, Standing, Stored, Table
-from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.warden import BEAT_NS, FURTHEST_EPOCH, Warden
+from vehicle_agent.traffic.warden import Warden
 
 LEASE_NS = 3 * BEAT_NS
 """A warden that is silent for so long may be replaced. Until then its members refuse every claim."""

@@ -20,8 +20,8 @@ _DEEPEST = 200
 class Mover:
     """A vehicle at rest.
 
-    wants   the cells that it could go to, the best first; the first `better` of them are better than to stay
-    guest   it stands in another plot and asks to come in
+    wants    the cells that it could go to, the best first; the first `better` of them are better than to stay
+    outside  it stands in another plot and asks to come in
     """
 
     id: str
@@ -29,7 +29,7 @@ class Mover:
     wants: Sequence[int]
     better: int
     age: int
-    guest: bool = False
+    outside: bool = False
 
 
 class Round:
@@ -48,7 +48,7 @@ class Round:
         self.to: dict[str, int] = {}
         self.taken: dict[int, str] = {}
         self.pushed: dict[str, int] = {}
-        self._standing = {mover.cell: mover for mover in movers if not mover.guest}
+        self._standing = {mover.cell: mover for mover in movers if not mover.outside}
         self._closed = closed
         self._inside = inside
         self._chain: set[int] = set()
@@ -65,7 +65,7 @@ class Round:
         if found:
             return True
         self.to[mover.id] = mover.cell
-        if not mover.guest:
+        if not mover.outside:
             self.taken[mover.cell] = mover.id
         if pushed and any(not self._inside(cell) for cell in mover.wants):
             self.pushed[mover.id] = age
@@ -76,7 +76,7 @@ class Round:
             if rank >= mover.better and not pushed:
                 return False
             if not self._inside(cell):
-                if pushed or mover.guest:
+                if pushed or mover.outside:
                     continue
                 return False  # it waits for the other plot's warden
             if cell in self.taken or cell in self._closed or cell in self._chain:

@@ -6,32 +6,18 @@ what follows is said.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 
 import msgspec
 from msgspec.structs import replace
 
-from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
-from swarm.liveness import Peer, Roster
+from swarm.liveness import Peer
+from swarm.right_of_way.holdings import Holdings, Place, Tell, Wish
+from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host, first_of
+from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Standing, Stored, Table
-from vehicle_agent.traffic.holdings import Holdings, Tell, Wish
 from vehicle_agent.traffic.member import Member, MemberAction, Refused
-from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.warden import first_life, is_far_ahead
-
-Place = Callable[[str, Sequence[int]], int]
-
-_LIVES_KEPT = 32
-_ALONE_NS = NS_PER_S // 2
-"""A life that has been replaced begins again once no other process of its agent has been alive for so long."""
-_UNLED_NS = 2 * NS_PER_S
-"""A plot that is silent for so long has no warden; another one takes over within a second where it can."""
-
-
-def _first(vehicle: str, cells: Sequence[int]) -> int:
-    return cells[0]
 
 
 class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -49,11 +35,6 @@ class OwnRecord(msgspec.Struct, frozen=True, kw_only=True):
     noted_by: list[str] = []
 
 
-@dataclass(frozen=True, slots=True)
-class AskKnown:
-    """Ask the other agents what they have on file about this one, then `begin`."""
-
-
 Action = MemberAction | Tell | OwnRecord | Known | AskKnown
 
 
@@ -64,6 +45,7 @@ class RightOfWay:
     own     what this agent's file holds: of itself,
     saved   and of plots: (promised epoch, stored table)
     place   tells on which of the cells that it was granted a vehicle of a new life stands
+    vehicles  of an agent that is not in `spawns`, a guest: it has no seat, and its vehicles enter one by one
 
     holdings  which cells our vehicles hold: none before `begin`
     silent    whether our file takes nothing now: then we are no member of any plot, and note nobody's file. What
@@ -77,40 +59,50 @@ class RightOfWay:
         spawns: Mapping[str, Mapping[str, int]],
         own: OwnRecord,
         saved: Mapping[int, tuple[int, Table]],
-        place: Place = _first,
+        place: Place = first_of,
+        vehicles: Collection[str] = (),
     ) -> None:
         self.agent = agent
         self.plots = plots
         self.own = own
-        self.holdings = Holdings(plots, agent, spawns[agent])
+        self._is_guest = agent not in spawns
+        self._host = Host(plots, agent, vehicles if self._is_guest else spawns[agent], place)
         self._spawns = spawns
         self._saved = dict(saved)
-        self._place = place
         self._members: dict[int, Member] = {}
-        self._known_life = 0
-        self._twins = Roster()
-        self._alone_since_ns: int | None = None
-        self._led_ns: dict[int, int] = {}
-        """Plot that concerns us -> when its warden was heard last."""
         self.silent = False
+
+    @property
+    def holdings(self) -> Holdings:
+        return self._host.holdings
 
     # --- beginning a life -----------------------------------------------------------------------------------
 
     @property
+    def informed(self) -> bool:
+        """Whether we have heard of all plots that may hold cells of ours."""
+        return self._host.informed
+
+    @property
     def settled(self) -> bool:
-        """Whether nobody needs to be asked what is known of us: we live, all other agents have noted our file, and
-        no later life leaves it to us to say, wherever cells of ours are shut, that we have stopped."""
-        noted = len(self.own.noted_by) >= len(self._spawns) - 1
+        """Whether nobody needs to be asked what is known of us: we live, all other agents have noted our file (a
+        guest's nobody notes; it has to hear of its plots), and no later life leaves it to us to say, wherever cells
+        of ours are shut, that we have stopped."""
+        noted = self._host.informed if self._is_guest else len(self.own.noted_by) >= len(self._spawns) - 1
         return self.holdings.life > 0 and noted and not self.holdings.replaced
 
     def answer_known(self, request: KnownRequest) -> list[Action]:
         """Another agent has begun a life. The last action is what to answer.
 
         Its file is noted once and for all: with another one it has no seat, because what it promised stands in the
-        first.
+        first. A guest never has a seat: of its file nothing is noted, and it is told who has one.
         """
-        if request.agent not in self._spawns or request.agent == self.agent or self.silent:
+        if request.agent == self.agent or self.silent or self._is_guest:
             return []
+        if request.agent not in self._spawns or not request.disk:
+            life, plots = self._known(request.agent)
+            lives, agents = self._lives_of(request.agent), list(self.plots.agents)
+            return [Known(agent=self.agent, disk=request.disk, life=life, plots=plots, lives=lives, agents=agents)]
         actions: list[Action] = []
         if request.agent not in self.own.noted:
             self.own = replace(self.own, noted={**self.own.noted, request.agent: request.disk})
@@ -123,10 +115,8 @@ class RightOfWay:
         """An answer to our question."""
         if known.agent not in self._spawns or known.agent == self.agent:
             return []
-        if not is_far_ahead(known.life, self._known_life):
-            self._known_life = max(self._known_life, known.life)
-        self.holdings.watch([plot for plot in known.plots if plot < self.plots.count])
-        if self.silent or known.disk != self.own.disk or known.agent in self.own.noted_by:
+        self._host.hear_known(known.agent, known.life, known.plots)
+        if self.silent or self._is_guest or known.disk != self.own.disk or known.agent in self.own.noted_by:
             return []
         self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
         return [self.own]
@@ -136,36 +126,21 @@ class RightOfWay:
 
         chance  a random number
         """
-        life, plots = self._known(self.agent)
-        dead = self.own.lives  # they have ended: this life has the file
-        life = first_life(max(self._known_life, life, *dead), chance)
-        self.holdings.begin(life, dead)
-        home = map(self.plots.of, self._spawns[self.agent].values())
-        self.holdings.watch([plot for plot in (*plots, *home) if plot < self.plots.count])
-        self.own = replace(self.own, lives=[*dead[1 - _LIVES_KEPT :], life])
+        self._host.hear_known(self.agent, *self._known(self.agent))
+        lives = self._host.begin(self.own.lives, chance)
+        home = map(self.plots.of, self._spawns.get(self.agent, {}).values())
+        self.holdings.watch([plot for plot in home if plot < self.plots.count])
+        self.own = replace(self.own, lives=lives)
         return [self.own]
 
     def hear_token(self, peer: Peer, *, up: bool) -> None:
         """The liveliness token of another process has risen or fallen."""
-        if peer.id == self.agent:
-            (self._twins.appeared if up else self._twins.gone)(peer)
-
-    def _again(self, now_ns: int) -> list[Action]:
-        """Begin another life after this one was replaced, once its successor is gone; nothing while it lives."""
-        if self._twins.is_alive("agent", self.agent) or self._alone_since_ns is None:
-            self._alone_since_ns = now_ns
-        if now_ns - self._alone_since_ns < _ALONE_NS:
-            return []
-        self._alone_since_ns = None
-        self._known_life = max(self._known_life, self.holdings.newest)
-        self.holdings.end()
-        return [AskKnown()]
+        self._host.hear_token(peer, up=up)
 
     def _known(self, agent: str) -> tuple[int, list[int]]:
         """The greatest life of an agent in any stored table, and the plots that grant cells to its vehicles or keep
         some of an earlier life shut."""
-        stored = {plot: table for plot, (_, table) in self._saved.items()}
-        stored.update((plot, member.stored) for plot, member in self._members.items())
+        stored = self._stored()
         life = max((table.hosts.get(agent, (0, 0))[0] for table in stored.values()), default=0)
         return life, sorted(
             plot
@@ -173,6 +148,18 @@ class RightOfWay:
             if any(agent_of(vehicle) == agent for vehicle in table.grants)
             or any(shut.agent == agent for shut in table.shut)
         )
+
+    def _stored(self) -> dict[int, Table]:
+        """Plot -> the newest table of it on our file."""
+        stored = {plot: table for plot, (_, table) in self._saved.items()}
+        stored.update((plot, member.stored) for plot, member in self._members.items())
+        return stored
+
+    def _lives_of(self, agent: str) -> list[int]:
+        """All lives of an agent that stored tables name, the newest ones."""
+        lives = {table.hosts[agent][0] for table in self._stored().values() if agent in table.hosts}
+        lives.update(shut.life for table in self._stored().values() for shut in table.shut if shut.agent == agent)
+        return sorted(lives)[-LIVES_KEPT:]
 
     def leads(self, plot: int) -> bool:
         """Whether we are the plot's warden, as far as we know."""
@@ -183,7 +170,7 @@ class RightOfWay:
 
     def hear_standing(self, standing: Standing, now_ns: int) -> None:
         member = self._member(standing.plot, now_ns)
-        if member is not None and standing.agent in self._spawns:
+        if member is not None:
             member.hear_standing(standing, now_ns)
 
     def hear_table(self, table: Table, now_ns: int) -> list[Action]:
@@ -196,12 +183,7 @@ class RightOfWay:
 
     def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
         """A warden's word to us. Returns the vehicles that have found their place."""
-        if not self.holdings.life or granted.plot not in self.holdings.plots:
-            return []
-        placed = self.holdings.hear_granted(granted, self._place, now_ns)
-        if self.holdings.heard_ns(granted.plot) == now_ns:
-            self._led_ns[granted.plot] = now_ns
-        return placed
+        return self._host.hear_granted(granted, now_ns)
 
     def hear_claim(self, plot: int, epoch: int, now_ns: int) -> list[Action]:
         """Another member asks for our promise: `Save`, then the table to answer with; or nothing."""
@@ -223,25 +205,14 @@ class RightOfWay:
             actions += member.tick(now_ns)
         if self.holdings.replaced:
             self.holdings.watch(self._known(self.agent)[1])
-        if self.holdings.life:
-            actions += self.holdings.standings(wishes, now_ns)
-        if self.holdings.replaced:
-            actions += self._again(now_ns)
+        actions += self._host.standings(wishes, now_ns)
+        if self._host.ended_alone(now_ns):
+            actions.append(AskKnown())
         return actions
 
     def unled(self, now_ns: int) -> dict[int, str]:
         """Why vehicles of ours wait: plot -> that no warden of it is heard."""
-        plots = self.holdings.plots
-        self._led_ns = {plot: self._led_ns.get(plot, now_ns) for plot in plots}
-        found = {}
-        for plot, heard_ns in self._led_ns.items():
-            if now_ns - heard_ns > _UNLED_NS and (vehicles := self.holdings.waiting(plot)):
-                members = self.plots.members(plot)
-                found[plot] = (
-                    f"plot {plot} has no warden: {len(vehicles)} of our vehicles there wait until "
-                    f"{self.plots.majority} of its members {', '.join(members)} run and reach each other and us"
-                )
-        return found
+        return self._host.unled(now_ns)
 
     def _member(self, plot: int, now_ns: int) -> Member | None:
         """Our seat in a plot; None where we have none, or the other members have not all noted our file: then it is

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
+from swarm.right_of_way.holdings import Wish
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.vehicle import Vehicle
-from vehicle_agent.traffic.holdings import Wish
 
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
@@ -39,6 +39,8 @@ class Steering:
     reserve      cells ahead of itself that a vehicle may be granted
     occupied     whether another vehicle holds a cell
     bodies       what speaks no right of way: its cells are passed as lethal ones are, but by routes
+
+    ways_out     cell that only an operator's zone closes -> steps from there out of it: who stands there leaves
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class Steering:
         self._occupied = occupied
         self._bodies = bodies
         self._shut = bodies.closed
+        self.ways_out: Mapping[int, int] = {}
         self._since_ns: dict[str, int] = {}
         """Vehicle -> since when it has been on its way to a target."""
         self._stood_ns: dict[str, tuple[int, int]] = {}
@@ -71,6 +74,8 @@ class Steering:
 
     def passable(self, tail: int, head: int) -> bool:
         """Whether the map allows the step between two neighbours; a diagonal also needs the cells beside it."""
+        if tail in self.ways_out:
+            return head in self._out_of(tail)
         if self.closed(head):
             return False
         cols = self._grid.cols
@@ -102,6 +107,10 @@ class Steering:
         in_reach   whether the target is within capture range of a cell
         """
         still = len(path) == 1
+        if path[0] in self.ways_out:
+            age_ms = (now_ns - self._since_ns.setdefault(vehicle.id, now_ns)) // _MS
+            wants = sorted(self.steps(path[0]) if still else (), key=self._occupied)
+            return Wish((), wants, len(wants), max(1, min(age_ms, _OLDEST_MS), pushed_ms))
         if vehicle.in_reach or vehicle.target is None:
             self._since_ns[vehicle.id] = now_ns
             steps = self.steps(path[0]) if still else []
@@ -157,8 +166,17 @@ class Steering:
                 return ahead[:index]
         return ahead
 
+    def _out_of(self, cell: int) -> list[int]:
+        """The neighbours straight beside a cell in a zone that are nearer to its border, or open."""
+        depth = self.ways_out[cell]
+        beside = [neighbour for direction, neighbour in self._grid.neighbours(cell) if direction % 2 == 0]
+        outwards = [each for each in beside if not self.closed(each) or self.ways_out.get(each, depth) < depth]
+        return [each for each in outwards if each not in self._shut]
+
     def steps(self, cell: int) -> list[int]:
         """The neighbours that the map allows to drive to."""
+        if cell in self.ways_out:
+            return self._out_of(cell)
         around: list[int | None] = [None] * 8
         for direction, neighbour in self._grid.neighbours(cell):
             if not self.closed(neighbour):

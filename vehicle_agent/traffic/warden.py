@@ -13,12 +13,11 @@ from zlib import crc32
 
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
+from swarm.right_of_way.lives import BEAT_NS, is_far_ahead
+from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Grant, Granted, Shut, Stamp, Stand, Standing, Table
 from vehicle_agent.traffic.pibt import Mover, Round
-from vehicle_agent.traffic.plots import Plots
 
-BEAT_NS = NS_PER_S // 5
-"""A table is told so often though nothing has changed, so that the other members know of a warden."""
 SILENT_NS = NS_PER_S
 """Vehicles of a host that has not spoken for so long are obstacles: nobody waits for them or pushes them."""
 _AGE_BITS = 12
@@ -26,10 +25,14 @@ _AGE_BITS = 12
 the older most of the time, or each lets its own wait for the other."""
 _TOLD_AGAIN_NS = 3 * BEAT_NS // 4
 """A host is told the same again after so long: somewhat less than a beat, so that a beat tells it."""
-_LIFE_BITS = 32
-_FURTHEST_LIFE = 1 << 16
-FURTHEST_EPOCH = 3 << 20
-"""No run gets so many epochs further while somebody does not hear of it."""
+MOST_GUESTS = 256
+"""Guests that one plot has ever known: their lives stay in its table, as those of all hosts."""
+MOST_CELLS_OF_GUEST = 1024
+"""Cells of one plot that one guest holds."""
+MOST_CELLS_OF_GUESTS = 1 << 14
+"""Cells of one plot that all guests together hold: a quarter of it."""
+_MOST_CELLS = 64
+"""Of one vehicle: what a `Grant` has room for."""
 
 
 def _turn(stand: Stand) -> tuple[int, int, str]:
@@ -39,19 +42,14 @@ def _turn(stand: Stand) -> tuple[int, int, str]:
     return -step, _lot(stand.vehicle, step), stand.vehicle
 
 
+def _is_entering(stand: Stand) -> bool:
+    """Whether it stands nowhere yet, as far as right of way knows, and asks for its first cell."""
+    return not stand.holds and stand.ahead[:1] == [stand.cell]
+
+
 @lru_cache(maxsize=1 << 14)
 def _lot(vehicle: str, step: int) -> int:
     return crc32(f"{vehicle}/{step}".encode())
-
-
-def first_life(after: int, chance: int) -> int:
-    """A new life's number: greater than all that are known. Of two that begin at once, chance decides."""
-    return ((after >> _LIFE_BITS) + 1 << _LIFE_BITS) | (chance & 0xFFFF_FFFF)
-
-
-def is_far_ahead(life: int, known: int) -> bool:
-    """Whether a number is further ahead than a host can have been restarted."""
-    return life >> _LIFE_BITS > (known >> _LIFE_BITS) + _FURTHEST_LIFE
 
 
 @dataclass(slots=True)
@@ -73,7 +71,8 @@ class _Host:
 class Warden:
     """Holds one plot's table in one epoch. Every `tick` may make a new one, which counts once a majority stored it.
 
-    fleets  agent -> its vehicles, all of the run
+    fleets  agent -> its vehicles, all of the scenario's. Any other host is a guest (decision 40): its vehicles are
+            those that bear its name
     """
 
     def __init__(
@@ -93,6 +92,11 @@ class Warden:
             vehicle: (list(grant.cells), grant.stamp) for vehicle, grant in table.grants.items()
         }
         self._shut = {(each.agent, each.life): list(each.cells) for each in table.shut}
+        self._guests: dict[str, dict[str, int]] = {}
+        """Guest -> its vehicles that are granted cells here, and how many cells."""
+        for vehicle, (cells, _) in self._grants.items():
+            if agent_of(vehicle) not in fleets:
+                self._guests.setdefault(agent_of(vehicle), {})[vehicle] = len(cells)
         self._hosts: dict[str, _Host] = {}
         self._pushed: dict[str, int] = {}
         self._granted = True  # since the last table: something that a host waits for
@@ -110,11 +114,13 @@ class Warden:
 
     def hear(self, standing: Standing, now_ns: int) -> None:
         host = standing.agent
+        if not self._is_welcome(host):
+            self.refused.append(f"plot {self._plot} has known {MOST_GUESTS} guests: {host} cannot enter")
+            return
         known = self._hosts.setdefault(host, _Host(now_ns))
         known.spoke_ns = now_ns
-        for dead in standing.dead:
-            if self._shut.pop((host, dead), None) is not None:
-                self._granted = True
+        if host in self._fleets:
+            self._open(standing)
         life, seq = self._lives.get(host, (0, 0))
         if standing.ended:
             self._ended(host, standing.life, life)
@@ -133,10 +139,47 @@ class Warden:
         for vehicle in self._granted_to(host):
             self._free(vehicle, holds.get(vehicle, []), standing.knows)
         known.standing, known.heard_ns = standing, now_ns
+        if host not in self._fleets:
+            # Only now: a life that is itself replaced must not open cells on which its vehicle stands.
+            self._enter_again(standing, self._open(standing))
+            if standing.life in standing.dead:
+                self._shut[host, standing.life] = []  # nobody drives by it: its successor need not wait
+
+    def _open(self, standing: Standing) -> set[int]:
+        """Open what is shut for lives that are proved to have ended. Returns the cells."""
+        opened: set[int] = set()
+        for dead in standing.dead:
+            cells = self._shut.pop((standing.agent, dead), None)
+            if cells is not None:
+                opened.update(cells)
+                self._granted = self._granted or dead != standing.life
+        return opened
+
+    def _enter_again(self, standing: Standing, opened: set[int]) -> None:
+        """A guest that stands on a cell which was shut for an earlier life of it gets it before all others."""
+        if not opened:
+            return
+        held = {cell for cells, _ in self._grants.values() for cell in cells}
+        held.update(cell for cells in self._shut.values() for cell in cells)
+        for stand in standing.vehicles:
+            if _is_entering(stand) and self._is_of(stand.vehicle, standing.agent) and stand.cell in opened:
+                self._grant(stand, [stand.cell], held, {})
+
+    def _is_welcome(self, host: str) -> bool:
+        """Whether there is room for this host: for each of the scenario, and for so many guests."""
+        if host in self._fleets or host in self._lives or host in self._hosts:
+            return True
+        known = self._lives.keys() | self._hosts.keys()
+        return len(known - self._fleets.keys()) < MOST_GUESTS
+
+    def _is_of(self, vehicle: str, host: str) -> bool:
+        """Whether a vehicle is one that the host may speak for."""
+        return vehicle in self._fleets[host] if host in self._fleets else agent_of(vehicle) == host
 
     def _granted_to(self, host: str) -> list[str]:
         """The vehicles of a host that are granted cells."""
-        return [vehicle for vehicle in self._fleets.get(host, ()) if vehicle in self._grants]
+        vehicles = self._fleets[host] if host in self._fleets else self._guests.get(host, ())
+        return [vehicle for vehicle in vehicles if vehicle in self._grants]
 
     def _ended(self, host: str, ended: int, life: int) -> None:
         """A life's own word that it drives no more."""
@@ -177,6 +220,17 @@ class Warden:
                 self._grants[vehicle] = (kept, stamp)
             else:
                 del self._grants[vehicle]
+            self._count_guest(vehicle, len(kept))
+
+    def _count_guest(self, vehicle: str, cells: int) -> None:
+        """Keep account of how many cells guests hold."""
+        host = agent_of(vehicle)
+        if host in self._fleets:
+            return
+        held = self._guests.setdefault(host, {})
+        held[vehicle] = cells
+        if not cells:
+            del held[vehicle]
 
     # --- what is granted ------------------------------------------------------------------------------------
 
@@ -250,13 +304,15 @@ class Warden:
         movers: dict[str, Mover] = {}
         for stand in stands:
             cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+            if not cells and _is_entering(stand):
+                continue  # nobody makes way for it
             if stand.cell != stand.end or (cells and cells != [stand.cell]):
                 # It is under way: whoever wants a cell that it will leave may wait for it.
                 closed.difference_update(cells[:-1] if stand.end in cells else cells)
                 continue
             closed.difference_update(cells)
             movers[stand.vehicle] = Mover(
-                stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, guest=not cells
+                stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=not cells
             )
         for cells in self._shut.values():
             closed.update(cells)
@@ -283,7 +339,7 @@ class Warden:
             for name, host in self._hosts.items()
             if host.standing is not None and now_ns - host.heard_ns <= SILENT_NS
             for stand in host.standing.vehicles
-            if stand.vehicle in self._fleets.get(name, ())
+            if self._is_of(stand.vehicle, name)
         ]
         return sorted(stands, key=_turn)
 
@@ -301,7 +357,20 @@ class Warden:
             mine = taken.setdefault(cell, stand.vehicle) == stand.vehicle
             if not mine or cell in held or self._plots.of(cell) != self._plot:
                 return
-            held.add(cell)
             cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+            if len(cells) >= _MOST_CELLS or not self._guest_may_hold_more(stand.vehicle):
+                return
+            held.add(cell)
             self._grants[stand.vehicle] = ([*cells, cell], self._next_stamp)
+            self._count_guest(stand.vehicle, len(cells) + 1)
             self._granted = True
+
+    def _guest_may_hold_more(self, vehicle: str) -> bool:
+        """Whether neither this guest nor all together hold their share; true of vehicles of the scenario."""
+        host = agent_of(vehicle)
+        if host in self._fleets:
+            return True
+        if sum(self._guests.get(host, {}).values()) >= MOST_CELLS_OF_GUEST:
+            return False
+        together = sum(sum(held.values()) for held in self._guests.values())
+        return together < MOST_CELLS_OF_GUESTS

@@ -144,7 +144,8 @@ class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
 
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
-    """A new life of an agent asks all others what they know of it. `disk` names the file that it keeps."""
+    """A new life of an agent or a guest asks all agents what they know of it. `disk` names the file that it keeps;
+    a guest's is 0, and nobody notes it."""
 
     agent: Id
     disk: Natural
@@ -153,13 +154,17 @@ class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-requ
 class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
     """What one agent has on file about another.
 
-    agent  who answers
-    disk   the file that it takes to be the other's: the first that it was told of
-    life   the greatest life in any table
-    plots  those whose tables grant cells to its vehicles, or keep cells of an earlier life of it shut
+    agent   who answers
+    disk    the file that it takes to be the other's: the first that it was told of
+    life    the greatest life in any table
+    plots   those whose tables grant cells to its vehicles, or keep cells of an earlier life of it shut
+    agents  for a guest, which may not know the scenario: the agents of which three are members of each plot
+    lives   for a guest: all lives of it that tables name, so that an operator can say that they have ended
     """
 
     agent: Id
     disk: Natural
     life: Natural
     plots: Annotated[list[Plot], LARGE]
+    agents: Annotated[list[Id], IDS] = []
+    lives: Annotated[list[Natural], Meta(max_length=32)] = []

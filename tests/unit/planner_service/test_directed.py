@@ -19,6 +19,8 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import CostConfig, PlannerConfig, Scenario, TerrainConfig
 from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
+from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.traffic import Granted
@@ -26,8 +28,6 @@ from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.agent import Agent, AskRoutes, LocalMap
 from vehicle_agent.assignment import AskCosts
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.traffic.holdings import Holdings
-from vehicle_agent.traffic.plots import Plots
 
 RES = 10.0
 

@@ -15,6 +15,8 @@ from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
+from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.plots import Plots
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
@@ -28,8 +30,6 @@ from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.fleet import FleetReport
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.traffic.holdings import Holdings
-from vehicle_agent.traffic.plots import Plots
 
 GRID = GridSpec(12, 12, 10.0)
 LEVEL = np.full((12, 12), 0.1, np.float32)

@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
+from swarm.right_of_way.holdings import Holdings, Tell, Wish
+from swarm.right_of_way.lives import BEAT_NS, first_life, is_far_ahead
+from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
 from swarm.wire.topics import STANDING
 from vehicle_agent.bodies import Bodies
-from vehicle_agent.traffic.holdings import Holdings, Tell, Wish
 from vehicle_agent.traffic.member import Member, Refused, Save
 from vehicle_agent.traffic.pibt import Mover, Round
-from vehicle_agent.traffic.plots import Plots
 from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
 from vehicle_agent.traffic.steering import Steering
-from vehicle_agent.traffic.warden import BEAT_NS, Warden, first_life, is_far_ahead
+from vehicle_agent.traffic.warden import Warden
 
 GRID = GridSpec(8, 8, 1.0)
 AGENTS = [f"a{n}" for n in range(5)]

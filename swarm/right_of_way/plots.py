@@ -21,12 +21,12 @@ class Plots:
 
     def __init__(self, grid: GridSpec, agents: Sequence[str], side: int = PLOT_CELLS) -> None:
         self.grid = grid
-        self._agents = list(agents)
+        self.agents = tuple(agents)
         self._side = side
         self._across = -(-grid.cols // side)
         self._members: dict[int, tuple[str, ...]] = {}
         self.count = self._across * -(-grid.rows // side)
-        self.majority = 2 if len(self._agents) >= _MEMBERS else 1
+        self.majority = 2 if len(self.agents) >= _MEMBERS else 1
 
     def of(self, cell: int) -> int:
         """The plot of a cell; -1 of a cell outside the grid."""
@@ -38,7 +38,7 @@ class Plots:
     def members(self, plot: int) -> tuple[str, ...]:
         members = self._members.get(plot)
         if members is None:
-            by_hash = sorted(self._agents, key=lambda agent: blake2s(f"{plot}/{agent}".encode()).digest())
+            by_hash = sorted(self.agents, key=lambda agent: blake2s(f"{plot}/{agent}".encode()).digest())
             members = self._members[plot] = tuple(by_hash[: _MEMBERS if self.majority > 1 else 1])
         return members
 

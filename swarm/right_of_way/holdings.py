@@ -6,14 +6,16 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 
+from swarm.right_of_way.lives import BEAT_NS, FURTHEST_EPOCH
+from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Granted, Stamp, Stand, Standing
-from vehicle_agent.traffic.plots import Plots
-from vehicle_agent.traffic.warden import BEAT_NS, FURTHEST_EPOCH
 
 _UNHEARD_NS = 5 * BEAT_NS // 2
 """A host that has not heard a plot's warden for so long speaks to all members of the plot."""
 _FURTHEST_SEQ = 1 << 32
 _BEFORE_ALL: Stamp = (0, 0)
+Place = Callable[[str, Sequence[int]], int | None]
+"""On which of the cells that it was granted a vehicle of a new life stands; None if it does not stand there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,8 @@ class _Said:
 class Holdings:
     """The host's side of right of way.
 
+    vehicles  those of the host; None for all that bear its name
+
     life      which life of the host this is; 0 before `begin`
     plots     those that concern the host now: it speaks to their members and listens to their tables
     replaced  a later life of this host has spoken: this one must end
@@ -86,11 +90,11 @@ class Holdings:
     refused   sentences about what cannot be true; whoever tells them clears them
     """
 
-    def __init__(self, plots: Plots, agent: str, vehicles: Collection[str]) -> None:
+    def __init__(self, plots: Plots, agent: str, vehicles: Collection[str] | None) -> None:
         self._plots = plots
         self._agent = agent
         self.refused: list[str] = []
-        self._vehicles = frozenset(vehicles)
+        self._vehicles = None if vehicles is None else frozenset(vehicles)
         self.end()
 
     def end(self) -> None:
@@ -100,6 +104,10 @@ class Holdings:
         self.plots: dict[int, None] = {}
         self._dead: list[int] = []
         self._paths: dict[str, list[int]] = {}
+        self._enters: dict[str, int] = {}
+        """Vehicle that holds nothing -> the cell on which it would begin, until that is granted."""
+        self._away: set[str] = set()
+        """Vehicles that have left in this life: what is still granted to them is given back."""
         self._cells: set[int] | None = None
         """All cells of our paths; None when they have changed."""
         self._others: set[int] | None = None
@@ -114,6 +122,10 @@ class Holdings:
         """Begin a life; `dead` are earlier ones that are proved to have ended."""
         self.life = life
         self._dead = list(dead)
+
+    def end_at_once(self) -> None:
+        """Say that nobody drives by this life: it only gives back what those before it held."""
+        self._dead.append(self.life)
 
     # --- what is held ---------------------------------------------------------------------------------------
 
@@ -149,6 +161,31 @@ class Holdings:
         self._paths[vehicle] = self._paths[vehicle][: max(keep, 1)]
         self._cells = None
 
+    def enter(self, vehicle: str, cell: int) -> None:
+        """Ask for a first cell for a vehicle that holds none; the newest call counts. Where an earlier life of ours
+        was granted cells for it, this one of them is taken and all others are given back."""
+        if vehicle not in self._paths:
+            self._enters[vehicle] = cell
+            self._away.discard(vehicle)
+            self.watch([self._plots.of(cell)])
+
+    def leave(self, vehicle: str) -> None:
+        """It stands nowhere any more: give back all that it holds."""
+        self._enters.pop(vehicle, None)
+        self._paths.pop(vehicle, None)
+        self._said.pop(vehicle, None)
+        self._away.add(vehicle)
+        self._cells = None
+
+    @property
+    def gone(self) -> bool:
+        """Whether no vehicle of ours holds or wants a cell, and all wardens that we spoke to know it."""
+        return not (self.plots or self._paths or self._enters)
+
+    def is_granted(self, vehicle: str) -> bool:
+        """Whether a table in use grants cells to a vehicle, though it may have left them."""
+        return any(vehicle in view.seen for view in self._views.values())
+
     def waiting(self, plot: int) -> list[str]:
         """The vehicles that hold cells of a plot, as far as its table in use tells."""
         return list(self._views[plot].seen) if plot in self._views else []
@@ -165,7 +202,7 @@ class Holdings:
             self.plots.setdefault(plot)
             self._views.setdefault(plot, _View())
 
-    def hear_granted(self, granted: Granted, place: Callable[[str, Sequence[int]], int], now_ns: int) -> list[str]:
+    def hear_granted(self, granted: Granted, place: Place, now_ns: int) -> list[str]:
         """Act on what a warden says to us, if it is newer than what we know. Returns the vehicles that have found
         their place.
 
@@ -188,14 +225,15 @@ class Holdings:
         self._cells = self._others = self._pushed = None
         return self._take(view, granted, place)
 
-    def _take(self, view: _View, granted: Granted, place: Callable[[str, Sequence[int]], int]) -> list[str]:
+    def _take(self, view: _View, granted: Granted, place: Place) -> list[str]:
         """Take in the cells that are granted to each vehicle."""
         before, view.seen = view.seen, {}
         for vehicle in before.keys() - granted.grants.keys():
             self._said.pop(vehicle, None)
         placed = []
         for vehicle, cells in granted.grants.items():
-            if vehicle not in self._vehicles or any(self._plots.of(cell) != granted.plot for cell in cells):
+            ours = self._vehicles is None or vehicle in self._vehicles
+            if not ours or any(self._plots.of(cell) != granted.plot for cell in cells):
                 continue
             view.seen[vehicle] = cells
             seen = before.get(vehicle, [])
@@ -204,10 +242,23 @@ class Holdings:
             self._said.pop(vehicle, None)
             if vehicle in self._paths:
                 self._extend(vehicle, cells, seen)
-            else:
-                self._paths[vehicle] = [place(vehicle, cells)]
+            elif (cell := self._first_cell(vehicle, cells, seen, place)) is not None:
+                self._paths[vehicle] = [cell]
                 placed.append(vehicle)
         return placed
+
+    def _first_cell(self, vehicle: str, cells: Sequence[int], seen: Sequence[int], place: Place) -> int | None:
+        """Where a vehicle that holds nothing begins, of the cells that are granted to it; None if it does not. What
+        was granted to a life before it was replaced may come late: its successor may have given that back."""
+        if vehicle in self._away or self.replaced:
+            return None
+        cell = self._enters.get(vehicle)
+        if cell is None:
+            return place(vehicle, cells)
+        if cell not in cells or cell in seen:  # one that was seen before may be about to be freed
+            return None
+        del self._enters[vehicle]
+        return cell
 
     def _extend(self, vehicle: str, cells: Sequence[int], seen: Sequence[int]) -> None:
         """Take the cells that are granted anew. One that does not follow the path is left, and so given back."""
@@ -232,6 +283,10 @@ class Holdings:
                 said = self._said[vehicle] = self._say(vehicle, path, wish)
             for each in said.stands:
                 by_plot.setdefault(each[0], []).append(each)
+        for vehicle, cell in self._enters.items():
+            if not any(cell in view.seen.get(vehicle, ()) for view in self._views.values()):
+                stand = Stand(vehicle, cell, cell, [], [cell], [], 0, 0)
+                by_plot.setdefault(self._plots.of(cell), []).append((self._plots.of(cell), stand, stand))
         self._forget_left(by_plot)
         return [
             Tell(self._listeners(plot, now_ns), self._standing(plot, [stand for _, stand, _ in said]))

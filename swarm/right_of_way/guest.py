@@ -1,0 +1,234 @@
+"""A vehicle that is not in the scenario: how it gets right of way, and how an operator says that it is gone
+(decision 40)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from swarm.clock import NS_PER_S
+from swarm.liveness import Peer
+from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.host import LIVES_KEPT, AskKnown, Host
+from swarm.right_of_way.plots import Plots
+from swarm.wire.messages.traffic import Granted, Known
+
+MOST_AHEAD = 16
+"""Cells ahead of itself that a guest is granted at most."""
+_MS = NS_PER_S // 1000
+_OLDEST_MS = 1 << 31
+
+
+@dataclass(frozen=True, slots=True)
+class SaveLives:
+    """Put these on file before what follows is said."""
+
+    lives: list[int]
+
+
+GuestAction = AskKnown | SaveLives | Tell
+
+
+class Guest:
+    """One vehicle that speaks for itself. It has no seat among members; else it is a host as any other.
+
+    Nothing is said before `enter`: what a new life leaves out is given back, so it must not speak before it knows
+    where its vehicle stands.
+
+    name   of the guest; its vehicle is called `name-00`
+    lives  of it that are on the file which this process has locked: they have ended
+
+    needs_life  whether it wants to enter and waits for `begin`
+    """
+
+    def __init__(self, plots: Plots, name: str, lives: Sequence[int] = ()) -> None:
+        self.vehicle = f"{name}-00"
+        self._plots = plots
+        self._host = Host(plots, name, [self.vehicle], lambda vehicle, cells: None)
+        self._lives = list(lives)
+        self._cell: int | None = None
+        """Where it stands or would enter; None while it is away."""
+        self._path: tuple[int, ...] = ()
+        self._aside: tuple[int, ...] = ()
+        self._wish = Wish()
+        self._since_ns: int | None = None
+        """Since when it has wanted to go somewhere; None while it does not."""
+
+    # --- what its driver says -------------------------------------------------------------------------------
+
+    @property
+    def cells(self) -> tuple[int, ...]:
+        """The cells that it may stand on and enter, in driving order, its own first."""
+        return () if self.replaced else tuple(self._host.holdings.path(self.vehicle))
+
+    @property
+    def replaced(self) -> bool:
+        """Whether another process speaks for this guest. It stands where it stands, and must not move."""
+        return self._host.holdings.replaced
+
+    @property
+    def gone(self) -> bool:
+        """Whether it holds and wants nothing, and every warden that it spoke to knows."""
+        return self._cell is None and (not self._host.holdings.life or self._host.holdings.gone)
+
+    @property
+    def needs_life(self) -> bool:
+        return self._cell is not None and not self._host.holdings.life
+
+    @property
+    def refused(self) -> list[str]:
+        """Sentences about what cannot be true; whoever tells them clears them."""
+        return self._host.holdings.refused
+
+    def enter(self, cell: int) -> None:
+        """Ask for the cell on which it stands, or wants to begin. Raises ValueError where it has one already, or
+        there is none."""
+        if self.cells:
+            raise ValueError(f"it holds cell {self.cells[0]}: leave before it enters elsewhere")
+        if self._plots.of(cell) < 0:
+            raise ValueError(f"cell {cell} is outside the map of {self._plots.grid.cells} cells")
+        self._cell = cell
+        if self._host.holdings.life and not self.replaced:
+            self._host.holdings.enter(self.vehicle, cell)
+
+    def want(self, path: Sequence[int], aside: Sequence[int] = ()) -> None:
+        """Say where it would go. Cells that it holds and that are not the beginning of this path are given back.
+
+        path   cells, each next to the one before: the one on which it stands, then where it drives
+        aside  neighbours to which it would also go, to let others pass, if it stands
+
+        Raises ValueError if the path does not begin where it stands, or leaps, or it has not entered.
+        """
+        held = self.cells
+        if not held or not path or path[0] != held[0]:
+            where = f"cell {held[0]}" if held else "no cell"
+            raise ValueError(f"the path must begin where the vehicle stands: it holds {where}")
+        for tail, head in pairwise(path):
+            if self._plots.of(head) < 0 or not self._plots.adjacent(tail, head):
+                raise ValueError(f"cell {head} of the path is not next to cell {tail}")
+        same = next(
+            (n for n, (a, b) in enumerate(zip(held, path, strict=False)) if a != b), min(len(held), len(path))
+        )
+        if same < len(held):
+            self._host.holdings.give_back(self.vehicle, same)
+        self._path = tuple(path)
+        self._aside = tuple(cell for cell in aside if self._plots.adjacent(held[0], cell))
+
+    def left(self, cell: int) -> None:
+        """It has driven out of a cell, into the next that it holds. Raises ValueError if it holds none after it."""
+        held = self.cells
+        if cell not in held[:-1]:
+            raise ValueError(f"it cannot have left cell {cell}: it holds {list(held)}")
+        self._host.holdings.moved(self.vehicle, held[held.index(cell) + 1])
+        self._cell = self.cells[0]
+
+    def leave(self) -> None:
+        """It stands nowhere any more: its cells are free for others once wardens have heard."""
+        self._cell = None
+        self._path = self._aside = ()
+        self._host.holdings.leave(self.vehicle)
+
+    # --- what is heard --------------------------------------------------------------------------------------
+
+    @property
+    def settled(self) -> bool:
+        """Whether nobody needs to be asked what is known of it, now or once more."""
+        return not self.needs_life and self._host.informed
+
+    def hear_known(self, known: Known) -> None:
+        """An agent's answer to `AskKnown`."""
+        self._host.hear_known(known.agent, known.life, known.plots)
+
+    def begin(self, chance: int) -> list[GuestAction]:
+        """Begin a life, once all agents that could be asked have answered.
+
+        chance  a random number
+        """
+        if not self.needs_life:
+            return []
+        assert self._cell is not None
+        self._lives = self._host.begin(self._lives, chance)
+        self._host.holdings.enter(self.vehicle, self._cell)
+        return [SaveLives(self._lives)]
+
+    def hear_granted(self, granted: Granted, now_ns: int) -> bool:
+        """A warden's word to us. Whether the vehicle has entered by it."""
+        return bool(self._host.hear_granted(granted, now_ns))
+
+    def hear_token(self, peer: Peer, *, up: bool) -> None:
+        """The liveliness token of another process has risen or fallen."""
+        self._host.hear_token(peer, up=up)
+
+    def unled(self, now_ns: int) -> list[str]:
+        """Why it waits: plots of which no warden is heard."""
+        return list(self._host.unled(now_ns).values())
+
+    def tick(self, now_ns: int) -> list[GuestAction]:
+        """What it has to say now."""
+        if self.replaced:
+            # Not that it has ended, as a host would: its vehicle still stands there.
+            return [AskKnown()] if self._host.ended_alone(now_ns) and self._cell is not None else []
+        return [*self._host.standings({self.vehicle: self._wish_now(now_ns)}, now_ns)]
+
+    def _wish_now(self, now_ns: int) -> Wish:
+        held, path = self.cells, self._path
+        after = path.index(held[-1]) + 1 if held and held[-1] in path else len(path)
+        ahead = list(path[after : after + max(MOST_AHEAD + 1 - len(held), 0)])
+        self._since_ns = (self._since_ns or now_ns) if ahead else None
+        wants = list(dict.fromkeys((*ahead[:1], *self._aside))) if len(held) == 1 else []
+        pushed = self._host.holdings.pushed(self.vehicle)
+        better = len(wants) if pushed else len(ahead[:1]) if wants else 0
+        # In whole seconds, so that a wish is the same object while nothing happens.
+        age_s = (now_ns - self._since_ns) // NS_PER_S if self._since_ns is not None else 0
+        wish = Wish(ahead, wants[:8], min(better, 8), max(min(age_s * 1000, _OLDEST_MS), pushed))
+        if wish != self._wish:
+            self._wish = wish
+        return self._wish
+
+
+class Removal:
+    """An operator's word that a guest is gone: it, and whatever process spoke for it, is on no cell any more.
+
+    It is a new life of the guest, which proves by the operator's word that all before it have ended, and holds
+    nothing. A process that still speaks for the guest stops as soon as it hears of it.
+    """
+
+    def __init__(self, plots: Plots, name: str) -> None:
+        self._host = Host(plots, name, None, lambda vehicle, cells: None)
+        self._lives: set[int] = set()
+
+    @property
+    def known(self) -> bool:
+        """Whether anybody has ever heard of this guest."""
+        return bool(self._lives)
+
+    @property
+    def done(self) -> bool:
+        """Whether every warden that had cells of the guest has freed them."""
+        return self._host.holdings.life > 0 and self._host.holdings.gone and self.settled
+
+    @property
+    def settled(self) -> bool:
+        """Whether so many have answered that no plot can be missing."""
+        return self._host.informed
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the guest has begun a later life meanwhile."""
+        return self._host.holdings.replaced
+
+    def hear_known(self, known: Known) -> None:
+        self._lives.update(known.lives)
+        self._host.hear_known(known.agent, known.life, known.plots)
+
+    def begin(self, chance: int) -> None:
+        """Once all agents that could be asked have answered."""
+        self._host.begin(sorted(self._lives)[1 - LIVES_KEPT :], chance)
+        self._host.holdings.end_at_once()
+
+    def hear_granted(self, granted: Granted, now_ns: int) -> None:
+        self._host.hear_granted(granted, now_ns)
+
+    def tick(self, now_ns: int) -> list[Tell]:
+        return [] if self.replaced else self._host.standings({}, now_ns)

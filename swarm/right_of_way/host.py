@@ -1,0 +1,125 @@
+"""One host of vehicles in right of way: its lives, and the cells that its vehicles hold (decision 25, Lives)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
+from swarm.liveness import Peer, Roster
+from swarm.right_of_way.holdings import Holdings, Place, Tell, Wish
+from swarm.right_of_way.lives import first_life, is_far_ahead
+from swarm.right_of_way.plots import Plots
+from swarm.wire.messages.traffic import Granted
+
+LIVES_KEPT = 32
+_ALONE_NS = NS_PER_S // 2
+"""A life that has been replaced begins again once no other process of its host has been alive for so long."""
+_UNLED_NS = 2 * NS_PER_S
+"""A plot that is silent for so long has no warden; another one takes over within a second where it can."""
+
+
+def first_of(vehicle: str, cells: Sequence[int]) -> int:
+    """A `Place` of hosts that remember nothing."""
+    return cells[0]
+
+
+@dataclass(frozen=True, slots=True)
+class AskKnown:
+    """Ask all agents what they have on file about this host, then begin a life."""
+
+
+class Host:
+    """A host's part in right of way; whether it is also a member of plots is nothing to it.
+
+    name   of the agent or guest
+    place  tells on which of the cells that it was granted a vehicle of a new life stands
+
+    holdings  which cells our vehicles hold: none before `begin`
+    """
+
+    def __init__(self, plots: Plots, name: str, vehicles: Collection[str] | None, place: Place = first_of) -> None:
+        self.name = name
+        self.plots = plots
+        self.holdings = Holdings(plots, name, vehicles)
+        self._place = place
+        self._known_life = 0
+        self._told_by: set[str] = set()
+        """Agents that have told us what they know of us."""
+        self._twins = Roster()
+        self._alone_since_ns: int | None = None
+        self._led_ns: dict[int, int] = {}
+        """Plot that concerns us -> when its warden was heard last."""
+
+    def hear_known(self, agent: str, life: int, plots: Sequence[int]) -> None:
+        """An agent has tables that name this life of ours, and plots which concern us."""
+        self._told_by.add(agent)
+        if not is_far_ahead(life, self._known_life):
+            self._known_life = max(self._known_life, life)
+        self.holdings.watch([plot for plot in plots if plot < self.plots.count])
+
+    @property
+    def informed(self) -> bool:
+        """Whether we have heard of every plot in which cells are granted to us: of each plot so many members have
+        answered that one of them has the newest usable table."""
+        if self._told_by.issuperset(self.plots.agents):
+            return True
+        every = map(self.plots.members, range(self.plots.count))
+        return all(len(self._told_by.intersection(of)) > len(of) - self.plots.majority for of in every)
+
+    def begin(self, dead: Sequence[int], chance: int) -> list[int]:
+        """Begin a new life, once those who could be asked have answered. Returns the lives to keep on file; nothing
+        may be said before they are.
+
+        dead    our lives that are on the file which this process has locked: they have ended
+        chance  a random number
+        """
+        life = first_life(max(self._known_life, *dead, 0), chance)
+        self.holdings.begin(life, dead)
+        return [*dead[1 - LIVES_KEPT :], life]
+
+    def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
+        """A warden's word to us. Returns the vehicles that have found their place."""
+        if not self.holdings.life or granted.plot not in self.holdings.plots:
+            return []
+        placed = self.holdings.hear_granted(granted, self._place, now_ns)
+        if self.holdings.heard_ns(granted.plot) == now_ns:
+            self._led_ns[granted.plot] = now_ns
+        return placed
+
+    def hear_token(self, peer: Peer, *, up: bool) -> None:
+        """The liveliness token of another process has risen or fallen."""
+        if peer.id == self.name:
+            (self._twins.appeared if up else self._twins.gone)(Peer("host", peer.id, peer.incarnation))
+
+    def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
+        """What our vehicles have to say now."""
+        return self.holdings.standings(wishes, now_ns) if self.holdings.life else []
+
+    def ended_alone(self, now_ns: int) -> bool:
+        """Whether a life that was replaced is to begin again, as its successor is gone. It holds and knows nothing
+        then: ask what is known of us, and `begin`."""
+        if not self.holdings.replaced:
+            return False
+        if self._twins.is_alive("host", self.name) or self._alone_since_ns is None:
+            self._alone_since_ns = now_ns
+        if now_ns - self._alone_since_ns < _ALONE_NS:
+            return False
+        self._alone_since_ns = None
+        self._known_life = max(self._known_life, self.holdings.newest)
+        self.holdings.end()
+        return True
+
+    def unled(self, now_ns: int) -> dict[int, str]:
+        """Why vehicles of ours wait: plot -> that no warden of it is heard."""
+        plots = self.holdings.plots
+        self._led_ns = {plot: self._led_ns.get(plot, now_ns) for plot in plots}
+        found = {}
+        for plot, heard_ns in self._led_ns.items():
+            if now_ns - heard_ns > _UNLED_NS and (vehicles := self.holdings.waiting(plot)):
+                members = self.plots.members(plot)
+                found[plot] = (
+                    f"plot {plot} has no warden: {len(vehicles)} of our vehicles there wait until "
+                    f"{self.plots.majority} of its members {', '.join(members)} run and reach each other and us"
+                )
+        return found

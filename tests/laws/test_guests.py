@@ -1,0 +1,220 @@
+"""Guests in right of way: robots that come, crash, come back and leave, agents that join while the swarm runs, and
+operators who say that one is gone, under the same faults. Nobody meets anybody, and nobody is lost. Each rule that
+decision 40 needs is taken out in turn, and the law must notice.
+
+More histories: `pytest tests/laws/test_guests.py -m seeds --seeds 0:2000`.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import pytest
+from support.guest_world import GuestProcess, GuestWorld
+from support.traffic_world import Faults
+
+from swarm.config.agents import agent_of
+from swarm.right_of_way.guest import Guest
+from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.host import Host
+from vehicle_agent.traffic.warden import SILENT_NS, Warden
+
+QUIET_S = 12.0
+SHAPES = (
+    (3, 4, 9, 9, 3, 1),
+    (4, 3, 10, 5, 3, 1),
+    (8, 3, 14, 7, 5, 2),
+    (2, 5, 8, 4, 2, 1),
+    (5, 4, 12, 4, 4, 1),
+    (1, 5, 7, 4, 2, 1),
+)
+"""(agents, vehicles each, side of the map, side of a plot, robots, added agents)."""
+
+
+def faults_of(chance: random.Random) -> Faults:
+    return Faults(
+        loss=chance.choice((0, 0.05, 0.3)),
+        repeat=chance.choice((0, 0.1)),
+        late=chance.choice((0, 0.02, 0.2)),
+        delay_ms=chance.choice((1, 50, 300)),
+        crashes=chance.choice((0, 0.5, 2)),
+        hangs=chance.choice((0, 0.3, 1)),
+        cuts=chance.choice((0, 0.3, 1)),
+        leaps=chance.choice((0, 0.3, 2)),
+        twins=chance.choice((0, 0.1, 0.3)),
+        quiet_s=QUIET_S,
+    )
+
+
+def world_of(seed: int, twins: bool = True) -> GuestWorld:
+    chance = random.Random(f"guests/{seed}")
+    shape, faults = chance.choice(SHAPES), faults_of(chance)
+    agents, each, size, side, robots, added = shape
+    return GuestWorld(seed, agents, each, size, side, faults if twins else replace(faults, twins=0), robots, added)
+
+
+def borders_of(seed: int) -> GuestWorld:
+    """Nine plots of three by three cells, and a network that repeats half of all and delays much for seconds."""
+    faults = Faults(repeat=0.5, late=0.3, delay_ms=50, crashes=1, twins=0.3, quiet_s=QUIET_S)
+    return GuestWorld(seed, 4, 3, 9, 3, faults, 5, 1)
+
+
+def test_guests_come_and_go_where_nothing_fails() -> None:
+    world = GuestWorld(1, 4, 3, 12, 6, Faults(quiet_s=30), 5, 2)
+    world.run(40.0)
+    assert world.collisions == []
+    assert world.entered > 10
+    assert world.left > 3
+    assert world.removed > 3
+
+
+@pytest.mark.seeds(12)
+def test_no_two_meet_and_all_move_again_when_it_is_quiet(seed: int) -> None:
+    world = world_of(seed, twins=False)
+    world.run(QUIET_S + 10.0)
+    before = dict(world.moves)
+    world.run(12.0)
+    assert world.collisions == []
+    guests = [f"{robot}-00" for robot in world.robots] + [id for each in world.added.values() for id in each]
+    vehicles = [id for each in world.spawns.values() for id in each]
+    assert [id for id in vehicles + guests if world.moves.get(id, 0) == before.get(id, 0)] == []
+    assert world.entered
+
+
+@pytest.mark.seeds(8)
+def test_no_two_meet_where_two_robots_have_one_name(seed: int) -> None:
+    """The one that is replaced stands still, and others may wait for it for ever."""
+    for world in (world_of(seed), borders_of(seed)):
+        world.run(QUIET_S + 8.0)
+        assert world.collisions == []
+
+
+def test_cells_of_a_guest_that_is_gone_are_free_again() -> None:
+    for seed in range(4):
+        world = world_of(seed, twins=False)
+        world.run(QUIET_S)
+        for robot in [each for each in world.processes if isinstance(each, GuestProcess)]:
+            world.gone.add(robot.agent)
+            robot.alive = False
+            world.processes.remove(robot)
+            world.at(0, partial(world.carry_away, robot, back=False))
+        world.run(10.0)
+        for process in world.processes:
+            for member in process.rights._members.values():
+                if member.warden is not None:
+                    held = [*member.stored.grants, *(each.agent for each in member.stored.shut if each.cells)]
+                    assert not set(map(agent_of, held)).intersection(world.robots)
+
+
+# --- the rules, each taken out ------------------------------------------------------------------------------
+
+
+def first_cells_are_granted_to_whoever_asks(patch: pytest.MonkeyPatch) -> None:
+    grant = Warden._grant
+
+    def generous(self: Warden, stand, ahead, held, taken):  # type: ignore[no-untyped-def]
+        entering = not stand.holds and list(ahead[:1]) == [stand.cell]
+        grant(self, stand, ahead, set() if entering else held, {} if entering else taken)
+
+    patch.setattr(Warden, "_grant", generous)
+
+
+def a_silent_guest_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
+    tick = Warden.tick
+
+    def leasing(self: Warden, now_ns: int):  # type: ignore[no-untyped-def]
+        for host in list(self._guests):
+            heard = self._hosts.get(host)
+            if heard is not None and now_ns - heard.spoke_ns > SILENT_NS:
+                for vehicle in self._granted_to(host):
+                    del self._grants[vehicle]
+                    self._count_guest(vehicle, 0)
+        return tick(self, now_ns)
+
+    patch.setattr(Warden, "tick", leasing)
+
+
+def a_new_life_speaks_before_it_knows_where_it_stands(patch: pytest.MonkeyPatch) -> None:
+    begin = Guest.begin
+
+    def rash(self: Guest, chance: int):  # type: ignore[no-untyped-def]
+        actions = begin(self, chance)
+        self._host.holdings._enters.clear()
+        return actions
+
+    patch.setattr(Guest, "begin", rash)
+
+
+def a_first_cell_is_taken_from_a_table_that_is_about_to_free_it(patch: pytest.MonkeyPatch) -> None:
+    first = Holdings._first_cell
+    patch.setattr(
+        Holdings, "_first_cell", lambda self, vehicle, cells, seen, place: first(self, vehicle, cells, (), place)
+    )
+    take = Holdings._take
+
+    def again(self: Holdings, view, granted, place):  # type: ignore[no-untyped-def]
+        view.seen = {vehicle: cells for vehicle, cells in view.seen.items() if vehicle in self._paths}
+        return take(self, view, granted, place)
+
+    patch.setattr(Holdings, "_take", again)
+
+
+def a_robot_that_is_replaced_says_that_it_has_ended(patch: pytest.MonkeyPatch) -> None:
+    def talkative(self: Guest, now_ns: int):  # type: ignore[no-untyped-def]
+        actions = self._host.standings({}, now_ns)
+        self._host.ended_alone(now_ns)
+        return actions
+
+    tick = Guest.tick
+    patch.setattr(Guest, "tick", lambda self, now_ns: (talkative if self.replaced else tick)(self, now_ns))
+
+
+def a_robot_drives_on_though_it_is_replaced(patch: pytest.MonkeyPatch) -> None:
+    hear = Host.hear_granted
+
+    def unfenced(self: Host, granted, now_ns):  # type: ignore[no-untyped-def]
+        self.holdings.life = max(self.holdings.life, granted.life)
+        return hear(self, granted, now_ns)
+
+    patch.setattr(Host, "hear_granted", unfenced)
+
+
+def a_cell_that_was_shut_for_a_guest_is_anybodys(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Warden, "_enter_again", lambda self, standing, opened: None)
+
+
+def an_operator_says_gone_of_one_that_still_stands_there(patch: pytest.MonkeyPatch) -> None:
+    carry = GuestWorld.carry_away
+
+    def careless(self: GuestWorld, process: GuestProcess, back: bool = True) -> None:
+        bodies = dict(process.disk.bodies)
+        carry(self, process, back)
+        process.disk.bodies.update(bodies)
+
+    patch.setattr(GuestWorld, "carry_away", careless)
+
+
+RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
+    first_cells_are_granted_to_whoever_asks,
+    a_silent_guest_loses_its_cells,
+    a_new_life_speaks_before_it_knows_where_it_stands,
+    a_first_cell_is_taken_from_a_table_that_is_about_to_free_it,
+    a_robot_that_is_replaced_says_that_it_has_ended,
+    a_robot_drives_on_though_it_is_replaced,
+    a_cell_that_was_shut_for_a_guest_is_anybodys,
+    an_operator_says_gone_of_one_that_still_stands_there,
+]
+
+
+@pytest.mark.parametrize("broken", RULES, ids=lambda rule: rule.__name__)
+def test_each_rule_is_needed(broken: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    broken(monkeypatch)
+    for seed in range(96):
+        world = (world_of, borders_of)[seed % 2](seed // 2)
+        world.run(QUIET_S)
+        if world.collisions:
+            return
+    raise AssertionError("96 histories without a collision: the law would not notice")

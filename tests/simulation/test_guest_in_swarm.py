@@ -1,0 +1,157 @@
+"""A vehicle that is not in the scenario, among the services of a whole swarm."""
+
+from __future__ import annotations
+
+import random
+
+from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import seeded
+from swarm.bus.bus import Event, Replied
+from swarm.config.agents import added_agent
+from swarm.right_of_way.guest_service import GuestService
+from swarm.right_of_way.life_file import MemoryLives
+from swarm.wire.messages.guests import Removed, RemoveVehicles
+from swarm.wire.topics import LEAVE
+from vehicle_agent.agent import Agent
+from vehicle_agent.service import AgentService
+
+
+class Rover:
+    """Drives about at random on what it is granted, among vehicles that chase targets."""
+
+    def __init__(self, simulation: Simulation, name: str, lives: MemoryLives, cell: int) -> None:
+        self.simulation = simulation
+        self.grid = simulation.terrain.grid
+        self.pace = simulation.terrain.pace_s_per_m.reshape(-1)
+        self.chance = random.Random(name)
+        self.on: int | None = None
+        self.moves = 0
+        self.warnings: list[str] = []
+        self.bus = simulation.network.bus(name, simulation.scenario.network.namespace, simulation.authenticator)
+        now_ns = simulation.scheduler.clock.now_ns()
+        self.service = GuestService(name, self.grid, now_ns, lives, self.bus, self.hear, self.warnings.append)
+        self.service.start(now_ns)
+        self.service.enter(cell, now_ns)
+
+    def hear(self, event: Event) -> None:
+        self.service.handle(event, self.simulation.scheduler.clock.now_ns())
+
+    def tick(self) -> None:
+        guest = self.service.guest
+        if guest is not None and guest.cells:
+            if len(guest.cells) > 1 and self.chance.random() < 0.5:
+                guest.left(guest.cells[0])
+                self.moves += 1
+            self.on = guest.cells[0]
+            path = list(guest.cells)
+            while len(path) < 5:
+                path.append(self.chance.choice([cell for cell in self.near(path[-1]) if cell not in path[-2:]]))
+            guest.want(path, self.near(self.on))
+        self.service.tick(self.simulation.scheduler.clock.now_ns())
+
+    def near(self, cell: int) -> list[int]:
+        return [other for _, other in self.grid.neighbours(cell) if self.pace[other] < 1e6]
+
+
+def drive(simulation: Simulation, rovers: list[Rover], seconds: float) -> None:
+    """Drive on, and look that all vehicles are on cells of their own."""
+    end_s = simulation.now_s + seconds
+    while simulation.now_s < end_s:
+        for rover in rovers:
+            rover.tick()
+        simulation.run_until(simulation.now_s + 0.1)
+        on = [rover.on for rover in rovers if rover.on is not None] + places(simulation)
+        assert len(on) == len(set(on))
+
+
+def places(simulation: Simulation) -> list[int]:
+    agents = [node.service.agent for node in simulation.nodes.values() if isinstance(node.service, AgentService)]
+    return [vehicle.cell for agent in agents for vehicle in agent.vehicles.values()]
+
+
+def test_a_guest_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_scenario() -> None:
+    simulation = Simulation(seeded(3))
+    simulation.run_until(3)
+    lives = [MemoryLives() for _ in range(3)]
+    # Where vehicles stand: they have to leave before it gets in.
+    rovers = [Rover(simulation, f"rover-{n}", lives[n], cell) for n, cell in enumerate(places(simulation)[:3])]
+    drive(simulation, rovers, 12)
+    assert all(rover.moves > 5 for rover in rovers)
+    assert not any(rover.warnings for rover in rovers)
+
+    stands = [rover.on for rover in rovers]
+    for rover in rovers:
+        rover.bus.close()  # as a process that dies
+    drive(simulation, [], 3)
+    assert not set(stands).intersection(places(simulation))
+    rovers = [Rover(simulation, f"rover-{n}", lives[n], on or 0) for n, on in enumerate(stands)]
+    drive(simulation, rovers, 1.0)
+    assert [rover.service.guest is not None and len(rover.service.guest.cells) > 0 for rover in rovers] == [
+        True
+    ] * 3
+    drive(simulation, rovers, 5)
+    assert all(rover.moves > 3 for rover in rovers)
+
+    for rover in rovers:
+        rover.service.leave(simulation.scheduler.clock.now_ns())
+        rover.on = None
+    drive(simulation, rovers, 1.5)
+    assert all(rover.service.guest is not None and rover.service.guest.gone for rover in rovers)
+
+
+def test_a_guest_must_not_have_the_name_of_an_agent() -> None:
+    simulation = Simulation(seeded(3))
+    simulation.run_until(2)
+    rover = Rover(simulation, "a0", MemoryLives(), 5)
+    simulation.run_until(4)
+    assert rover.service.guest is None
+    assert rover.warnings == ["a0 is an agent of this run's scenario: a guest needs another name"]
+
+
+def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anybody() -> None:
+    simulation = Simulation(seeded(4))
+    simulation.run_until(3)
+    group = simulation.scenario.groups[0].name
+    here = simulation.terrain.grid.row_col(places(simulation)[0])
+    node = simulation.add(added_agent(simulation.scenario, "extra", group, 3, here))
+    drive(simulation, [], 8)
+    agent = agent_of_node(node)
+    assert sorted(agent.vehicles) == ["extra-00", "extra-01", "extra-02"]
+    assert any(vehicle.target for vehicle in agent.vehicles.values())
+    before = {id: vehicle.cell for id, vehicle in agent.vehicles.items()}
+    drive(simulation, [], 5)
+    assert any(vehicle.cell != before[id] for id, vehicle in agent.vehicles.items())
+    assert set(before) <= set(simulation.recorder.observed.vehicles().ids)  # whoever watches sees them
+
+    simulation.crash(node.name)
+    drive(simulation, [], 5)
+    agent = agent_of_node(node)
+    assert sorted(agent.vehicles) == sorted(before)
+    asked: list[Removed] = []
+
+    def hear(event: Event) -> None:
+        if isinstance(event, Replied) and isinstance(event.message, Removed):
+            asked.append(event.message)
+
+    bus = simulation.network.bus("operator", simulation.scenario.network.namespace, simulation.authenticator)
+    one, other = "extra-01", next(iter(agent_of_node(simulation.nodes["agent-a0"]).vehicles))
+    bus.ask(LEAVE, RemoveVehicles(vehicles=[one]), hear, tag="x", agent="extra")
+    bus.ask(LEAVE, RemoveVehicles(vehicles=[other, "nobody"]), hear, tag="x", agent="a0")
+    drive(simulation, [], 2)
+    assert [each.left for each in asked] == [[one], [other]]
+    assert asked[1].unknown == ["nobody"]
+    assert one not in agent.vehicles
+    assert other not in agent_of_node(simulation.nodes["agent-a0"]).vehicles
+    bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
+    drive(simulation, [], 2)
+    assert node.service is not None
+    assert node.service.over  # type: ignore[attr-defined]
+    bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
+    drive(simulation, [], 0.5)
+    assert asked[-1].held == 0
+
+
+def agent_of_node(node: Node) -> Agent:
+    assert isinstance(node.service, AgentService)
+    return node.service.agent
