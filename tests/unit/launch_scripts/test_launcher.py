@@ -95,9 +95,9 @@ def test_a_part_of_a_swarm_that_has_no_process_is_refused_in_a_sentence(tmp_path
         run_swarm(options)
 
 
-def test_targets_that_somebody_else_tracks_need_no_driver() -> None:
+def test_the_referee_watches_also_where_somebody_else_tracks_all_targets() -> None:
     scenario = Scenario(targets=(TargetConfig(walk="external"),))
-    assert "targets-0" not in [spec.name for spec in processes_of(scenario)]
+    assert "targets-0" in [spec.name for spec in processes_of(scenario)]
 
 
 def test_the_router_starts_first_and_ends_last() -> None:
