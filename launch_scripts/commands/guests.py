@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from swarm.wire.messages.processes import RunInfo
 
 app = typer.Typer(
-    help="Let vehicles join a running swarm, and leave it.", no_args_is_help=True, pretty_exceptions_enable=False
+    help="Let vehicles join a running swarm, and leave it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
 )
 
 _WITHIN_S = 5.0
@@ -105,6 +108,7 @@ def gone(
     """Say that vehicles of a dead process are not on the map any more, so that others may drive there.
 
     Only a person can know: a robot whose program has died stands where it stands. Never say it of one that does.
+    Between machines it takes the guest's own certificate.
     """
     from swarm.errors import BusError
     from swarm.grid import GridSpec
