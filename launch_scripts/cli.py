@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from launch_scripts.commands import query, roles
+from launch_scripts.commands import orders, query, roles
 from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Runs, Tls, spread
 from swarm.errors import StoreError, SwarmError
 from swarm.ranks import HIGHEST_RANK
@@ -305,6 +305,7 @@ def chaos(
 
 app.add_typer(roles.app)
 app.add_typer(query.app)
+app.add_typer(orders.app)
 
 
 MOUNTED: dict[str, str] = {}
@@ -332,7 +333,12 @@ _mount(
 )
 _mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swarm terrain --help`.")
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
-_mount("vehicle", "launch_scripts.commands.guests", "Add and remove vehicles. See `swarm vehicle --help`.")
+_mount("zone", "launch_scripts.commands.zone", "Close areas while the swarm runs. See `swarm zone --help`.")
+_mount("target", "launch_scripts.commands.target", "Add, move and remove targets. See `swarm target --help`.")
+_mount("vehicle", "launch_scripts.commands.guests", "Add, remove and stop vehicles. See `swarm vehicle --help`.")
+_mount(
+    "plugins", "launch_scripts.commands.plugins", "Your own sensors, walks, and so on. See `swarm plugins --help`."
+)
 _mount(
     "deploy",
     "launch_scripts.commands.deploy",

@@ -27,7 +27,7 @@ find_python() {
 wanted() { cat "$root/uv.lock" "$root/pyproject.toml" "$root/launch_scripts/install.sh" | cksum; }
 
 sync_with() { (cd "$root" && env -u VIRTUAL_ENV UV_PROJECT_ENVIRONMENT="$venv" UV_PYTHON_DOWNLOADS=never \
-    "$@" sync --frozen --inexact --quiet --python "$python"); }
+    "$@" sync --frozen --extra all --inexact --quiet --python "$python"); }
 
 install() {
     if [[ -x $venv/bin/python && -f $stamp && $(<"$stamp") == "$(wanted)" ]] && suits "$venv/bin/python"; then

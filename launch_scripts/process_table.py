@@ -39,12 +39,14 @@ class ProcessSpec:
 
     entry    `module:function`, called as function(setup, stop_when)
     restart  whether it is started again when it crashes
+    added    an operator's order started it: the run goes on without it, whatever keeps it from starting
     """
 
     role: str
     id: str
     entry: str
     restart: Restart = "always"
+    added: bool = False
 
     @property
     def name(self) -> str:
@@ -61,7 +63,7 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES, rank: int |
         "keeper": ["0"],
         "monitor": ["0"],
         "planner": scenario.target_ids,
-        "targets": ["0"] if any(target.is_simulated for target in scenario.targets) else [],
+        "targets": ["0"],  # the referee also where all targets are external
         "agent": [plan.id for plan in plan_agents(scenario)],
     }
     standbys = {"planner": scenario.standbys.planner, "targets": scenario.standbys.targets}
@@ -73,6 +75,11 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES, rank: int |
         if rank in (None, each) or role not in standbys
         for job in jobs[role]
     ]
+
+
+def planner_spec(id: str) -> ProcessSpec:
+    """The planner of a target that was added while the swarm runs, or one of its standbys."""
+    return ProcessSpec("planner", id, ENTRIES["planner"], added=True)
 
 
 LAUNCHER = "launcher"

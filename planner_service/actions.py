@@ -32,5 +32,14 @@ class FindCorridors:
     search: CorridorSearch
 
 
-Action = GrowTree | FindCorridors | PushedRoute | PlannerStatus
+@dataclass(frozen=True, slots=True)
+class Tell:
+    """A sentence for people who watch the run; `cell` is where, if anywhere."""
+
+    kind: str
+    text: str
+    cell: int | None = None
+
+
+Action = GrowTree | FindCorridors | PushedRoute | PlannerStatus | Tell
 """What a planner wants done: a growth run, corridors found, a message published."""

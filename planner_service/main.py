@@ -20,6 +20,7 @@ from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, end_with
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +38,9 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     prepared = prepared_costs(setup.run_dir, terrain, scenario.planner, kept_key(scenario))
     clock = MonotonicClock()
     inbox = Inbox()
+    network = scenario.network
     with (
-        open_bus(scenario.network, patient=True) as bus,
+        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
         closing(ThreadWorker("grow-tree", inbox)) as worker,
     ):
         service = PlannerService(

@@ -11,13 +11,13 @@ from planner_service.followers import Follower, Followers
 from planner_service.full_growth import GrownTree
 from planner_service.gaps import GapStatistics
 from planner_service.target_tree import MODEL_NS_PER_CELL, TargetTree
+from planner_service.target_watch import TargetWatch
 from planner_service.tree.corridors import CorridorSearch, CorridorShelf
 from planner_service.update import Update
 from shared_map.cost_map import CostMap, merged
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window
-from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import (
@@ -59,6 +59,7 @@ class Planner:
     newest_mark_ns  stamp of the newest mark that the map has taken in since this was last asked
     shelf           where the planners of a machine leave corridors for each other
     leads           false for a standby, which keeps its tree up to date, pushes nothing and tells no status
+    time_scale      seconds on the terrain per second: by it a target is taken for teleported
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class Planner:
         newest_mark_ns: Callable[[], int | None] = lambda: None,
         shelf: CorridorShelf | None = None,
         leads: bool = True,
+        time_scale: float = 1.0,
     ) -> None:
         self.target = target
         self.leads = leads
@@ -89,9 +91,9 @@ class Planner:
         self._shelf = shelf
         self._push_ns = int(config.push_s * NS_PER_S)
         self.followers = Followers(target, self._grid, FOLLOWER_LEASE_NS, route_cells)
-        # The newest pose heard, and which poses of the tracker are news; the tick takes it in.
-        self._pose: TargetPose | None = None
-        self._poses = Newest(silence_ns=POSE_SILENCE_NS)
+        # Where the target is; the tick takes it in.
+        self._watch = TargetWatch(target, self._grid, counters, time_scale)
+        self._watch.counts = leads
         # (target cell, map version) that the tree was last told.
         self._told: tuple[int, int] | None = None
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
@@ -118,18 +120,23 @@ class Planner:
     def lead(self, leads: bool) -> None:
         """Take over, or leave it to another. A planner that takes over does not know which routes followers have:
         it pushes one to each."""
-        self.leads = leads
+        self.leads = self._watch.counts = leads
         if leads:
             self.followers.forget_routes()
 
-    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Note where the target's tracker says it is, if that is news. The next tick takes it in."""
-        if pose.target == self.target and self._poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
-            self._pose = pose
+    def set_pace(self, cpu_budget: float, push_s: float) -> None:
+        """Share of a core that this planner may use, and how often it may push a vehicle newer routes."""
+        self._push_ns = int(push_s * NS_PER_S)
+        self.tree.set_budget(cpu_budget)
 
-    def set_pose(self, pose: TargetPose) -> None:
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
+        """Note where a tracker says the target is, if that tracker owns it. The next tick takes it in."""
+        if pose.target == self.target:
+            self._watch.hear(pose, now_ns)
+
+    def set_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Note where the target is, by the best sighting of it: sightings are ordered before they come here."""
-        self._pose = pose
+        self._watch.see(pose, now_ns)
 
     def hear_chasers(self, chasers: Chasers, now_ns: int) -> None:
         """Note which vehicles of an agent chase this target, and from where."""
@@ -150,7 +157,9 @@ class Planner:
         if self.tree.ready and self.tree.wants_corridors:
             actions.append(FindCorridors(self.tree.corridor_job(self._shelf)))
         self.followers.drop_silent(now_ns)
+        told = self._watch.take_told(now_ns)
         if self.leads:
+            actions.extend(told)
             actions.extend(self._pushes(now_ns))
         if self.leads and now_ns >= self._status_due_ns:
             self._status_due_ns = now_ns + STATUS_NS
@@ -159,10 +168,11 @@ class Planner:
 
     def adopt(self, grown: GrownTree, took_ns: int, now_ns: int) -> list[Action]:
         """Replace the tree by what the worker grew, and make up for what happened meanwhile."""
-        if self._growing_since_ns is None or self._pose is None:
+        pose = self._watch.pose
+        if self._growing_since_ns is None or pose is None:
             return []
         snapshot_ns = self._growing_since_ns
-        news = (self._pose.cell, self._cost_map.version)
+        news = (pose.cell, self._cost_map.version)
         dirty = self._take_dirty()
         self._growing_since_ns = None
         update = self.tree.adopt(
@@ -192,13 +202,19 @@ class Planner:
         """Whether there is nothing to answer from now, and will be once the growth under way is adopted."""
         return not self.tree.ready and self._growing_since_ns is not None
 
+    @property
+    def knows_map(self) -> bool:
+        """Whether routes go by the map as it is now."""
+        return self._told is None or self._told[1] == self._cost_map.version
+
     # --- the tree -----------------------------------------------------------------------------------------------
 
     def _keep_up(self, now_ns: int) -> list[Action]:
         """Take in the newest pose and all map changes since the last time, if there are any."""
-        if self._pose is None:
+        pose = self._watch.pose
+        if pose is None:
             return []  # the first growth takes the map as it is then, whatever changed before
-        now_known = (self._pose.cell, self._cost_map.version)
+        now_known = (pose.cell, self._cost_map.version)
         if now_known != self._told:
             self._take_in(now_known, now_ns)
         if self._wants_full and self._growing_since_ns is None:
@@ -288,6 +304,8 @@ class Planner:
             rows=self._grid.rows,
             cols=self._grid.cols,
             routes=routes.columns(),
+            pose_age_s=self._watch.age_s(now_ns),
+            tracker_lost=self._watch.lost(now_ns),
         )
 
     def _improvable(self, cells: list[int], routes: RouteBatch) -> list[int]:
@@ -330,6 +348,8 @@ class Planner:
             map_version=max(self.tree.map_version, 0),
             tree_age_ms=self._age_ms(now_ns),
             cost_to_go_s=pack_column(self.tree.cost_to_go_at(cells), "<f4"),
+            pose_age_s=self._watch.age_s(now_ns),
+            tracker_lost=self._watch.lost(now_ns),
         )
 
     def _cells(self, request: RouteRequest | CostRequest) -> list[int]:
@@ -376,14 +396,14 @@ class Planner:
         )
 
     def status(self, now_ns: int) -> PlannerStatus:
-        window, counts = self._window, self.counters.counts
+        window, counts, pose = self._window, self.counters.counts, self._watch.pose
         mean, p95, highest = self._gaps.last or (None, None, None)
         return PlannerStatus(
             target=self.target,
             incarnation=self._incarnation,
             stamp_ns=now_ns,
             strategy=self._config.strategy,
-            target_cell=None if self._pose is None else self._pose.cell,
+            target_cell=None if pose is None else pose.cell,
             map_version=max(self.tree.map_version, 0),
             tree_age_ms=self._age_ms(now_ns),
             window=[] if window.empty else [window.row0, window.col0, window.row1, window.col1],
@@ -392,6 +412,9 @@ class Planner:
             growth_ms=self._growth_ms,
             routes_served=counts["routes_served"],
             following=len(self.followers),
+            tracker=None if pose is None else pose.tracker,
+            pose_age_s=self._watch.age_s(now_ns),
+            tracker_lost=self._watch.lost(now_ns),
             gap_mean=mean,
             gap_p95=p95,
             gap_max=highest,

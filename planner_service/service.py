@@ -6,10 +6,11 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
-from planner_service.actions import Action, FindCorridors, GrowTree, Refusal
+from planner_service.actions import Action, FindCorridors, GrowTree, Refusal, Tell
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.prepared_costs import PreparedCosts
+from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from planner_service.tree.corridors import CorridorSearch
 from shared_map.cost_map import CostMap
@@ -21,10 +22,13 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, Bus, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
+from swarm.plugins.find import named_plugin
 from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
+from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostRequest, PlannerStatus, PushedRoute, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Chasers
@@ -58,6 +62,7 @@ class PlannerService:
     ) -> None:
         scenario = setup.scenario
         self._target = job_of(setup.id)
+        self._scenario = scenario
         self._bus = bus
         self._post = post
         self._worker = worker
@@ -70,7 +75,13 @@ class PlannerService:
         self._sightings = Sightings(filter)
         self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
-        tree = TargetTree(terrain.grid, scenario.planner, terrain.climb, all_kernels, has_worker=True)
+        self._faults: list[str] = []
+        """What the strategy's plug-in did wrong and nobody has been told yet."""
+        world = StrategyWorld(self._target, terrain.grid, scenario.planner)
+        chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
+        tree = TargetTree(
+            terrain.grid, scenario.planner, terrain.climb, all_kernels, has_worker=True, chosen_by=chosen_by
+        )
         if prepared is not None:
             tree.share(prepared.cell_cost)
         self._planner = Planner(
@@ -85,7 +96,13 @@ class PlannerService:
             newest_mark_ns=self._replica.take_newest_stamp_ns,
             shelf=prepared,
             leads=False,
+            time_scale=scenario.time_scale,
         )
+        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obeyed_version = 0
+        self._removed = False
+        """Whether its target was removed: then it serves nobody."""
+        self._now_ns = 0
         self._served = False
         self._held: deque[tuple[int, Asked]] = deque()
         """Queries that came while there was nothing to answer from, and when; the oldest first."""
@@ -102,24 +119,25 @@ class PlannerService:
         else:
             self._bus.collect(POSE, target=self._target)
         self._bus.collect(CHASERS, target=self._target)
+        self._obedience.start(now_ns)
         self._candidacy.start()
         self._lead(self._candidacy.leads, now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if self._candidacy.handle(event, now_ns):
+        if self._candidacy.handle(event, now_ns) or self._obedience.handle(event, now_ns):
             return
         match event:
             case Heard(message=Sighted() as sighted):
                 if self._sightings.hear(sighted, now_ns):
                     for seen in self._sightings.best(now_ns).values():
-                        self._planner.set_pose(pose_of(seen))
+                        self._planner.set_pose(pose_of(seen), now_ns)
             case Asked(request=RouteRequest() | CostRequest()):
                 self._held.append((now_ns, event))
                 self._answer(now_ns)
             case WorkDone(tag=tag, result=GrownTree() as grown, took_ns=took_ns) if tag == _GROW:
-                self._perform(self._planner.adopt(grown, took_ns, now_ns))
+                self._perform(self._planner.adopt(grown, took_ns, now_ns), now_ns)
                 self._answer(now_ns)
             case WorkDone(tag=tag, result=CorridorSearch() as search) if tag == _SEARCH:
                 self._searching = False
@@ -138,8 +156,11 @@ class PlannerService:
             self._planner.hear_chasers(heard.message, now_ns)
         self._sync.tick(now_ns)
         self._sightings.expire(now_ns)
-        self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns), now_ns)
-        self._perform(self._planner.tick(now_ns))
+        self._obey()
+        self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns) and not self._removed, now_ns)
+        self._perform(self._planner.tick(now_ns), now_ns)
+        self._now_ns = now_ns
+        self._obedience.tick(now_ns)
         self._answer(now_ns)
         if self._search is not None and not self._searching:
             self._searching = True
@@ -149,6 +170,7 @@ class PlannerService:
         if self._planner.tree.ready and not self._served:
             self._served = True
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
+        self._member.tell_faults(self._faults, now_ns)
         self._member.tick(now_ns)
 
     def _answer(self, now_ns: int) -> None:
@@ -166,6 +188,23 @@ class PlannerService:
             else:
                 event.answer(reply, target=self._target)
             event.end()
+
+    def _obey(self) -> None:
+        """Go by what is ordered."""
+        book, scenario = self._obedience.book, self._scenario
+        if book.version == self._obeyed_version:
+            return
+        self._obeyed_version = book.version
+        self._removed = self._target not in book.targets(scenario)
+        self._planner.set_pace(
+            book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
+            book.setting("planner.push_s", scenario.planner.push_s),
+        )
+
+    def _obeys(self, order: Obey) -> bool:
+        if order.subject is not None:
+            return self._obeyed_version == self._obedience.book.version
+        return self._sync.holds(order.author, order.sets, self._now_ns) and self._planner.knows_map
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()
@@ -188,7 +227,7 @@ class PlannerService:
                 self._bus.unserve(topic, target=self._target)
         self._candidacy.tell(self._member, now_ns)
 
-    def _perform(self, actions: list[Action]) -> None:
+    def _perform(self, actions: list[Action], now_ns: int) -> None:
         for action in actions:
             match action:
                 case GrowTree(job):
@@ -199,3 +238,6 @@ class PlannerService:
                     self._bus.publish(PUSHED_ROUTE, pushed, agent=agent_of(vehicle), vehicle=vehicle)
                 case PlannerStatus() as status:
                     self._bus.publish(STATUS, status, target=self._target)
+                case Tell(kind, text, cell):
+                    log.info("%s: %s", kind, text)
+                    self._member.note(now_ns, kind, text, cell)

@@ -1,19 +1,23 @@
 """The strategies by which a tree follows its target: one table, a row per strategy, in the terms of the paper.
 
-A strategy says what is grown when the target moves, how wide, when the whole tree is due, and whether far cells are
+A row says what is grown when the target moves, how wide, when the whole tree is due, and whether far cells are
 thinned out. `TargetTree` and `Planner` ask the row that is in force and compare no names: a new strategy is a row
-here, and its name in `swarm.config.scenario.Strategy`. Sections are those of Wan et al.
+here, and its name in `swarm.config.scenario.Strategy`, or a plug-in. Sections are those of Wan et al.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from enum import Enum
-from typing import Literal
+from functools import partial
+from typing import Literal, Protocol
 
 from planner_service.tree.windows import AHEAD
-from swarm.config.scenario import Strategy
+from swarm.config.scenario import PlannerConfig
+from swarm.grid import GridSpec
+from swarm.plugins.door import Door, Nonsense, Tell
+from swarm.plugins.find import Plugin
 
 
 class OnMove(Enum):
@@ -72,8 +76,49 @@ class StrategyRow:
             or self.thins_far_cells
         )
 
+    def row(self, growths: Growths) -> StrategyRow:
+        """Itself: a strategy of one row."""
+        return self
 
-STRATEGIES: Mapping[Strategy, StrategyRow] = {
+
+@dataclass(frozen=True, slots=True)
+class Growths:
+    """What a strategy chooses by.
+
+    full_ns       CPU time that a full growth takes: a model's figure until one has been measured
+    budget_ns     CPU time that a tick may take, by `planner.cpu_budget`
+    widest_cells  how far the widest window reaches that is grown without a worker
+    map_cells     cells of the map
+    """
+
+    full_ns: float
+    budget_ns: float
+    widest_cells: int
+    map_cells: int
+
+
+class Strategy(Protocol):
+    """Says what a planner grows. A plug-in is made as `Name(world: StrategyWorld, options)`, or a `StrategyRow`."""
+
+    def row(self, growths: Growths) -> StrategyRow:
+        """The row in force from now on. Asked at the start, and whenever one of these has changed."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StrategyWorld:
+    """What a strategy is made with.
+
+    target  id of the planner's target
+    config  the planner's settings
+    """
+
+    target: str
+    grid: GridSpec
+    config: PlannerConfig
+
+
+ROWS: Mapping[str, StrategyRow] = {
     "full": StrategyRow(OnMove.WHOLE_TREE),
     "variable_range": StrategyRow(OnMove.BLOCK_WINDOW),
     "multi_resolution": StrategyRow(
@@ -82,7 +127,7 @@ STRATEGIES: Mapping[Strategy, StrategyRow] = {
     "variable_range+multi_resolution": StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True),
     "rotation": StrategyRow(OnMove.SCHEDULED_WINDOW, FullGrowth.EVERY_FEW_MOVES, renews_loose_bounds=True),
 }
-"""Every strategy but `auto`, which goes through the rows of `STAGES`."""
+"""Every strategy of one row; `auto` goes through those of `STAGES`."""
 
 Stage = Literal["exact", "rotate", "coarsen"]
 
@@ -99,32 +144,63 @@ HYSTERESIS = 0.7
 """`auto` returns to the better stage only below this share of the budget: times are noisy."""
 
 
-class AutoStage:
+class Auto:
     """Which stage `auto` is in: a function of the times observed alone, so that a model decides alike everywhere.
 
-    budget_ns  CPU time that a tick may take
-    stage      what to do now; `observe` alone changes it
+    stage  what to do now; `row` alone changes it
     """
 
-    def __init__(self, budget_ns: float) -> None:
-        self.budget_ns = budget_ns
+    def __init__(self) -> None:
         self.stage: Stage = "exact"
 
-    def observe(self, full_ns: float, widest: int) -> None:
-        """Choose the stage by what a full growth takes, and by how far, in cells, the widest window reaches."""
-        slowest_exact = self.budget_ns
+    def row(self, growths: Growths) -> StrategyRow:
+        full_ns, slowest_exact = growths.full_ns, growths.budget_ns
         # The target comes one cell a tick, and a window is due once it has come an `AHEAD`th of its width.
-        slowest_rotation = max(self.budget_ns * widest / AHEAD, slowest_exact)
+        slowest_rotation = max(growths.budget_ns * growths.widest_cells / AHEAD, slowest_exact)
         if full_ns > slowest_rotation * (HYSTERESIS if self.stage == "coarsen" else 1.0):
             self.stage = "coarsen"
         elif full_ns > slowest_exact * (1.0 if self.stage == "exact" else HYSTERESIS):
             self.stage = "rotate"
         else:
             self.stage = "exact"
+        return STAGES[self.stage]
 
 
-def row_of(strategy: Strategy, stage: Stage, *, only_whole: bool) -> StrategyRow:
-    """The row in force. Where uphill is not downhill, or other kernels are not compiled yet, only whole trees are
-    grown."""
-    row = STAGES[stage] if strategy == "auto" else STRATEGIES[strategy]
-    return replace(STAGES["exact"], renews_loose_bounds=row.renews_loose_bounds) if only_whole else row
+STRATEGIES: Mapping[str, Callable[[], Strategy]] = {
+    "auto": Auto,
+    **{name: partial(replace, row) for name, row in ROWS.items()},
+}
+"""Every built-in strategy."""
+
+
+def strategy_of(plugin: Plugin, world: StrategyWorld, tell: Tell) -> Strategy:
+    """The strategy that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+    if plugin.factory is None:
+        return STRATEGIES[plugin.named.name]()
+    return PluginStrategy(plugin.make(world), Door(plugin, tell))
+
+
+class PluginStrategy:
+    """The rows of a plug-in; whole trees, which are exact, once it has failed."""
+
+    def __init__(self, strategy: Strategy, door: Door) -> None:
+        self._strategy = strategy
+        self._door = door
+
+    def row(self, growths: Growths) -> StrategyRow:
+        return self._door.ask(lambda: self._strategy.row(growths), _checked, lambda: STAGES["exact"])
+
+
+def _checked(row: object) -> StrategyRow:
+    if type(row) is not StrategyRow:
+        raise Nonsense(f"{type(row).__name__}, expected a StrategyRow")
+    for field in fields(StrategyRow):
+        wanted, found = type(getattr(STAGES["exact"], field.name)), getattr(row, field.name)
+        if type(found) is not wanted:
+            raise Nonsense(f"a StrategyRow whose {field.name} is {found!r}, expected a {wanted.__name__}")
+    return row
+
+
+def whole_trees_only(row: StrategyRow) -> StrategyRow:
+    """A row where uphill is not downhill, or other kernels are not compiled yet: only whole trees are grown."""
+    return replace(STAGES["exact"], renews_loose_bounds=row.renews_loose_bounds)

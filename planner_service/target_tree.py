@@ -15,7 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.full_growth import GrownTree, can_be_root, growth_job, offered_gaps
-from planner_service.strategy import AutoStage, FullGrowth, OnMove, StrategyRow, WidestWindow, row_of
+from planner_service.strategy import (
+    STRATEGIES,
+    FullGrowth,
+    Growths,
+    OnMove,
+    Strategy,
+    StrategyRow,
+    WidestWindow,
+    whole_trees_only,
+)
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.corridors import CorridorGraph, CorridorSearch, CorridorShelf, CorridorUpkeep
 from planner_service.tree.cost_grid import Changes
@@ -56,6 +65,7 @@ class TargetTree:
                  repairs and corridors give way to whole trees, so that nothing waits for a compilation
     has_worker   whether a growth that takes longer than `INLINE_NS` is left to `full_job`. Until that is adopted
                  the tree leads where it led, and says so by `target_cell`; where it is of no use, `ready` is false
+    chosen_by    the strategy; the built-in one that `config` names if not given
     last_gaps    float64, driven cost over optimum of what was offered to each followed vehicle, measured by the
                  last `adopt`; empty before
     """
@@ -68,6 +78,7 @@ class TargetTree:
         all_kernels: Callable[[], bool] = lambda: True,
         *,
         has_worker: bool = False,
+        chosen_by: Strategy | None = None,
     ) -> None:
         self.target_cell: int | None = None
         self.map_version = -1
@@ -97,16 +108,24 @@ class TargetTree:
         self._full_ns = self.measured_model_ns()
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
         self._schedule = WindowSchedule(grid, self._narrowest)
-        self._auto = AutoStage(config.cpu_budget * 1e9 / config.tick_hz)
-        self._auto.observe(self._full_ns, self._widest)
+        self._budget_ns = config.cpu_budget * 1e9 / config.tick_hz
+        self._chosen_by = chosen_by if chosen_by is not None else STRATEGIES[config.strategy]()
+        # The row that the strategy has chosen: by its model until a growth has been measured.
+        self._row = StrategyRow(OnMove.WHOLE_TREE)
+        self._choose_row()
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
 
     @property
     def strategy(self) -> StrategyRow:
-        """The row in force now; under `auto` it changes with `observe_full_ns`."""
+        """The row in force now; it changes with `observe_full_ns`, as under `auto`."""
         only_whole = self._costs.directed or not self._all_kernels()
-        return row_of(self._config.strategy, self._auto.stage, only_whole=only_whole)
+        return whole_trees_only(self._row) if only_whole else self._row
+
+    def set_budget(self, cpu_budget: float) -> None:
+        """The share of one core that this tree may take from now on, under `auto`."""
+        self._budget_ns = cpu_budget * 1e9 / self._config.tick_hz
+        self._choose_row()
 
     def share(self, cell_cost: Floats) -> None:
         """Begin with the cell costs of the map as it is before any mark, which other processes share; `update` is
@@ -242,10 +261,13 @@ class TargetTree:
         return Update("forced", window, grown_cells, wants_full=not self._job_out)
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """What a full growth really took, for `auto` to choose by; not one that found corridors too. A simulation
-        does not call it."""
+        """What a full growth really took, for the strategy to choose by; not one that found corridors too. A
+        simulation does not call it."""
         self._full_ns = max(1, took_ns)
-        self._auto.observe(self._full_ns, self._widest)
+        self._choose_row()
+
+    def _choose_row(self) -> None:
+        self._row = self._chosen_by.row(Growths(self._full_ns, self._budget_ns, self._widest, self._grid.cells))
 
     def measured_model_ns(self) -> int:
         """What one full growth is taken to cost in a simulation: a constant per cell, the same on every machine."""
@@ -414,7 +436,7 @@ class TargetTree:
         if row.full_growth is FullGrowth.WITHIN_BUDGET:
             # As often as the budget allows, but no sooner than the whole map were due as a window.
             come = self._grid.distance_cells(self._full_root, self._tree.root)
-            return 2 * AHEAD * come >= self._side and self._moves * self._auto.budget_ns >= self._full_ns
+            return 2 * AHEAD * come >= self._side and self._moves * self._budget_ns >= self._full_ns
         return False
 
     def _inside(self, cells: Any) -> NDArray[np.int64]:

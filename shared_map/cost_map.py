@@ -125,6 +125,17 @@ class CostMap:
     def snapshot(self) -> CostSnapshot:
         return CostSnapshot(self.pace_s_per_m.copy(), self.version)
 
+    def padded(self, window: Window) -> Window:
+        """A window and the cells around it that inflation may reach from there."""
+        return self._padded(window, max(len(self._halves) - 1, 0))
+
+    def inflated(self, ground: Floats, window: Window) -> Floats:
+        """The pace in a window, were this the ground: float32 (rows, cols) of the whole grid."""
+        outer = self.padded(window)
+        wide = inflate(ground[outer.row0 : outer.row1, outer.col0 : outer.col1], self._halves)
+        row0, col0 = window.row0 - outer.row0, window.col0 - outer.col0
+        return wide[row0 : row0 + window.row1 - window.row0, col0 : col0 + window.col1 - window.col0]
+
     def _last_of_each(
         self, where: NDArray[np.int64], kinds: NDArray[np.uint8], paces: Floats
     ) -> tuple[NDArray[np.int64], Floats]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from shared_map.replication.filter import MarkFilter
 from swarm.clock import NS_PER_S
 from swarm.liveness import POSE_SILENCE_NS
+from swarm.wire.fields import LONGEST_LEASE_S
 from swarm.wire.messages.targets import Sighted, TargetPose
 
 LONGEST_NS = 120 * NS_PER_S
@@ -78,12 +79,14 @@ class Sightings:
 
 
 def pose_of(sighted: Sighted) -> TargetPose:
-    """A sighting in the form of a tracker's message, numbered by its stamp."""
+    """A sighting in the form of a tracker's message, numbered by its stamp; its lease is for how long it stands."""
+    lasts_s = (sighted.until_ns - sighted.stamp_ns) / NS_PER_S
     return TargetPose(
         target=sighted.target,
         incarnation=0,
         seq=sighted.stamp_ns,
         stamp_ns=sighted.stamp_ns,
+        lease_s=min(max(lasts_s, 0.0), LONGEST_LEASE_S),
         cell=sighted.cell,
         x_m=sighted.x_m,
         y_m=sighted.y_m,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -17,19 +17,23 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec, Window, walk
-from swarm.liveness import POSE_SILENCE_NS, Newest
 from swarm.right_of_way.holdings import Holdings, Wish
+from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
-from vehicle_agent.assignment import AskCosts, Assignment
+from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
+from vehicle_agent.bodies import Bodies
+from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
+from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
 
 _LONGEST_STEP_S = 0.5
 _WISH_LASTS_NS = NS_PER_S
 """A wish that has not changed is made anew so often, as it tells the vehicle's age."""
+_STAYS = Wish()
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
@@ -77,8 +81,12 @@ class Agent:
     plan       which vehicles, of which group
     local_map  the agent's map
     holdings   the cells that the vehicles may stand on and enter
+    bodies     what they must not drive into, though it speaks no right of way
+    assigner   which target each vehicle goes for; evenly spread if not given
+    dynamics   how fast vehicles drive; as the ground allows if not given
 
     wishes     what to ask of wardens, as of the last `decide`
+    stopped    whether an operator wants a vehicle to stand
     """
 
     def __init__(
@@ -88,6 +96,9 @@ class Agent:
         local_map: LocalMap,
         sensor: Sensor,
         holdings: Holdings,
+        bodies: Bodies | None = None,
+        assigner: Assigner | None = None,
+        dynamics: PluginDynamics | None = None,
     ) -> None:
         self.plan = plan
         self.vehicles: dict[str, Vehicle] = {}
@@ -95,20 +106,26 @@ class Agent:
         self.holdings = holdings
         self.wishes: dict[str, Wish] = {}
         self.blocked_ticks = 0
+        self.stopped: Callable[[str], bool] = lambda vehicle: False
         self._config = scenario.vehicles
         self._time_scale = scenario.time_scale
         self._map = local_map
+        self.bodies = bodies or Bodies(local_map.grid)
         self._sensor = sensor
+        self._dynamics = dynamics
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
-        self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied)
+        self._steering = Steering(
+            grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied, self.bodies
+        )
+        self.detours = Detours(grid, pace, self._steering.steps, self.bodies)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
-        self._newest_poses = Newest(silence_ns=POSE_SILENCE_NS)
+        self._trackings = Trackings(local_map.grid)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
-        self._assignment = Assignment(self.targets, self._config.reassign_s, chance.random())
+        self._assignment = Assignment(self.targets, assigner or Spread(), config.reassign_s, chance.random())
         self._unassigned = False
         """Whether vehicles have been placed that nobody has asked a target for yet."""
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
@@ -119,6 +136,25 @@ class Agent:
         self._look_from: dict[int, None] = {}
         self._wished: dict[str, tuple[object, ...]] = {}
         """Vehicle under way -> what its wish was made of."""
+
+    # --- what operators order ---------------------------------------------------------------------------------
+
+    def set_targets(self, targets: Sequence[str], now_ns: int) -> None:
+        """The targets that the vehicles may go for from now on. Those that go for another get one of these."""
+        if list(targets) == self.targets:
+            return
+        self.targets = list(targets)
+        self._assignment.set_targets(self.targets)
+        for vehicle in self.vehicles.values():
+            if vehicle.target is not None and vehicle.target not in self.targets:
+                vehicle.release()
+                self._stop_soon(vehicle)
+        self._assignment.ask_soon(now_ns)
+
+    def set_pace(self, time_scale: float, reassign_s: float) -> None:
+        """Seconds on the terrain per second, and how often vehicles ask which target is the cheapest."""
+        self._time_scale = time_scale
+        self._assignment.set_period(reassign_s)
 
     # --- where vehicles start -------------------------------------------------------------------------------
 
@@ -143,6 +179,10 @@ class Agent:
         self.wishes.clear()
         self._wished.clear()
 
+    def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
+        """Cells that only an operator's zone closes, and how many steps it is from each out of it."""
+        self._steering.ways_out = ways_out
+
     @property
     def places(self) -> list[int]:
         """The cells that our vehicles hold."""
@@ -153,9 +193,13 @@ class Agent:
     def begin_drive(self, now_ns: int) -> None:
         """Give every vehicle the time that has passed since it was last driven."""
         elapsed_s = 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / NS_PER_S
+        if self.bodies.any and self.bodies.was_deaf(elapsed_s):
+            elapsed_s = 0.0  # what bodies have said meanwhile may not have been read yet
         self._driven_ns = now_ns
         seconds = min(elapsed_s, _LONGEST_STEP_S) * self._time_scale
         self._left_s = dict.fromkeys(self.vehicles, seconds)
+        if self._dynamics is not None:
+            self._dynamics.begin(seconds)
 
     def drive(self) -> Findings | None:
         """Let vehicles drive until they come to another cell; returns what they find there, to be written into
@@ -179,6 +223,8 @@ class Agent:
         physics = self._map.physics.reshape(-1)
         while left_s > 0.0:
             if motion.at_rest:
+                if self.stopped(vehicle.id):
+                    return 0.0
                 path = self.holdings.path(vehicle.id)
                 if len(path) < 2 or not self._steering.passable(path[0], path[1]):
                     return 0.0
@@ -187,7 +233,11 @@ class Agent:
             pace_s_per_m = float(physics[motion.head])
             if self._map.climb is not None:
                 pace_s_per_m *= self._map.climb.of_step(motion.tail, motion.head)
-            left_s = motion.advance(left_s, pace_s_per_m)
+            if self._dynamics is None:
+                left_s = motion.advance(left_s, pace_s_per_m)
+            else:
+                path = self.holdings.path(vehicle.id)
+                left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
             if vehicle.cell != before:
                 self.holdings.moved(vehicle.id, vehicle.cell)
                 vehicle.route.moved(vehicle.cell)
@@ -218,6 +268,19 @@ class Agent:
             if look:
                 self._look_from[vehicle.cell] = None
 
+    def bodies_moved(self) -> None:
+        """Let vehicles stop before cells that bodies close, or turn back. Called before they drive: what was
+        granted since the last time may lie on closed cells, too."""
+        changed = self.bodies.take_changed()
+        if not self.vehicles or not (changed or self.bodies.any):
+            return
+        vehicles = list(self.vehicles.values())
+        for vehicle in vehicles:
+            self._end_path(vehicle)
+        cells = np.array([divmod(vehicle.cell, self._map.grid.cols) for vehicle in vehicles], np.int64)
+        for index in np.flatnonzero(_meet(np.hstack((cells, cells)), changed, self._sight_cells)):
+            self._wished.pop(vehicles[index].id, None)
+
     def _end_path(self, vehicle: Vehicle) -> None:
         """Give back what lies behind a step that the map does not allow any more."""
         path = self.holdings.path(vehicle.id)
@@ -239,12 +302,23 @@ class Agent:
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0
+        lost = self._trackings.lost(now_ns)
+        self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         for vehicle in self.vehicles.values():
+            if vehicle.tracked == (vehicle.target in lost):
+                vehicle.set_tracked(not vehicle.tracked)
             self._check_reach(vehicle)
+            stopped = self.stopped(vehicle.id)
+            if stopped:
+                self._stop_soon(vehicle)
             path = self.holdings.path(vehicle.id)
             ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)
+            if stopped:
+                self.wishes[vehicle.id] = _STAYS
+                self._wished.pop(vehicle.id, None)
+                continue
             self._wish(vehicle, path, now_ns)
             self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
         for (target_id, force), batch in asks.items():
@@ -296,16 +370,20 @@ class Agent:
 
     # --- what is heard --------------------------------------------------------------------------------------
 
-    def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Where the tracker of a target says it is. Poses off the grid, and those that are no news, are ignored."""
-        inside = 0 <= pose.cell < self._map.grid.cells
-        if inside and self._newest_poses.is_news(pose.target, (pose.incarnation, pose.seq), now_ns):
-            self.set_pose(pose, now_ns)
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
+        """Where a tracker of a target says it is; returns that, with its cell, if it counts."""
+        counts = self._trackings.hear(pose, now_ns)
+        if counts is not None:
+            self._moved(counts, now_ns)
+        return counts
 
-    def set_pose(self, pose: TargetPose, now_ns: int) -> None:
-        """Where a target is, by its tracker or by the best sighting of it. A pose outside the grid is ignored."""
-        if not 0 <= pose.cell < self._map.grid.cells:
-            return
+    def see_target(self, pose: TargetPose, now_ns: int) -> None:
+        """Where a target without a tracker is, by the best sighting of it. A pose outside the grid is ignored."""
+        if 0 <= pose.cell < self._map.grid.cells:
+            self._trackings.place(pose, now_ns)
+            self._moved(pose, now_ns)
+
+    def _moved(self, pose: TargetPose, now_ns: int) -> None:
         known = self._poses.get(pose.target)
         self._poses[pose.target] = pose
         if known is not None and pose.jumps != known.jumps:

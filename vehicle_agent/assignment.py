@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
+from swarm.plugins.door import Door, Nonsense, Tell
+from swarm.plugins.find import Plugin
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.driving.vehicle import Vehicle
 
@@ -105,22 +108,123 @@ def spread(costs_s: NDArray[np.float64], current: Sequence[int]) -> NDArray[np.i
     return chosen
 
 
+@dataclass(frozen=True, slots=True)
+class AssignmentWorld:
+    """What an assigner is made with.
+
+    agent    id of the agent whose vehicles it assigns
+    group    their group
+    targets  those that the group may chase at the start; operators add and remove some
+    seed     of the run
+    """
+
+    agent: str
+    group: str
+    targets: tuple[str, ...]
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CostTable:
+    """What each vehicle would need to each target.
+
+    targets   those whose planners have answered
+    vehicles  those that have a choice
+    costs_s   (targets, vehicles) float64, inf where there is no route
+    current   (vehicles,) index of the target of each now, -1 for none
+    """
+
+    targets: tuple[str, ...]
+    vehicles: tuple[str, ...]
+    costs_s: NDArray[np.float64]
+    current: tuple[int, ...]
+
+
+class Assigner(Protocol):
+    """Says which vehicle of an agent goes for which target. A plug-in is made as
+    `Name(world: AssignmentWorld, options)`."""
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        """(vehicles,) index of a target that the vehicle has a route to; -1 lets it keep its target, or take the
+        cheapest."""
+        ...
+
+
+class Spread:
+    """Even shares: see `spread`."""
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        return spread(table.costs_s, table.current)
+
+
+ASSIGNERS: Mapping[str, Callable[[], Assigner]] = {"spread": Spread}
+"""The built-in assigners."""
+
+
+def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
+    """The assigner that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+    if plugin.factory is None:
+        return ASSIGNERS[plugin.named.name]()
+    return PluginAssigner(plugin.make(world), Door(plugin, tell))
+
+
+class PluginAssigner:
+    """What a plug-in assigns; even shares once it has failed."""
+
+    def __init__(self, assigner: Assigner, door: Door) -> None:
+        self._assigner = assigner
+        self._door = door
+
+    def assign(self, table: CostTable) -> NDArray[np.int64]:
+        told = replace(table, costs_s=table.costs_s.copy())
+        return self._door.ask(
+            lambda: self._assigner.assign(told),
+            lambda chosen: _checked(chosen, table.costs_s),
+            lambda: spread(table.costs_s, table.current),
+        )
+
+
+def _checked(chosen: object, costs_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    targets, vehicles = costs_s.shape
+    found = np.asarray(chosen)
+    if found.shape != (vehicles,) or found.dtype.kind not in "iu":
+        raise Nonsense(f"{found.dtype} {found.shape}, expected whole numbers, one for each of {vehicles} vehicles")
+    wrong = (found < -1) | (found >= targets)
+    if wrong.any():
+        raise Nonsense(f"target {found[wrong][0]}, expected -1 to {targets - 1}")
+    at = np.flatnonzero(found >= 0)
+    lost = at[~np.isfinite(costs_s[found[at].astype(np.intp), at])]
+    if lost.size:
+        raise Nonsense(f"target {found[lost[0]]} for vehicle {lost[0]}, which has no route to it")
+    return found.astype(np.int64)
+
+
 class Assignment:
     """Asks all planners for the costs of all vehicles of an agent, and assigns each vehicle its target.
 
     targets     those that the vehicles may go for
+    assigner    which of them each goes for
     stagger     share of the period by which the first request is followed early, so that agents ask one after the
                 other
     """
 
-    def __init__(self, targets: Sequence[str], reassign_s: float, stagger: float) -> None:
+    def __init__(self, targets: Sequence[str], assigner: Assigner, reassign_s: float, stagger: float) -> None:
         self._targets = targets
+        self._assigner = assigner
         self._reassign_ns = int(reassign_s * NS_PER_S)
         self._stagger_ns = int(stagger * self._reassign_ns)
         self._due_ns = 0
         self._open: AskCosts | None = None
         self._costs_s: dict[str, NDArray[np.float32]] = {}
         """Target -> the costs that its planner answered to the open request."""
+
+    def set_targets(self, targets: Sequence[str]) -> None:
+        """Those that the vehicles may go for from now on."""
+        self._targets = targets
+
+    def set_period(self, reassign_s: float) -> None:
+        """How often vehicles ask from now on."""
+        self._reassign_ns = int(reassign_s * NS_PER_S)
 
     def due(self, now_ns: int) -> bool:
         return now_ns >= self._due_ns and self._open is None
@@ -176,7 +280,8 @@ class Assignment:
             return {}
         costs_s = np.array([self._costs_s[target] for target in targets], np.float64)[:, free]
         current = [-1 if (target := now[asked.vehicles[n]]) is None else targets.index(target) for n in free]
-        chosen = spread(costs_s, current)
+        names = tuple(asked.vehicles[n] for n in free)
+        chosen = self._assigner.assign(CostTable(tuple(targets), names, costs_s, tuple(current)))
         return {
             asked.vehicles[n]: targets[each] for n, each in zip(free, chosen.tolist(), strict=True) if each >= 0
         }

@@ -16,18 +16,24 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, load_homes
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
 from swarm.liveness import Roster
+from swarm.plugins.find import named_plugin
 from swarm.ranks import job_of
 from swarm.runtime.membership import Member
+from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.guests import Removed, RemoveVehicles
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Followed, VehicleState
 from swarm.wire.topics import (
+    BODY,
     CHASERS,
     COST,
     FLEET,
@@ -40,8 +46,10 @@ from swarm.wire.topics import (
     TRUE_POSE,
 )
 from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
-from vehicle_agent.assignment import AskCosts
+from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of
+from vehicle_agent.bodies import Bodies
 from vehicle_agent.chasers import ChasersReport
+from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.entering import Entering
@@ -49,11 +57,14 @@ from vehicle_agent.fleet import FleetReport, directions_of
 from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
-from vehicle_agent.sensing.sensor import TruthSensor
+from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.target_bodies import TargetBodies
+from vehicle_agent.zones import ZonesAround
 
 log = logging.getLogger(__name__)
 
+_LONGEST_AGE_NS = 10 * NS_PER_S
 _LEAD_CELLS = 24
 """Marks are followed so far ahead of the vehicles at least."""
 
@@ -99,7 +110,11 @@ class AgentService:
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
-        sensor = TruthSensor(grid, truth, scenario.vehicles.sense_range_m)
+        self._faults: list[str] = []
+        """What plug-ins did wrong and nobody has been told yet."""
+        world = SensorWorld(grid, truth, scenario.vehicles.sense_range_m, setup.id, scenario.seed)
+        sensor = sensor_of(named_plugin(scenario, "vehicles.sensor"), world, self._faults.append)
+        self._target_bodies = TargetBodies(scenario, grid)
         self._untracked = UntrackedTargets(scenario.untracked, self._replica.filter)
         self._detector = TargetDetector(
             grid,
@@ -110,11 +125,22 @@ class AgentService:
         self._right_of_way = RightOfWaySync(
             setup, grid, spawns, store, bus, post, self._place, self._warn, plan.vehicle_ids
         )
-        self._agent = Agent(plan, scenario, local, sensor, self._right_of_way.core.holdings)
+        bodies = Bodies(grid, scenario.cost.vehicle_radius_m)
+        targets = plan.group.targets or tuple(scenario.target_ids)
+        assigned = AssignmentWorld(setup.id, group, targets, scenario.seed)
+        assigner = assigner_of(named_plugin(scenario, "vehicles.assignment"), assigned, self._faults.append)
+        driven = DynamicsWorld(setup.id, grid, scenario.seed)
+        dynamics = dynamics_of(named_plugin(scenario, "vehicles.dynamics"), driven, self._faults.append)
+        self._agent = Agent(
+            plan, scenario, local, sensor, self._right_of_way.core.holdings, bodies, assigner, dynamics
+        )
         lead_cells = scenario.vehicles.reserve_cells + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.
         reach_m = max(scenario.map.interest_m, 2 * scenario.vehicles.sense_range_m)
+        self._zones = ZonesAround(self._replica, self._cost_map)
+        self._obedience = Obedience(setup, bus, post, self._obeys)
         self._near_marks = Interest(grid, max(lead_cells, int(reach_m / grid.resolution_m)))
+        self._obeyed_version = 0
         self._roster = Roster()
         self._now_ns = 0
         self.when_over: Callable[[], None] | None = None
@@ -141,7 +167,9 @@ class AgentService:
         self._bus.watch_alive(self._post, role="planner")
         self._member.join()
         self._sync.start(now_ns)
+        self._obedience.start(now_ns)
         self._bus.collect(POSE)
+        self._bus.collect(BODY)
         if self._untracked.targets:
             self._bus.collect(TRUE_POSE)
             for target in sorted(self._untracked.targets):
@@ -153,7 +181,7 @@ class AgentService:
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if self._right_of_way.handle(event, now_ns):
+        if self._right_of_way.handle(event, now_ns) or self._obedience.handle(event, now_ns):
             return
         agent = self._agent
         match event:
@@ -186,6 +214,7 @@ class AgentService:
 
     def tick(self, now_ns: int) -> None:
         self._now_ns = now_ns
+        self._agent.bodies.tick(now_ns)
         for heard in (*self._bus.collected(POSE), *self._bus.collected(TRUE_POSE)):
             self._hear_pose(heard, now_ns)
         self._member.tick(now_ns)
@@ -196,12 +225,16 @@ class AgentService:
             self._entering.tick(self._right_of_way.core.informed, now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
+        self._zones.update(agent.places, now_ns)
+        agent.set_ways_out(self._zones.ways_out)
+        self._obey(now_ns)
         agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
         if agent.places:
             self._sync.enter(self._near_marks.update(agent.places))
+        self._hear_bodies(now_ns)
         agent.begin_drive(now_ns)
-        while (findings := agent.drive()) is not None:
-            if len(findings):
+        while (found := agent.drive()) is not None:
+            if len(findings := self._zones.without(found)):
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._cost_map.take_dirty(), now_ns)
@@ -216,6 +249,7 @@ class AgentService:
         for chasers in self._chasers.reports(chasing, now_ns):
             self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
+        self._member.tell_faults(self._faults, now_ns)
         self._gauge()
         if self.over and self.when_over is not None:
             self.when_over()
@@ -225,6 +259,25 @@ class AgentService:
             self._remove([])  # whoever ends this process takes its vehicles away; one that is killed leaves them
             self._right_of_way.tick(self._agent.wishes, now_ns)
         self._member.publish_stats(now_ns)
+
+    def _obey(self, now_ns: int) -> None:
+        """Go by what is ordered."""
+        orders, agent = self._obedience, self._agent
+        agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
+        if self._obeyed_version != orders.book.version:
+            self._obeyed_version = orders.book.version
+            scenario, book = self._setup.scenario, orders.book
+            agent.set_targets(book.targets_of(agent.plan.group.name, scenario), now_ns)
+            agent.set_pace(
+                book.setting("time_scale", scenario.time_scale),
+                book.setting("vehicles.reassign_s", scenario.vehicles.reassign_s),
+            )
+        orders.tick(now_ns)
+
+    def _obeys(self, order: Obey) -> bool:
+        if order.subject is not None:
+            return self._obeyed_version == self._obedience.book.version
+        return self._sync.holds(order.author, order.sets, self._now_ns)
 
     # --- places ---------------------------------------------------------------------------------------------
 
@@ -246,9 +299,7 @@ class AgentService:
         return Removed(agent=self._setup.id, left=left, unknown=unknown, held=held)
 
     def _warn(self, kind: str, text: str) -> None:
-        log.warning("%s: %s", kind, text)
-        self.counters.count(kind)
-        self._member.note(self._now_ns, kind, text)
+        self._member.warn(self._now_ns, kind, text)
 
     def _stand_down(self, now_ns: int) -> None:
         """A later life of this agent drives the vehicles. While it lives, this one keeps its promises only."""
@@ -269,14 +320,38 @@ class AgentService:
     def _hear_pose(self, heard: Heard, now_ns: int) -> None:
         pose = heard.message
         assert isinstance(pose, TargetPose)
-        self._detector.set_truth(pose, now_ns)
-        if heard.topic is POSE and pose.target not in self._untracked.targets:
-            self._agent.hear_pose(pose, now_ns)
+        if heard.topic is TRUE_POSE:
+            self._detector.set_truth(pose, now_ns)
+        elif pose.target not in self._untracked.targets:
+            counts = self._agent.hear_pose(pose, now_ns)
+            if counts is not None:  # for the simulated sensor of targets it is the truth
+                self._detector.set_truth(counts, now_ns)
+                self._hear_target_bodies(counts, now_ns)
+
+    def _hear_bodies(self, now_ns: int) -> None:
+        bodies = self._agent.bodies
+        for heard in self._bus.collected(BODY):
+            assert isinstance(heard.message, Body)
+            bodies.hear(heard.message, now_ns)
+            age_ns = now_ns - heard.message.stamp_ns
+            if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree
+                self.counters.observe("body_ms", age_ns / 1e6)
+        self._agent.bodies_moved()
+        self.counters.counts["bodies_refused"] = bodies.refused
+        self.counters.counts["detours"] = self._agent.detours.found
+        for text in bodies.complaints:
+            self._warn("body", text)
+        bodies.complaints.clear()
 
     def _hear_sighted(self, sighted: Sighted, now_ns: int) -> None:
         pose = self._untracked.hear(sighted, now_ns)
         if pose is not None:
-            self._agent.set_pose(pose, now_ns)
+            self._agent.see_target(pose, now_ns)
+            self._hear_target_bodies(pose, now_ns)
+
+    def _hear_target_bodies(self, pose: TargetPose, now_ns: int) -> None:
+        for body in self._target_bodies.bodies_of(pose, now_ns):
+            self._agent.bodies.hear(body, now_ns)
 
     def _planners(self) -> dict[str, int]:
         """Target -> incarnation of its living planner, or of the first of its standbys that lives."""

@@ -9,7 +9,7 @@ import typing
 from collections.abc import Sequence
 from enum import Enum
 from types import NoneType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -107,6 +107,8 @@ class Lies:
         metas = [note for note in notes if isinstance(note, msgspec.Meta)]
         if NoneType in args:
             return None if self._chance.random() < 0.3 else self._value(name, args[0])
+        if origin is Literal:
+            return self._chance.choice(args)
         if origin is int:
             return self._whole(*_limits(metas), cell="cell" in name or name in ("start", "held"))
         if origin is float:
@@ -132,12 +134,12 @@ class Lies:
         return self._made(origin)
 
     def _column(self, rule: Column, many: int) -> bytes:
-        dtype = np.dtype(rule.dtype)
-        if dtype.names:
+        if not isinstance(rule.dtype, str):
             rows = [
                 (self._chance.randrange(9), self._whole(0, (1 << 62)), self._whole(0, 1 << 62)) for _ in range(many)
             ]
             return np.array(rows, DIGEST_ROW).tobytes()
+        dtype: np.dtype[Any] = np.dtype(rule.dtype)
         if dtype.kind == "f":
             assert rule.least is not None
             assert rule.most is not None

@@ -79,7 +79,7 @@ class Siege:
         scenario = with_port(find_scenario(options.scenario), 0)
         self._scenario: Scenario = scenario
         terrain = build_terrain(scenario)
-        self._referee = Referee(build_truth(scenario, terrain))
+        self._referee = Referee(build_truth(scenario, terrain), terrain.grid)
         vehicles = [id for plan in plan_agents(scenario) for id in plan.vehicle_ids]
         self._recovery = Recovery(vehicles)
         self._names = [spec.name for spec in processes_of(scenario)]

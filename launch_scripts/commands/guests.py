@@ -11,6 +11,7 @@ import typer
 from launch_scripts.commands.query import Where
 from launch_scripts.commands.roles import Joins, Part, run_role
 from launch_scripts.commands.shared_options import AsJson, Tls, spread
+from launch_scripts.commands.vehicle import app as app
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -19,20 +20,8 @@ if TYPE_CHECKING:
     from swarm.wire.messages.guests import Removed
     from swarm.wire.messages.processes import RunInfo
 
-app = typer.Typer(
-    help="Let vehicles join a running swarm, and leave it.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-
 _WITHIN_S = 5.0
 _AGAIN_S = 0.2
-
-
-@app.callback()
-def _root() -> None:
-    pass
 
 
 @app.command()

@@ -87,9 +87,10 @@ def info(
 ) -> None:
     """Say what a terrain file or a scenario holds, and what was done to bring it onto a metric grid.
 
-    Reads .tif, .tiff, .hgt, .vrt, .asc, .npz, MovingAI .map, ROS map_server
-    .yaml or .yml, and .png with --resolution-m and --height-scale. The lines after the table say
-    what was done to the file, and what you should know about it; those
+    Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
+    these in a .zip, .asc, .npz, MovingAI .map, ROS map_server .yaml or .yml,
+    and .png with --resolution-m and --height-scale. The lines after the table
+    say what was done to the file, and what you should know about it; those
     with a ! what looks wrong. Costs are those of the scenario, of a file
     those of an empty one.
 

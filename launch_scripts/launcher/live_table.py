@@ -23,7 +23,7 @@ def live_table(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], r
     for heading in ("following", "nearest m", "re-plans", "ms", "gap", "captures"):
         table.add_column(heading, justify="right")
     for line in summary.targets[:SHOWN_TARGETS]:
-        table.add_row(*_row(line), style=None if line.planner_up else "red")
+        table.add_row(*_row(line), style=_style(line))
     if len(summary.targets) > SHOWN_TARGETS:
         table.add_row(f"... {len(summary.targets) - SHOWN_TARGETS} more")
     lines = [Text(line, overflow="ellipsis", no_wrap=True) for line in _totals(summary)]
@@ -39,13 +39,19 @@ def plain_line(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], r
     alive = sum(count for count, _ in processes.values())
     every = sum(count for _, count in processes.values())
     following = sum(line.following for line in summary.targets)
+    lost = [line.id for line in summary.targets if line.lost]
+    untracked = f"; lost targets: {', '.join(lost[:SHOWN_TARGETS])}" if lost else ""
     states = ", ".join(f"{count} {state}" for state, count in summary.states.items() if count)
     return (
         f"{summary.elapsed_s:5.1f} s  {alive}/{every} processes, {restarts} restarts; "
         f"{states or 'no vehicles yet'}; {following} assigned; {_count(summary.captures)} captures, "
         f"{_count(summary.reroute_requests)} re-route requests, {_count(summary.marks)} marks, "
-        f"{_count(summary.messages_per_s)} messages/s"
+        f"{_count(summary.messages_per_s)} messages/s{untracked}"
     )
+
+
+def _style(line: TargetLine) -> str | None:
+    return "red" if not line.planner_up else "yellow" if line.lost else None
 
 
 def _row(line: TargetLine) -> tuple[str, ...]:

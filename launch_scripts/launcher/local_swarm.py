@@ -75,6 +75,8 @@ class Running:
     refused_s: list[float] = field(default_factory=list)
     """When it refused to run, within the last `REFUSALS_WITHIN_S`."""
     backoff: Backoff = field(default_factory=Backoff)
+    dismissed_s: float | None = None
+    """Since when it has been asked to end for good; None if it has not."""
 
     @property
     def alive(self) -> bool:
@@ -113,13 +115,42 @@ class LocalSwarm:
             if running.process is None and running.due_s is None and role in (None, running.spec.role):
                 self._start(running)
 
+    def add(self, spec: ProcessSpec) -> None:
+        """Start one more process. Raises SwarmError, and adds none, where it cannot be started."""
+        running = Running(spec)
+        self._start(running)
+        self.running.append(running)
+
+    def dismiss(self, spec: ProcessSpec) -> None:
+        """Ask a process to end for good. Once it has, it is not in `running` any more."""
+        for running in self.running:
+            if running.spec.name == spec.name and running.dismissed_s is None:
+                running.dismissed_s, running.due_s = time.monotonic(), None
+                if running.process is not None:
+                    running.process.terminate()
+
+    def _let_go(self) -> None:
+        """Forget dismissed processes that have ended, and kill those that do not."""
+        for running in [each for each in self.running if each.dismissed_s is not None]:
+            process = running.process
+            assert running.dismissed_s is not None
+            if process is not None and process.exitcode is None:
+                if time.monotonic() - running.dismissed_s > STOP_GRACE_S:
+                    process.kill()
+                continue
+            self._forget(running)
+            self.running.remove(running)
+
     def poll(self) -> list[Ending]:
         """Reaps processes which ended, and starts those which are due."""
+        self._let_go()
         endings = []
         # One look at all: to ask each for its exit code costs a system call and a selector each time.
         ended = wait([running.process.sentinel for running in self.running if running.process is not None], 0)
         for running in self.running:
             process = running.process
+            if running.dismissed_s is not None:
+                continue
             if process is not None and process.sentinel in ended and process.exitcode is not None:
                 endings.append(self._ended(running, process))
             elif running.due_s is not None and time.monotonic() >= running.due_s:
@@ -185,7 +216,8 @@ class LocalSwarm:
         ran_s = now_s - running.began_s
         wait_s: float | None = running.backoff.crashed(ran_s)
         if reason.refused and self._is_final(running, reason.exit_code, ran_s, now_s):
-            wait_s = FINALLY_REFUSED_WAIT_S if running.spec.role in EXPENDABLE else None
+            expendable = running.spec.added or running.spec.role in EXPENDABLE
+            wait_s = FINALLY_REFUSED_WAIT_S if expendable else None
         if running.spec.restart != "always":
             wait_s = None
         if wait_s is not None:

@@ -15,8 +15,10 @@ from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.terrain import build_truth, load_prepared, save_prepared, scenario_key
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.load import BUILT_IN_TERRAINS
+from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError, TerrainError
+from swarm.plugins.find import source_of
 from swarm.wire.messages.processes import RunInfo
 
 log = logging.getLogger(__name__)
@@ -26,12 +28,13 @@ _LOOK = frozenset(("monitor", "keeper"))
 
 
 def missing_files(scenario: Scenario) -> list[str]:
-    """Files of the terrain which are missing on this machine."""
+    """Files of the terrain which are missing on this machine, and cost layers whose module is."""
     terrain = scenario.terrain
     source = None if terrain.source in BUILT_IN_TERRAINS else terrain.source
     masks = [zone.mask for zone in scenario.cost.zones]
     named = [source, terrain.photo, terrain.labels, *masks]
-    return [name for name in named if name is not None and not Path(name).is_file()]
+    layers = [each.name for each in cost_layers_of(scenario) if not source_of(each, scenario.plugin_folder)]
+    return [*(name for name in named if name is not None and not Path(name).is_file()), *layers]
 
 
 def find_members(scenario: Scenario) -> list[RunInfo]:

@@ -35,10 +35,13 @@ REPORTED = {
     "lost": "lost at the end",
     "collisions": "collisions",
     "lethal_entries": "lethal cells entered",
+    "driven_into": "bodies driven into",
+    "hit_by_bodies": "vehicles hit by bodies",
     "gap": "gap to the optimum",
     "growth_ms": "growing a tree, ms",
     "route_query_ms": "asking for a route, ms",
     "mark_to_tree_ms": "from mark to tree, ms",
+    "body_ms": "from a body's report to being avoided, ms",
     "messages_per_s": "messages/s",
     "payloads_dropped": "payloads dropped",
 }

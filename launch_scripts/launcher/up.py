@@ -22,6 +22,7 @@ from launch_scripts.launcher.options import (
     make_run_dir,
     new_run_id,
 )
+from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
@@ -34,13 +35,16 @@ from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
-from shared_map.terrain.terrain_report import summary_of
+from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError, StoreError, SwarmError
+from swarm.order_book import OrderBook
+from swarm.plugins.find import check_plugins
+from swarm.ranks import job_of
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.processes import RunInfo
@@ -121,6 +125,7 @@ def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     for spec in _table(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
+    check_plugins(options.scenario, options.roles)
     if not options.joins:
         check_ports(options.scenario, options.roles)
     run_id = _run_id(options)
@@ -163,6 +168,8 @@ class _Run:
         self._run_dir = run_dir
         self._run_id = run_id
         self._started_ns = time.time_ns()
+        self._book = OrderBook()
+        """What operators have ordered, once somebody watches the swarm."""
         self._terminal = Terminal(options.as_json, options.plain)
         self._stop_asked = _StopAsked()
         self._swarm = LocalSwarm(_table(options), self._setup_of, run_dir)
@@ -183,9 +190,7 @@ class _Run:
     def _run(self) -> int:
         with self._stop_asked.interrupting():
             self._terrain, self._truth = self._prepared()
-            log.info("terrain is ready: %s", summary_of(self._terrain))
-            for note in self._terrain.notes:
-                log.info("terrain: %s", note)
+            log.info("terrain is ready")
         if self._stop_asked:
             return 0
         self._wait(lambda: self._warm_up.progress, self._warm_up.done, again_s=2.0)
@@ -239,8 +244,11 @@ class _Run:
         return prepare(self._run_dir, self._scenario)
 
     def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
+        scenario = as_process(self._options.scenario, spec.role, spec.id)
+        if spec.role == "planner":
+            scenario = with_target(scenario, self._book, job_of(spec.id))
         return RoleSetup(
-            scenario=as_process(self._options.scenario, spec.role, spec.id),
+            scenario=scenario,
             run_id=self._run_id,
             role=spec.role,
             id=spec.id,
@@ -287,7 +295,10 @@ class _Run:
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = time.monotonic()
+        self._book = watcher.book
+        ordered = self._ordered_planners()
         while not self._stop_asked:
+            ordered.look(watcher.book, watcher.alive, time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S)
             self._tell(watcher)
@@ -295,20 +306,34 @@ class _Run:
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 began_s = now_s
-                self._terminal.say(
-                    f"all processes are alive and routes are served, {self._startup_s:.1f} s after launch"
-                )
+                if watcher.routes_served or not self._all_external:
+                    so_far = "all processes are alive and routes are served"
+                else:
+                    so_far = "all processes are alive, and targets wait for their trackers"
+                self._terminal.say(f"{so_far}, {self._startup_s:.1f} s after launch")
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
             if now_s - began_s >= limit_s:
                 break
         return time.monotonic() - began_s
 
+    def _ordered_planners(self) -> OrderedPlanners:
+        options = self._options
+        standbys = range(self._scenario.standbys.planner + 1) if "planner" in options.roles else ()
+        ranks = [rank for rank in standbys if options.rank in (None, rank)]
+        whole = not options.joins and set(ROLES[1:]) <= set(options.roles)
+        return OrderedPlanners(self._scenario, self._swarm, ranks, whole, self._terminal.say)
+
     def _is_up(self, watcher: Watcher) -> bool:
         if self._missing(watcher):
             return False
         planners = "planner" in self._options.roles
-        return not planners or watcher.routes_served
+        return not planners or watcher.routes_served or self._all_external
+
+    @property
+    def _all_external(self) -> bool:
+        """Whether no route is served before a tracker from outside tells where its target is."""
+        return not any(target.is_simulated for target in self._scenario.targets)
 
     def _missing(self, watcher: Watcher) -> list[str]:
         specs = [running.spec for running in self._swarm.running]
@@ -350,8 +375,10 @@ class _Run:
     def _say_begin(self) -> None:
         self._terminal.say(
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
-            f"{len(self._swarm.running)} processes, {self._terrain.grid.rows} x {self._terrain.grid.cols} cells"
+            f"{len(self._swarm.running)} processes"
         )
+        for line in said_of(self._terrain):
+            self._terminal.say(line)
         router = self._scenario.network.connect[0]
         self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 

@@ -42,6 +42,7 @@ class Drawing:
         self._vehicle_ids: list[str] = []
         self._vehicle_colours: Bytes = np.empty((0, 3), np.uint8)
         self._target_ids_drawn: list[str] = []
+        self._target_colours: Bytes = np.empty((0, 3), np.uint8)
 
     def set_time(self, frame: int, seconds: float) -> None:
         """Sets the time of all that follows. What is logged before the first call is on no timeline."""
@@ -119,11 +120,11 @@ class Drawing:
         """Logs balls on poles, each with its name at `names`."""
         rec = self._rec
         rec.log("world/targets/poles", rr.LineStrips3D.from_fields(strips=poles))
-        if points.ids == self._target_ids_drawn:
+        if points.ids == self._target_ids_drawn and np.array_equal(points.colours, self._target_colours):
             rec.log("world/targets/balls", rr.Points3D.from_fields(positions=points.positions))
             rec.log("world/targets/names", rr.Points3D.from_fields(positions=names))
             return
-        self._target_ids_drawn = points.ids
+        self._target_ids_drawn, self._target_colours = points.ids, points.colours
         radius = _screen_points(6.5)
         rec.log("world/targets/balls", rr.Points3D(points.positions, colors=points.colours, radii=radius))
         if len(points.ids) <= _NAMES_SHOWN:
@@ -136,6 +137,14 @@ class Drawing:
         """Logs balls as large as the uncertainty of the sightings."""
         balls = rr.Points3D(points.positions, colors=points.colours, radii=within_m, labels=points.ids)
         self._rec.log("world/targets/sighted", balls)
+
+    def bodies(self, points: Points, radii_m: Floats) -> None:
+        """Logs balls as large as the bodies."""
+        labels = points.ids if len(points.ids) <= _NAMES_SHOWN else None
+        balls = rr.Points3D(
+            points.positions, colors=points.colours, radii=radii_m, labels=labels, show_labels=False
+        )
+        self._rec.log("world/bodies", balls)
 
     def trails(self, who: str, strips: Floats) -> None:
         """Logs the newest piece of each trail; the view shows those of the last seconds together."""

@@ -5,7 +5,19 @@ from __future__ import annotations
 from launch_scripts.report.recorder import LiveSummary
 from swarm.runtime.role import RoleSetup
 
-_WARNINGS = ("restart", "crash", "lost", "stranded", "collision", "lethal", "mismatch", "gone")
+_WARNINGS = (
+    "restart",
+    "crash",
+    "lost",
+    "stranded",
+    "collision",
+    "lethal",
+    "mismatch",
+    "gone",
+    "refused",
+    "outside",
+    "teleported",
+)
 _SHOWN_TARGETS = 12
 
 

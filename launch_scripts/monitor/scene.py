@@ -7,7 +7,7 @@ stretched so that gentle land still looks like land.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -38,11 +39,14 @@ STATE_COLOURS = {
     VehicleState.ARRIVED: (205, 255, 80),
     VehicleState.STRANDED: (150, 150, 20),
     VehicleState.LOST: (40, 84, 60),
+    VehicleState.OUTDATED: (190, 200, 200),
 }
 _STEP_ROW, _STEP_COL = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int64)
 _STATE_COLOURS = np.array([STATE_COLOURS[state] for state in VehicleState], np.uint8)
 TARGET_COLOUR = (255, 46, 46)
+LOST_TARGET_COLOUR = (120, 120, 120)
 SIGHTED_COLOUR = (255, 170, 150)
+BODY_COLOUR = (110, 160, 255)
 LETHAL_MARK = (86, 22, 150)
 SLOW_MARK = (235, 150, 0)
 FAST_MARK = (90, 200, 250)
@@ -224,11 +228,14 @@ def vehicle_points(mesh: TerrainMesh, vehicles: VehicleColumns) -> Points:
     return Points(vehicles.ids, positions, _STATE_COLOURS[vehicles.states])
 
 
-def target_points(mesh: TerrainMesh, places_m: Mapping[str, tuple[float, float]]) -> Points:
-    """All targets, on top of poles that show over the hills."""
+def target_points(
+    mesh: TerrainMesh, places_m: Mapping[str, tuple[float, float]], lost: Collection[str] = ()
+) -> Points:
+    """All targets, on top of poles that show over the hills; grey where nobody tracks them any more."""
     east_south = np.array(list(places_m.values()), np.float32).reshape(-1, 2)
     positions = mesh.place(east_south[:, 0], east_south[:, 1], 2.2 * mesh.scale_m)
-    return Points(list(places_m), positions, np.tile(np.array(TARGET_COLOUR, np.uint8), (len(positions), 1)))
+    colours = [LOST_TARGET_COLOUR if id in lost else TARGET_COLOUR for id in places_m]
+    return Points(list(places_m), positions, np.array(colours, np.uint8).reshape(-1, 3))
 
 
 def sighting_points(mesh: TerrainMesh, seen: Mapping[str, Sighted]) -> tuple[Points, Floats]:
@@ -239,6 +246,17 @@ def sighting_points(mesh: TerrainMesh, seen: Mapping[str, Sighted]) -> tuple[Poi
     positions = mesh.place(east_m, south_m, 0.3 * mesh.scale_m)
     colours = np.tile(np.array(SIGHTED_COLOUR, np.uint8), (len(positions), 1))
     return Points(list(seen), positions, colours), np.array([s.uncertainty_m for s in seen.values()], np.float32)
+
+
+def body_points(mesh: TerrainMesh, bodies: Sequence[Body]) -> tuple[Points, Floats]:
+    """Where bodies are, and their radii in metres, float32 (n,)."""
+    grid = mesh.grid
+    east_m = np.array([each.x_m - grid.west_m for each in bodies], np.float32)
+    south_m = np.array([grid.north_m - each.y_m for each in bodies], np.float32)
+    positions = mesh.place(east_m, south_m, 0.2 * mesh.scale_m)
+    colours = np.tile(np.array(BODY_COLOUR, np.uint8), (len(positions), 1))
+    radii = np.array([max(each.radius_m, 0.25 * grid.resolution_m) for each in bodies], np.float32)
+    return Points([each.id for each in bodies], positions, colours), radii
 
 
 def label_places(mesh: TerrainMesh, targets: Points) -> Floats:

@@ -16,6 +16,7 @@ from launch_scripts.monitor.recording_watch import RecordingWatch
 from launch_scripts.monitor.scene import (
     RouteNow,
     TerrainMesh,
+    body_points,
     cell_at,
     cells_along,
     label_places,
@@ -40,17 +41,19 @@ from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
+from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
+from vehicle_agent.bodies import Bodies
 
 log = logging.getLogger(__name__)
 
 FRAME_HZ = 10.0
 """How often the view is drawn."""
-_DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.5 / FRAME_HZ, FOLLOWED: 0.5, SIGHTED: 0.0}
+_DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0}
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
 _TARGETS_NS = NS_PER_S // 5
 """Targets, each with its pole and its name, take as long to draw as all vehicles, which move faster."""
@@ -111,10 +114,15 @@ class MonitorService:
         self._stale_tiles: dict[int, None] = {}
         self._sightings = Sightings(replica.filter)
         self._sighted: Mapping[str, Sighted] = {}
+        self._bodies = Bodies(terrain.grid)
+        """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
+        self._bodies_drawn: list[Body] = []
         self._fleets_new = self._targets_new = self._windows_new = False
+        self._lost: set[str] = set()
+        """Targets that were drawn as lost."""
         self._windows: dict[str, tuple[int, ...]] = {}
         """Target -> the window that its planner grew last."""
-        self._windows_due_ns = self._targets_due_ns = 0
+        self._windows_due_ns = self._targets_due_ns = self._bodies_due_ns = 0
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
@@ -146,11 +154,12 @@ class MonitorService:
             case Fleet(stamp_ns=stamp_ns):
                 self._fleets_new = True
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
-            case TargetPose(stamp_ns=stamp_ns):
+            case TargetPose():  # a tracker's clock may be wrong, by which the view's must not be set
                 self._targets_new = True
-                self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
             case Sighted() as sighted:
                 self._sightings.hear(sighted, now_ns)
+            case Body() as body:
+                self._bodies.hear(body, now_ns)
             case PlannerStatus(target=target, window=window):
                 if self._windows.get(target) != tuple(window):
                     self._windows[target] = tuple(window)
@@ -251,9 +260,11 @@ class MonitorService:
             if trails_due:
                 self._drawing.trails("vehicles", self._vehicle_trails.advance(points.ids, points.positions))
             self._draw_routes(now_ns, vehicles)
+        if now_ns >= self._targets_due_ns and (lost := self.recorder.trackings.lost(now_ns)) != self._lost:
+            self._lost, self._targets_new = lost, True
         if self._targets_new and (trails_due or now_ns >= self._targets_due_ns):
             self._targets_new, self._targets_due_ns = False, now_ns + _TARGETS_NS
-            targets = target_points(self._mesh, self.recorder.observed.targets())
+            targets = target_points(self._mesh, self.recorder.observed.targets(), self._lost)
             feet = poles(self._mesh, targets)
             self._drawing.targets(targets, feet, label_places(self._mesh, targets))
             if trails_due:
@@ -263,6 +274,13 @@ class MonitorService:
         if sighted != self._sighted:  # a new sighting, or one that expired
             self._sighted = sighted
             self._drawing.sightings(*sighting_points(self._mesh, sighted))
+        self._bodies.tick(now_ns)
+        self._bodies.take_changed()
+        self._bodies.complaints.clear()
+        bodies = self._bodies.reports
+        if bodies != self._bodies_drawn and now_ns >= self._bodies_due_ns:
+            self._bodies_drawn, self._bodies_due_ns = bodies, now_ns + _TARGETS_NS
+            self._drawing.bodies(*body_points(self._mesh, bodies))
         if self._windows_new and now_ns >= self._windows_due_ns:
             self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
             self._draw_windows()

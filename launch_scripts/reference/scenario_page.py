@@ -152,6 +152,10 @@ def _allowed(hint: Any) -> str:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         metas = [note for note in args[1:] if isinstance(note, msgspec.Meta)]
+        for meta in metas:
+            if meta.extra is not None and "built_in" in meta.extra:
+                names = [f"`{name}`" for name in meta.extra["built_in"]]
+                return ", ".join([*names, "a [plug-in](../plugins/index.md)"])
         return " ".join(filter(None, [_allowed(args[0]), *map(_bounds, metas)]))
     if origin in (types.UnionType, typing.Union):
         return " or ".join(_allowed(arg) for arg in args if arg is not type(None))
@@ -161,6 +165,8 @@ def _allowed(hint: Any) -> str:
         if args[-1] is Ellipsis:
             return f"list of {_allowed(args[0])}"
         return f"[{', '.join(_allowed(arg) for arg in args)}]"
+    if origin is dict and args[1] is Any:
+        return "table"
     if origin is dict:
         return f"table of {_allowed(args[0])} to {_allowed(args[1])}"
     if isinstance(hint, type) and issubclass(hint, msgspec.Struct):

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from launch_scripts.reference.json_examples import OUTSIDE_ROLES, example, key_fields, put_from_outside
 from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
 from swarm.grid import REGION_TILES, TILE_CELLS
 from swarm.wire.access import OPERATOR, Grant
@@ -19,6 +20,7 @@ from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES
 from swarm.wire.fields import Characters, Column, taken_apart
 from swarm.wire.messages.base import WIRE_VERSION, Message
 from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.readable import JSON_ENCODING, MAX_JSON_BYTES
 from swarm.wire.routes import RouteStatus
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
@@ -49,6 +51,8 @@ Any Zenoh session may ask, with parameters instead of a payload and JSON as the 
     session.get("swarm/target/*/cost?row=40;col=200;format=json")
     session.get("swarm/run/*/*?format=json")
 
+or put and ask [in JSON](#json).
+
 A query says how long its asker waits, in seconds, by a parameter such as `?{TIMEOUT_PARAMETER}=2.5`; without it
 {USUAL_TIMEOUT_S:g} are assumed, and never more than {LONGEST_TIMEOUT_S:g}. The time counts from the arrival at the
 process that answers, by its own clock. A query that was not begun by then is refused and counted (`asks_expired`).
@@ -57,7 +61,7 @@ process that answers, by its own clock. A query that was not begun by then is re
 
 def document() -> str:
     """The page."""
-    return "\n".join([_INTRO, *_keys(), *_access(), *_messages(), *_enums()])
+    return "\n".join([_INTRO, *_keys(), *_access(), *_json(), *_messages(), *_enums()])
 
 
 def _keys() -> Iterator[str]:
@@ -94,6 +98,39 @@ def _access() -> Iterator[str]:
         yield f"| `{topic.key}` | {' | '.join(_granted(grants) for grants in columns)} |"
     yield f"| `{ALIVE_KEY}` | each its own token | | | all |"
     yield ""
+
+
+def _json() -> Iterator[str]:
+    yield f"""## JSON
+
+A payload whose Zenoh encoding is `{JSON_ENCODING}` is read as JSON, on every key, put or asked. It is turned into
+MessagePack first, so the same rules are checked. It may have {MAX_JSON_BYTES >> 10} KiB, and
+
+- `schema` may be left out, as the key says which message is meant; a wrong one is refused. So may fields that the
+  key has: `target` in `target/{{target}}/pose`.
+- A column is a list of its numbers, or base64 of its bytes; rows of bytes are lists of lists. Directions are
+  `"N"`, `"NE"` ... or their codes. `null` is infinite where a number may be infinite.
+- Unknown fields are refused, unlike in MessagePack: a person who mistypes one is told, in the log of who reads it.
+- Numbers from 2^53 on, such as times in ns, lose digits in JavaScript: no harm, as long as a later one is greater.
+
+An answer is JSON if the question was, or has `format=json`. Keys `with a code` take JSON too, with the code over
+the bytes as they are sent; who has no secret of the run is refused there, whatever the encoding.
+
+Programs outside of the swarm ({", ".join(f"`{role}`" for role in OUTSIDE_ROLES)}) may put on these keys. The least
+that is accepted on each; the tests put every line:
+"""
+    yield "| key | JSON |"
+    yield "|---|---|"
+    for topic in put_from_outside():
+        yield f"| `{topic.below(key_fields(topic))}` | `{example(topic)}` |"
+    yield ""
+    yield """In Python, with Zenoh alone:
+
+    session.put("swarm/body/r1", json.dumps({"incarnation": started_ns, "seq": 1, "x_m": 1205.0, "y_m": -860.0,
+                "radius_m": 2.0}), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+[In Rust](tutorial/vehicle.md#in-another-language). In Python [`swarm.client`](tutorial/vehicle.md) does all of it.
+"""
 
 
 def _granted(grants: tuple[Grant, ...]) -> str:

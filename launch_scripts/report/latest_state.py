@@ -53,6 +53,7 @@ class Observed:
         self._incarnations: dict[tuple[str, str], set[int]] = {}
 
     def heard(self, message: Message) -> None:
+        """Take in a message; of poses those only that count."""
         match message:
             case Stats():
                 key = (message.role, message.id, message.incarnation)
@@ -73,9 +74,7 @@ class Observed:
                     self._fleets[message.author, message.region] = message
                     self._vehicles = None
             case TargetPose():
-                pose = self.poses.get(message.target)
-                if pose is None or (message.incarnation, message.seq) >= (pose.incarnation, pose.seq):
-                    self.poses[message.target] = message
+                self.poses[message.target] = message
             case MarkSet():
                 marks = self._marks.get((message.author, message.tile))
                 if marks is None or (message.epoch, message.seq) > (marks.epoch, marks.seq):

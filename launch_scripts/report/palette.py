@@ -18,4 +18,5 @@ STATE_COLOURS = {
     VehicleState.IDLE: GREY,
     VehicleState.STRANDED: PINK,
     VehicleState.LOST: BLACK,
+    VehicleState.OUTDATED: YELLOW,
 }

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.ranks import ranked_id
 from swarm.runtime.stats import Histogram
+from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
@@ -34,7 +35,7 @@ from swarm.wire.topics import FLEET, LEAD, MARKS, NOTE, POSE, STATS, STATUS, Top
 TRACK_S = 0.5
 """Places are sampled so often."""
 RECORDED: dict[Topic, float] = {
-    STATS: 0.0, STATUS: 0.0, NOTE: 0.0, LEAD: TRACK_S, FLEET: TRACK_S, POSE: TRACK_S, MARKS: TRACK_S
+    STATS: 0.0, STATUS: 0.0, NOTE: 0.0, POSE: 0.0, LEAD: TRACK_S, FLEET: TRACK_S, MARKS: TRACK_S
 }  # fmt: skip
 """What a recorder hears, and how often it takes the newest of each key, in seconds; 0 for all that comes."""
 
@@ -62,6 +63,8 @@ class TargetLine:
     planner_up  whether its planner or one of its standbys is alive
     rank        of the planner that leads; 0 unless a standby does
     nearest_m   distance of the nearest vehicle
+    pose_age_s  time since its last pose; None before the first
+    lost        whether nobody tracks it: it was where that says, and may be anywhere
     """
 
     id: str
@@ -73,13 +76,20 @@ class TargetLine:
     growth_ms: float | None
     gap: float | None
     captures: int
+    pose_age_s: float | None = None
+    lost: bool = False
 
     @property
     def title(self) -> str:
-        """The id, and what is unusual about its planner."""
+        """The id, and what is unusual about its tracker and its planner."""
+        unusual = []
+        if self.lost:
+            unusual.append("lost" if self.pose_age_s is None else f"lost {self.pose_age_s:.0f} s")
         if not self.planner_up:
-            return f"{self.id} (planner down)"
-        return f"{self.id} (standby {self.rank})" if self.rank else self.id
+            unusual.append("planner down")
+        elif self.rank:
+            unusual.append(f"standby {self.rank}")
+        return f"{self.id} ({', '.join(unusual)})" if unusual else self.id
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +115,7 @@ class Recorder:
         self.scenario = scenario
         self.grid = grid
         self.observed = Observed(grid)
+        self.trackings = Trackings(grid)
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.ready_ns: int | None = None
@@ -129,7 +140,11 @@ class Recorder:
         self._touch(now_ns)
         match message:
             case TargetPose():
-                self._capture(message, now_ns)
+                counts = self.trackings.hear(message, now_ns)
+                if counts is None:
+                    return
+                message = counts
+                self._capture(counts, now_ns)
             case PlannerStatus(gap_max=float(gap)):
                 self._gap_max = max(gap, self._gap_max or 0.0)
             case Note():
@@ -146,6 +161,11 @@ class Recorder:
     def seconds(self, now_ns: int) -> float:
         """Seconds since the first message."""
         return 0.0 if self.first_ns is None else (now_ns - self.first_ns) / NS_PER_S
+
+    def lost_targets(self, now_ns: int) -> set[str]:
+        """The targets that nobody tracks now; of those without a tracker as their planners tell."""
+        told = {id for id, status in self.observed.status.items() if status.tracker_lost}
+        return self.trackings.lost(now_ns) | (told - self.observed.poses.keys())
 
     def missing(self) -> list[str]:
         """Processes of the scenario which are not alive now, as `role id`."""
@@ -221,9 +241,11 @@ class Recorder:
         observed = self.observed
         vehicles = observed.vehicles()
         rates = messages_per_s(self.samples.newest)
+        lost = self.lost_targets(now_ns)
+        lines = (self._target_line(id, vehicles, now_ns) for id in self.scenario.target_ids)
         return LiveSummary(
             elapsed_s=self.seconds(now_ns),
-            targets=tuple(self._target_line(id, vehicles) for id in self.scenario.target_ids),
+            targets=tuple(replace(line, lost=line.id in lost) for line in lines),
             states=_by_state(vehicles.count_states()),
             captures=observed.total("captures"),
             reroute_requests=observed.total("reroute_requests"),
@@ -234,7 +256,7 @@ class Recorder:
             restarts=observed.restarts,
         )
 
-    def _target_line(self, id: str, vehicles: VehicleColumns) -> TargetLine:
+    def _target_line(self, id: str, vehicles: VehicleColumns, now_ns: int) -> TargetLine:
         observed = self.observed
         pose, status = observed.poses.get(id), observed.status.get(id)
         nearest_m = None
@@ -251,7 +273,15 @@ class Recorder:
             growth_ms=None if status is None else status.growth_ms,
             gap=None if status is None else status.gap_mean,
             captures=self.captures_of[id],
+            pose_age_s=self._pose_age_s(id, now_ns),
         )
+
+    def _pose_age_s(self, target: str, now_ns: int) -> float | None:
+        tracking, status = self.trackings.of(target), self.observed.status.get(target)
+        if tracking is None:
+            return None if status is None else status.pose_age_s
+        age_ns = tracking.age_ns(now_ns)
+        return None if age_ns is None else age_ns / NS_PER_S
 
     def report(
         self,
@@ -282,6 +312,13 @@ class Recorder:
             "captures": total("captures"),
             "collisions": total("collisions"),
             "lethal_entries": total("lethal_entries"),
+            "tracking": {
+                "lost": total("trackers_lost"),
+                "lost_at_end": sorted(self.lost_targets(self.last_ns or 0)),
+                **{name: total(name) for name in ODD_POSES},
+            },
+            "driven_into": total("driven_into"),
+            "hit_by_bodies": total("hit_by_bodies"),
             "stranded": _whole(observed.gauge("stranded")),
             "lost": _whole(observed.gauge("lost")),
             "states_at_end": _by_state(observed.vehicles().count_states()),
@@ -338,7 +375,9 @@ class Recorder:
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
 
 
-TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "tick_ms")
+ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
+"""What planners count of poses that do not count, or look wrong."""
+TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 
 
@@ -349,10 +388,9 @@ def quantiles(histogram: Histogram) -> dict[str, float | None]:
 def _expected(scenario: Scenario) -> list[tuple[str, str]]:
     """(role, id) of the processes that a complete run has; "" stands for any id."""
     targets = scenario.target_ids
-    driven = any(target.is_simulated for target in scenario.targets)
     return [
         ("keeper", ""),
-        *([("targets", "")] if driven else []),
+        ("targets", ""),
         *(("planner", ranked_id(id, rank)) for rank in range(scenario.standbys.planner + 1) for id in targets),
         *(("agent", plan.id) for plan in plan_agents(scenario)),
     ]

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from launch_scripts.parent_death import end_with_parent
 from launch_scripts.simulation.trial import SECONDS, Verdict, try_seed
-from launch_scripts.simulation.worlds import WORLDS
+from launch_scripts.simulation.worlds import MIXED
 from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 
@@ -21,7 +21,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 MIX = "mix"
-"""Each seed in the world of `WORLDS` that is its turn."""
+"""Each seed in the world of `MIXED` that is its turn."""
 
 
 def parse_seeds(text: str) -> range:
@@ -33,7 +33,7 @@ def parse_seeds(text: str) -> range:
 
 
 def world_of(name: str, seed: int) -> str:
-    return WORLDS[seed % len(WORLDS)] if name == MIX else name
+    return MIXED[seed % len(MIXED)] if name == MIX else name
 
 
 def run_seeds(

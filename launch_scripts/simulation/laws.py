@@ -151,6 +151,7 @@ class Waits:
         for vehicle in node.service.agent.vehicles.values():
             cell, waited_s = self._waited_s.get(vehicle.id, (-1, 0.0))
             waits = vehicle.state in (VehicleState.FOLLOWING, VehicleState.WAITING)
+            waits = waits and not node.service.agent.stopped(vehicle.id)
             waited_s = waited_s + counts_s if waits and cell == vehicle.cell else 0.0
             self._waited_s[vehicle.id] = (vehicle.cell, waited_s)
             if waited_s > self.longest_s:

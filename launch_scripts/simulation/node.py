@@ -53,6 +53,8 @@ class Node:
         self.store: KeeperStore | None = None
         self.promises: MemoryPromiseStore | None = None
         self.skew_ns = skew_ns
+        self.retired = False
+        """Whether it never starts again."""
         self.added = added
         self._simulation = simulation
         self._clock = simulation.scheduler.clock
@@ -75,7 +77,7 @@ class Node:
 
     def boot(self) -> None:
         """Start a new incarnation."""
-        if self.bus is not None:
+        if self.bus is not None or self.retired:
             return
         simulation = self._simulation
         simulation.log.event(self._clock.now_ns(), "boot", self.name)

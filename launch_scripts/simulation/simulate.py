@@ -14,20 +14,25 @@ from typing import Any, TextIO
 
 import msgspec
 
-from launch_scripts.process_table import ENTRIES, STOP_ORDER, ProcessSpec, processes_of
+from launch_scripts.process_table import ENTRIES, STOP_ORDER, ProcessSpec, planner_spec, processes_of
 from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
-from swarm.bus.bus import Appeared, Disappeared, Event, Heard
+from swarm.bus.bus import Appeared, AskEnded, Disappeared, Event, Heard, Replied
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
+from swarm.order_book import OrderBook
+from swarm.ranks import ranked_id
 from swarm.runtime.garbage import collected_rarely
 from swarm.wire.authentication import Authenticator
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.orders import GiveOrder, Order, Orders, ZoneOrder
+from swarm.wire.topics import GIVE_ORDER, ZONES
 
 SIMULATED_ROLES = ("keeper", "planner", "targets", "agent")
 BOOT_SPREAD_S = 0.3
@@ -65,6 +70,8 @@ class Simulation:
 
     after_tick  called with a node after each of its ticks
     after_boot  called with a node after each of its starts
+    book        what operators ordered and a keeper acknowledged
+    refused     what was not acknowledged: (when, order, why)
     """
 
     def __init__(
@@ -96,6 +103,10 @@ class Simulation:
             node = Node(self, spec, phases.randrange(NS_PER_S), skew_ns)
             self.nodes[node.name] = node
             self.scheduler.at(EPOCH_NS + int(phases.random() * BOOT_SPREAD_S * NS_PER_S), node.boot)
+        self.book = OrderBook()
+        self.refused: list[tuple[float, Message, str | None]] = []
+        self._operator = self.network.bus(OBSERVER, scenario.network.namespace)
+        self._orders_given = 0
         self._watch()
         self._plan_faults()
 
@@ -109,8 +120,8 @@ class Simulation:
 
     def crash(self, name: str, *, for_good: bool = False) -> None:
         """Kills a node now, and starts it again after its backoff."""
-        node = self.nodes[name]
-        if node.bus is None:
+        node = self.nodes.get(name)
+        if node is None or node.bus is None:
             return
         node.crash()
         if for_good:
@@ -145,6 +156,40 @@ class Simulation:
         startup_s = None if ready_ns is None else round((ready_ns - EPOCH_NS) / NS_PER_S, 3)
         numbers = recorder.report(run_id=self.run_id, seconds=seconds, startup_s=startup_s)
         return {**numbers, "simulated": True, "deliveries": self.log.deliveries}
+
+    def order(self, at_s: float, order: GiveOrder | ZoneOrder) -> None:
+        """An operator gives an order then. A target that is added gets a planner, as a launcher would start it."""
+        self._at(at_s, lambda: self._give(order))
+
+    def _give(self, order: GiveOrder | ZoneOrder) -> None:
+        topic = ZONES if isinstance(order, ZoneOrder) else GIVE_ORDER
+        self._orders_given += 1
+        self.log.event(self.scheduler.clock.now_ns(), "order", str(self._orders_given))
+
+        def post(event: Event) -> None:
+            match event:
+                case Replied(message=Orders(given=Order() as given)):
+                    self.book.merge([given], self.scheduler.clock.now_ns())
+                    self._start_planners()
+                case AskEnded(replies=0, failure=failure):
+                    self.refused.append((self.now_s, order, failure))
+
+        self._operator.ask(topic, order, post, tag=f"order-{self._orders_given}", timeout_s=1.0, keeper="0")
+
+    def _start_planners(self) -> None:
+        """As a launcher does: a planner for each target, and none for one that was removed."""
+        targets = self.book.targets(self.scenario)
+        standbys = self.scenario.standbys.planner
+        wanted = {ranked_id(id, rank) for id in targets for rank in range(standbys + 1)}
+        there = {node.spec.id: node for node in self.nodes.values() if node.spec.role == "planner"}
+        for id in sorted(wanted - there.keys()):
+            node = Node(self, planner_spec(id), self._phases.randrange(NS_PER_S), 0)
+            self.nodes[node.name] = node
+            self.scheduler.after(NS_PER_S // 2, node.boot)
+        for id in sorted(there.keys() - wanted):
+            node = self.nodes.pop(there[id].name)
+            node.crash()
+            node.retired = True
 
     def _watch(self) -> None:
         """Subscribes the recorder to its topics."""

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from launch_scripts.process_table import processes_of
+from launch_scripts.simulation.body_law import BodyLaw
 from launch_scripts.simulation.faults import FaultPlan, random_plan
 from launch_scripts.simulation.laws import Laws, Routed, Waits, missing, replica_of
 from launch_scripts.simulation.simulate import SIMULATED_ROLES, Simulation
@@ -32,6 +33,8 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
 
     broken          a sentence per law that did not hold
     longest_wait_s  see `laws.Waits`
+    entered         cells that vehicles entered; near_rovers: within two cells of one; met_rovers: onto one, which
+                    had not been reported in time
     routed_after_s  from when all processes work again until every vehicle has a route; None if one never has
     faults          how many of each kind there were
     """
@@ -43,6 +46,9 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     longest_wait_s: float = 0.0
     routed_after_s: float | None = None
     captures: int = 0
+    entered: int = 0
+    near_rovers: int = 0
+    met_rovers: int = 0
     deliveries: int = 0
     faults: dict[str, int] = {}
     wall_s: float = 0.0
@@ -83,6 +89,9 @@ def try_seed(name: str, seed: int, seconds: float = SECONDS, given: Scenario | N
         longest_wait_s=trial.waits.longest_s,
         routed_after_s=trial.routed.after_s,
         captures=simulation.report(seconds)["captures"] or 0,
+        entered=trial.bodies.entered,
+        near_rovers=trial.bodies.near,
+        met_rovers=len(trial.bodies.met),
         deliveries=simulation.log.deliveries,
         faults=_count(plan),
         wall_s=time.perf_counter() - began_s,
@@ -94,6 +103,7 @@ class Trial:
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
+        self.bodies = BodyLaw(simulation)
         self.laws, self.waits, self.routed = Laws(simulation), Waits(simulation), Routed(simulation)
 
     def run(self, seconds: float) -> list[str]:
@@ -116,6 +126,8 @@ class Trial:
             broken.append(f"collision at {when_s:.2f} s: {one} and {other} on cell {cell}")
         for when_s, vehicle, cell in laws.lethal[:_SHOWN]:
             broken.append(f"lethal entry at {when_s:.2f} s: {vehicle} on cell {cell}")
+        for when_s, vehicle, body, cell in self.bodies.broken[:_SHOWN]:
+            broken.append(f"driven into body {body} at {when_s:.2f} s: {vehicle} on cell {cell}")
         if lost := missing(laws.stored(), laws.acknowledged):
             broken.append(f"{len(lost)} acknowledged sets are lost, such as {lost[0]}")
         return broken + self._replicas() + self._waited() + self._routes()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from shared_map.terrain.terrain import Terrain, build_terrain, terrain_of_pace
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import RoverConfig, Scenario
 
 CROWDS = ("open", "doors", "corridor", "maze")
 SMALL = parse_scenario("""
@@ -73,7 +73,16 @@ capture_range_m = 60
 reassign_s = 2
 """)
 """Eight agents, whose vehicles cross borders of plots and regions all the time."""
-WORLDS = ("small", "wide", *CROWDS)
+ROVERS = "rovers"
+"""A crowd among which 20 rovers drive that look out for nobody."""
+MIXED = ("small", "wide", *CROWDS)
+WORLDS = (*MIXED, ROVERS)
+_ROVERS = (
+    RoverConfig(name="quick", count=8, speed_m_per_s=3.0, radius_m=1.0),
+    RoverConfig(name="slow", count=8, speed_m_per_s=0.8, radius_m=4.0),
+    RoverConfig(name="wide", count=2, speed_m_per_s=1.0, radius_m=12.0),
+    RoverConfig(name="still", count=2, speed_m_per_s=0.0, radius_m=3.0),
+)
 _CROWD = """
 name = "crowd"
 time_scale = 10
@@ -131,6 +140,10 @@ def seeded(seed: int, scenario: Scenario = SMALL) -> Scenario:
 
 def world(name: str, seed: int) -> tuple[Scenario, Terrain]:
     """A world of `WORLDS` with a seed."""
+    if name == ROVERS:
+        kind = CROWDS[seed % len(CROWDS)]
+        scenario, terrain = crowd(kind, seed, vehicles=200, per_agent=25)
+        return msgspec.structs.replace(scenario, name=f"rovers-{kind}", rovers=_ROVERS), terrain
     if name in CROWDS:
         return crowd(name, seed, vehicles=200, per_agent=25)
     scenario = seeded(seed, {"small": SMALL, "wide": WIDE}[name])

@@ -11,6 +11,7 @@ from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
@@ -18,7 +19,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     terrain = load_terrain(setup)
     truth = load_truth(setup, terrain)
     inbox = Inbox()
-    with open_bus(setup.scenario.network, patient=True) as bus:
+    network = setup.scenario.network
+    with open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus:
         service = TargetsService(setup, terrain, truth, bus, inbox.post)
         process = Process(service, inbox, MonotonicClock(), TICK_HZ)
         process.stop_on_signals()

@@ -13,8 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.world.body_referee import BodyHit as BodyHit
+from launch_scripts.world.body_referee import BodyReferee, Stay
 from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
 from swarm.wire.fields import column
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.vehicles import Fleet
 
 _SKEW_NS = NS_PER_S // 200
@@ -42,19 +46,12 @@ class LethalEntry:
     stamp_ns: int
 
 
-@dataclass(slots=True, eq=False)
-class _Stay:
-    """A vehicle on a cell, from the first to the last time at which it is known to be there."""
-
-    vehicle: str
-    cell: int
-    begin_ns: int
-    end_ns: int
+Broken = Collision | LethalEntry | BodyHit
 
 
 @dataclass(slots=True)
 class _Vehicle:
-    stay: _Stay
+    stay: Stay
     author: str
     seq: int
     stamp_ns: int
@@ -66,21 +63,26 @@ class Referee:
     truth_s_per_m  float32 (rows, cols); inf is lethal
     """
 
-    def __init__(self, truth_s_per_m: NDArray[np.float32]) -> None:
+    def __init__(self, truth_s_per_m: NDArray[np.float32], grid: GridSpec) -> None:
         self._truth_s_per_m = truth_s_per_m.reshape(-1)
         self._vehicles: dict[str, _Vehicle] = {}
-        self._stays: dict[int, list[_Stay]] = {}
+        self._stays: dict[int, list[Stay]] = {}
         self._encounters: dict[tuple[str, str], int] = {}
         self._swept_ns = 0
+        self._bodies = BodyReferee(grid)
 
     @property
     def cells(self) -> NDArray[np.int64]:
         """Last known cell of every vehicle."""
         return np.fromiter((vehicle.stay.cell for vehicle in self._vehicles.values()), dtype=np.int64)
 
-    def hear(self, fleet: Fleet) -> list[Collision | LethalEntry]:
+    def hear_body(self, body: Body, now_ns: int) -> None:
+        """Take in where a body is."""
+        self._bodies.hear(body, now_ns)
+
+    def hear(self, fleet: Fleet) -> list[Broken]:
         """Returns the laws that a report proves broken. Cells outside the grid are ignored."""
-        broken: list[Collision | LethalEntry] = []
+        broken: list[Broken] = []
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
             if cell < len(self._truth_s_per_m):
                 broken.extend(self._report(id, cell, fleet))
@@ -88,13 +90,15 @@ class Referee:
             self._sweep(fleet.stamp_ns)
         return broken
 
-    def _report(self, id: str, cell: int, fleet: Fleet) -> Iterator[Collision | LethalEntry]:
+    def _report(self, id: str, cell: int, fleet: Fleet) -> Iterator[Broken]:
         stamp_ns = fleet.stamp_ns
+        since_ns = 0
         known = self._vehicles.get(id)
         if known is not None:
             if stamp_ns <= known.stamp_ns:
                 return
             gapless = fleet.author == known.author and fleet.seq <= known.seq + 1
+            since_ns = stamp_ns if gapless else known.stamp_ns
             known.author, known.seq, known.stamp_ns = fleet.author, fleet.seq, stamp_ns
             stay = known.stay
             if cell == stay.cell or gapless:
@@ -102,7 +106,7 @@ class Referee:
                 yield from self._meetings(stay)
             if cell == stay.cell:
                 return
-        entered = _Stay(id, cell, stamp_ns, stamp_ns)
+        entered = Stay(id, cell, stamp_ns, stamp_ns, since_ns)
         self._stays.setdefault(cell, []).append(entered)
         if known is None:
             self._vehicles[id] = _Vehicle(entered, fleet.author, fleet.seq, stamp_ns)
@@ -111,7 +115,8 @@ class Referee:
         if not self._truth_s_per_m.item(cell) < math.inf:
             yield LethalEntry(id, cell, stamp_ns)
 
-    def _meetings(self, stay: _Stay) -> Iterator[Collision]:
+    def _meetings(self, stay: Stay) -> Iterator[Collision | BodyHit]:
+        yield from self._bodies.check(stay)
         here = self._stays.get(stay.cell, ())
         if len(here) < 2:
             return

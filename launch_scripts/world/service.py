@@ -5,22 +5,25 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.world.referee import Collision, LethalEntry
+from launch_scripts.world.referee import BodyHit, Collision, LethalEntry
+from launch_scripts.world.rovers import Rovers
 from launch_scripts.world.targets import Action, Captured, Publish, TargetWorld
 from launch_scripts.world.telling import Telling
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import ids_of
 from swarm.liveness import Roster
 from swarm.ranks import job_of
 from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
+from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
+from swarm.wire.topics import BODY, COST, FLEET, POSE, STATUS, TRUE_POSE, Topic
 
 TICK_HZ = 10.0
 _ASK_NS = NS_PER_S // 2
@@ -28,7 +31,8 @@ _ASK = "where"
 
 
 class TargetsService:
-    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`."""
+    """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`; `driven_into`, bodies
+    that vehicles drove into, and `hit_by_bodies`, the other way round."""
 
     def __init__(
         self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
@@ -40,29 +44,50 @@ class TargetsService:
         self._ask_due_ns = 0
         self._candidacy = Candidacy(setup, setup.scenario.standbys.targets, TICK_HZ, bus, post)
         self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation, leads=self._candidacy.leads)
+        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obeyed_version: int | None = None
+        self._heard: set[str] = set()
+        """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
         self._telling = Telling(terrain.grid.resolution_m)
         self._planners = Roster()
         self.counters = self._member.counters
-        for name in ("captures", "collisions", "lethal_entries", "poses"):
+        for name in ("captures", "collisions", "driven_into", "hit_by_bodies", "lethal_entries", "poses"):
             self.counters.count(name, 0)
+
+    @property
+    def leads(self) -> bool:
+        return self._world.leads
+
+    @property
+    def rovers(self) -> Rovers:
+        return self._world.rovers
 
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._bus.subscribe(FLEET, self._post)
+        self._bus.subscribe(BODY, self._post)
         self._bus.subscribe(STATUS, self._post)
         self._bus.watch_alive(self._post, role="planner")
-        for target in self._scenario.targets:
-            if not target.is_simulated or self._scenario.standbys.targets:
-                for id in ids_of(target):
-                    self._bus.subscribe(self._topic(id), self._post, target=id)
+        self._hear_targets()
+        self._obedience.start(now_ns)
         self._candidacy.start()
+
+    def _hear_targets(self) -> None:
+        for id, target in self._obedience.book.targets(self._scenario).items():
+            if id not in self._heard and (not target.is_simulated or self._scenario.standbys.targets):
+                self._heard.add(id)
+                self._bus.subscribe(self._topic(id), self._post, target=id)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.handle(event) or self._candidacy.handle(event, now_ns):
             return
+        if self._obedience.handle(event, now_ns):
+            return
         match event:
             case Heard(message=Fleet() as fleet):
                 self._perform(self._world.hear_fleet(fleet, now_ns), now_ns)
+            case Heard(message=Body() as body):
+                self._world.hear_body(body, now_ns)
             case Heard(message=PlannerStatus() as status):
                 self._world.hear_planner(status.target, status.target_cell)
             case Replied(message=CostReply() as reply):
@@ -87,12 +112,29 @@ class TargetsService:
         if leads and self._world.listening and now_ns >= self._ask_due_ns:
             self._ask_due_ns = now_ns + _ASK_NS
             self._bus.ask(COST, CostRequest(), self._post, tag=_ASK)
+        self._obey(now_ns)
         self._perform(self._world.tick(now_ns), now_ns)
+        self._member.tell_faults(self._world.faults, now_ns)
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()
         self._member.publish_stats(now_ns)
+
+    def _obey(self, now_ns: int) -> None:
+        """Go by what is ordered. Nothing moves before it is known whether the swarm is paused."""
+        orders, version = self._obedience, self._obeyed_version
+        if not orders.known:
+            self._world.paused = True
+        elif version != orders.book.version:
+            self._obeyed_version = orders.book.version
+            obeyed = self._world.obey(orders.book, self._scenario, now_ns, first=version is None)
+            self._perform(obeyed, now_ns)
+            self._hear_targets()
+        orders.tick(now_ns)
+
+    def _obeys(self, order: Obey) -> bool:
+        return self._obeyed_version == self._obedience.book.version
 
     def _topic(self, target: str) -> Topic:
         return TRUE_POSE if target in self._scenario.untracked else POSE
@@ -109,6 +151,11 @@ class TargetsService:
                 case Collision(first, second, cell):
                     self.counters.count("collisions")
                     self._member.note(now_ns, "collision", f"{first} and {second} on one cell", cell)
+                case Body():
+                    self._bus.publish(BODY, action, id=action.id)
+                case BodyHit(cell=cell, by_vehicle=by_vehicle):
+                    self.counters.count("driven_into" if by_vehicle else "hit_by_bodies")
+                    self._member.note(now_ns, "body-collision", action.sentence, cell)
                 case LethalEntry(vehicle, cell):
                     self.counters.count("lethal_entries")
                     self._member.note(now_ns, "lethal-entry", f"{vehicle} entered a lethal cell", cell)

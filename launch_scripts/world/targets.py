@@ -12,18 +12,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.world.referee import Collision, LethalEntry, Referee
-from launch_scripts.world.walks import Budget, TrueTerrain, Walker, far_place, slowness_of
+from launch_scripts.world.referee import BodyHit, Collision, LethalEntry, Referee
+from launch_scripts.world.rovers import Rovers
+from launch_scripts.world.walks import Budget, TrueTerrain, Walker, WalkWorld, far_place, slowness_of, walk_of
 from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
+from swarm.config.plugin_names import walk_named_by
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
-from swarm.liveness import POSE_SILENCE_NS, Newest
+from swarm.order_book import OrderBook
+from swarm.plugins.find import find_plugin
+from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from vehicle_agent.target_bodies import TargetBodies
 
 LISTEN_NS = NS_PER_S
 """A starting process asks planners where their targets are before it places them itself: it waits so long for a
@@ -33,6 +39,9 @@ PATIENCE_NS = 5 * NS_PER_S
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
 _LONGEST_TICK_S = 1.0
+TRACKER = "targets"
+"""The name under which this process and its standbys tell poses: a later life takes over at once."""
+_WAYS_PER_TICK = 1
 _MOST_COUNTED = 1 << 32
 """Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
 
@@ -49,7 +58,7 @@ class Captured:
     cell: int
 
 
-Action = Publish | Captured | Collision | LethalEntry
+Action = Publish | Captured | Collision | LethalEntry | BodyHit | Body
 
 
 @dataclass(eq=False)
@@ -58,6 +67,7 @@ class _Target:
     walker: Walker
     x_m: float
     y_m: float
+    chance: random.Random
     placed: bool = False
     unheard_of: bool = False
     planner_up: bool = False
@@ -65,6 +75,7 @@ class _Target:
     captures: int = 0
     jumps: int = 0
     calm_until_ns: int = 0
+    ordered_ns: int = 0
 
 
 class TargetWorld:
@@ -73,8 +84,12 @@ class TargetWorld:
     An incarnation that starts while planners run goes on where they last saw the targets. A capture counts once:
     a target that jumps is out of reach for a cool-down, one that stays must first have been alone for another.
 
-    leads  false for a standby, which follows the poses that another tells and does nothing itself
+    leads   false for a standby, which follows the poses that another tells and does nothing itself
+    paused  nothing moves, and nobody is captured
+    faults  what plug-ins did wrong, for the owner to tell and clear
     """
+
+    paused = False
 
     def __init__(
         self,
@@ -86,6 +101,8 @@ class TargetWorld:
         leads: bool = True,
     ) -> None:
         self.leads = leads
+        self.faults: list[str] = []
+        self._budget = Budget()
         self._grid = terrain.grid
         # A target keeps to cells where a vehicle fits, by the truth and by the prior map: others are out of reach.
         halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
@@ -93,20 +110,25 @@ class TargetWorld:
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
         self._terrain = TrueTerrain(terrain.grid, pace)
-        self._referee = Referee(truth_s_per_m)
+        self._referee = Referee(truth_s_per_m, terrain.grid)
+        self._target_bodies = TargetBodies(scenario, terrain.grid)
+        self.rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
-        # Of the poses of simulated targets that others tell: which are news, and the highest incarnation.
-        self._poses = Newest(silence_ns=POSE_SILENCE_NS)
+        # Who tracks external targets, and for a standby who leads; and the highest incarnation of a leader.
+        self._trackings = Trackings(terrain.grid)
         self._others_incarnation = 0
         self._capture_range_m = scenario.vehicles.capture_range_m
         self._time_scale = scenario.time_scale
         self._started_ns: int | None = None
         self._ticked_ns = 0
         self._targets = {
-            id: self._place(id, config, scenario) for config in scenario.targets for id in ids_of(config)
+            id: self._place(id, config, scenario, f"targets[{n}].walk")
+            for n, config in enumerate(scenario.targets)
+            for id in ids_of(config)
         }
 
-    def _place(self, id: str, config: TargetConfig, scenario: Scenario) -> _Target:
+    def _place(self, id: str, config: TargetConfig, scenario: Scenario, key: str) -> _Target:
+        """key  what names the target's walk"""
         chance = random.Random(f"{scenario.seed}/{id}")
         if config.start is None:
             cell = self._terrain.random_home(chance)
@@ -117,8 +139,41 @@ class TargetWorld:
             cell = self._grid.cell(*config.start)
             if self._terrain.lethal(cell):
                 raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
-        walker = Walker(id, config.walk, slowness_of(config, scenario.cost), chance, cell)
-        return _Target(config, walker, *self._grid.centre_m(cell))
+        # An order names a built-in walk by its type: nothing that comes over the network is imported.
+        plugin = find_plugin(walk_named_by(config, key), scenario.plugin_folder)
+        world = WalkWorld(id, self._terrain, chance, self._budget)
+        walk = walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
+        walker = Walker(id, walk, slowness_of(config, scenario.cost), cell)
+        return _Target(config, walker, *self._grid.centre_m(cell), chance)
+
+    def obey(self, book: OrderBook, scenario: Scenario, now_ns: int, *, first: bool) -> list[Action]:
+        """Go by what is ordered: who is there, and who was put somewhere else.
+
+        first  what was ordered before this process began: its targets are where planners last saw them
+        """
+        self._time_scale = book.setting("time_scale", scenario.time_scale)
+        self.paused = book.paused
+        configs = book.targets(scenario)
+        for id in self._targets.keys() - configs.keys():
+            del self._targets[id]
+        actions: list[Action] = []
+        for id, config in configs.items():
+            order = book.about("target", id)
+            target = self._targets.get(id)
+            if target is None or (order is not None and order.added and target.config != config):
+                target = self._targets[id] = self._place(id, config, scenario, f"target {id}: walk")
+            if order is None or order.cell is None or order.stamp_ns == target.ordered_ns:
+                continue
+            target.ordered_ns = order.stamp_ns
+            if not config.is_simulated or order.cell >= self._grid.cells or (target.placed and first):
+                continue
+            target.walker.put(self._terrain.nearest(order.cell))
+            if not first:
+                target.placed = True
+                target.jumps += 1
+                if self.leads:
+                    actions.append(Publish(self._pose(id, target, now_ns)))
+        return actions
 
     def lead(self, leads: bool) -> None:
         """Take over where the poses of the one before ended, or leave it to another.
@@ -160,12 +215,14 @@ class TargetWorld:
     def hear_pose(self, pose: TargetPose, now_ns: int) -> None:
         """Takes the pose of an external target; as a standby also where whoever leads has moved one of ours."""
         target = self._targets.get(pose.target)
-        if target is None or not 0 <= pose.cell < self._grid.cells:
+        if target is None or (target.config.is_simulated and self.leads):
             return
+        counts = self._trackings.hear(pose, now_ns)
+        if counts is None:
+            return
+        pose = counts
         if target.config.is_simulated:
-            number = (pose.incarnation, pose.seq)
-            lethal = self._terrain.lethal(pose.cell)
-            if self.leads or lethal or not self._poses.is_news(pose.target, number, now_ns):
+            if self._terrain.lethal(pose.cell):
                 return
             self._others_incarnation = max(self._others_incarnation, pose.incarnation)
             if pose.captures > target.captures:
@@ -176,15 +233,23 @@ class TargetWorld:
             target.walker.put(pose.cell)
         target.x_m, target.y_m = pose.x_m, pose.y_m
         target.placed = True
+        self._refer(pose, now_ns)
+
+    def hear_body(self, body: Body, now_ns: int) -> None:
+        """Takes where a body is: of anybody's for the referee, of a rover that another leader moves for itself."""
+        if not self.leads:
+            self.rovers.hear(body)
+        self._referee.hear_body(body, now_ns)
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
-        actions: list[Action] = list(self._referee.hear(fleet))
-        if not self.leads:
-            return []
-        for index, vehicle in self._catchers(fleet):
+        seen = self._referee.hear(fleet)
+        if not self.leads or self.paused:
+            return list(seen) if self.leads else []
+        actions: list[Action] = []
+        for index, vehicle in self._catchers(fleet, now_ns):
             id = fleet.target_ids[index]
             actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
-        return actions
+        return [*actions, *seen]
 
     def tick(self, now_ns: int) -> list[Action]:
         """Moves all targets and returns their poses."""
@@ -193,26 +258,35 @@ class TargetWorld:
         if self._started_ns is None:
             self._started_ns = self._ticked_ns = now_ns
         elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * self._time_scale
+        if self.paused:
+            elapsed_s = 0.0
         self._ticked_ns = now_ns
         waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells
-        budget = Budget()
-        actions: list[Action] = []
+        self._budget.ways = _WAYS_PER_TICK
+        actions: list[Action] = [*self.rovers.tick(0.0 if self.paused else self._time_scale, now_ns)]
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
                 continue
             if target.placed:
-                target.walker.advance(self._terrain, elapsed_s, vehicles, budget)
+                target.walker.advance(self._terrain, elapsed_s, vehicles)
             target.placed = True
-            actions.append(Publish(self._pose(id, target, now_ns)))
+            pose = self._pose(id, target, now_ns)
+            self._refer(pose, now_ns)
+            actions.append(Publish(pose))
         return actions
+
+    def _refer(self, pose: TargetPose, now_ns: int) -> None:
+        for body in self._target_bodies.bodies_of(pose, now_ns):
+            self._referee.hear_body(body, now_ns)
 
     def _pose(self, id: str, target: _Target, now_ns: int) -> TargetPose:
         target.x_m, target.y_m = target.walker.position_m(self._terrain)
         target.seq += 1
         return TargetPose(
             target=id,
+            tracker=TRACKER,
             incarnation=self._incarnation,
             seq=target.seq,
             stamp_ns=now_ns,
@@ -223,8 +297,9 @@ class TargetWorld:
             jumps=target.jumps,
         )
 
-    def _catchers(self, fleet: Fleet) -> list[tuple[int, str]]:
-        """(target's index, first vehicle within reach of it) of the targets that a report says are chased.
+    def _catchers(self, fleet: Fleet, now_ns: int) -> list[tuple[int, str]]:
+        """(target's index, first vehicle within reach of it) of the targets that a report says are chased. A target
+        whose tracker is lost may be anywhere: nobody captures it.
 
         A vehicle that says ARRIVED is believed at twice the range: it compares cells, and the target may have moved
         on since it looked.
@@ -234,8 +309,8 @@ class TargetWorld:
         if not len(chasing):
             return []
         chased = chased[chasing]
-        # inf for targets of others and those which are not placed yet: no vehicle is near.
-        known = [self._targets.get(id) for id in fleet.target_ids]
+        # inf for targets of others, those which are not placed yet and lost ones: no vehicle is near.
+        known = [None if self._lost(id, now_ns) else self._targets.get(id) for id in fleet.target_ids]
         places = [(t.x_m, t.y_m) if t is not None and t.placed else (math.inf, math.inf) for t in known]
         x_m, y_m = np.array(places).T
         east_m = column(fleet.east_m, "<f4")[chasing] - (x_m[chased] - self._grid.west_m)
@@ -248,6 +323,11 @@ class TargetWorld:
         for index, vehicle in zip(chased[near].tolist(), chasing[near].tolist(), strict=True):
             caught.setdefault(index, fleet.ids[vehicle])
         return list(caught.items())
+
+    def _lost(self, id: str, now_ns: int) -> bool:
+        target, tracking = self._targets.get(id), self._trackings.of(id)
+        simulated = target is not None and target.config.is_simulated
+        return not simulated and tracking is not None and tracking.lost(now_ns)
 
     def _reached(self, id: str, target: _Target, vehicle: str, now_ns: int) -> list[Action]:
         calm = now_ns >= target.calm_until_ns
@@ -263,7 +343,7 @@ class TargetWorld:
         target.jumps += 1
         clear_cells = 1 + int(2 * self._capture_range_m / self._grid.resolution_m)
         walker = target.walker
-        walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, walker.chance))
+        walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, target.chance))
         return [captured, Publish(self._pose(id, target, now_ns))]
 
 

@@ -7,24 +7,27 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from shared_map.arrays import CellsOf
-from swarm.config.scenario import CostConfig, TargetConfig, Walk
+from swarm.config.scenario import CostConfig, TargetConfig
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.plugins.door import Door, Nonsense, Tell
+from swarm.plugins.find import Plugin
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-STANDING: frozenset[Walk] = frozenset(("still", "external"))
+STANDING: frozenset[str] = frozenset(("still", "external"))
 """Walks by which a simulated target takes no step."""
-FLEEING: frozenset[Walk] = frozenset(("evade",))
+FLEEING: frozenset[str] = frozenset(("evade",))
 """Walks that depend on where vehicles are."""
 WAY_HALF_CELLS = 96
 """Waypoints lie in a window which reaches this far to every side: bounds the time to compute a way."""
@@ -38,7 +41,8 @@ class TrueTerrain:
 
     def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32]) -> None:
         self.grid = grid
-        self.pace_s_per_m = pace_s_per_m
+        self.pace_s_per_m = pace_s_per_m.view()
+        self.pace_s_per_m.flags.writeable = False  # walks are told it
         passable = np.isfinite(pace_s_per_m)
         if not passable.any():
             raise TerrainError("every cell of the terrain is lethal: no target could stand on it")
@@ -60,6 +64,15 @@ class TrueTerrain:
 
     def _passable(self, row: int, col: int) -> bool:
         return self.pace_s_per_m.item(row, col) < math.inf
+
+    def nearest(self, cell: int) -> int:
+        """The passable cell nearest to a cell, which may be itself."""
+        if not self.lethal(cell):
+            return cell
+        rows, cols = np.nonzero(np.isfinite(self.pace_s_per_m))
+        row, col = divmod(cell, self.grid.cols)
+        best = int(((rows - row) ** 2 + (cols - col) ** 2).argmin())
+        return int(rows[best]) * self.grid.cols + int(cols[best])
 
     def random_home(self, chance: random.Random) -> int:
         return self._home.cell(chance.randrange(len(self._home)))
@@ -143,6 +156,161 @@ def _steps_graph(pace: NDArray[np.float32]) -> csr_array[np.float64]:
     return csr_array(edges, shape=(rows * cols, rows * cols))
 
 
+@dataclass
+class Budget:
+    """Number of ways that may still be computed in this tick. Other walkers wait for the next."""
+
+    ways: float = math.inf
+
+    def take(self) -> bool:
+        self.ways -= 1
+        return self.ways >= 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WalkWorld:
+    """What the walk of one target is made with.
+
+    target   its id
+    terrain  the true pace, and the steps that are possible
+    chance   numbers that follow from the run's seed and the target's id
+    budget   how many ways may still be computed now, by all walks together
+    """
+
+    target: str
+    terrain: TrueTerrain
+    chance: random.Random
+    budget: Budget
+
+
+class Walk(Protocol):
+    """Chooses the steps of one target. A plug-in is made as `Name(world: WalkWorld, options)`."""
+
+    def choose(self, cell: int, vehicles: NDArray[np.int64]) -> int | None:
+        """The cell of the next step, one of `world.terrain.steps(cell)`; None to stand still for now.
+
+        cell      where the target is; anywhere, after it was captured
+        vehicles  where vehicles are, one cell each
+        """
+        ...
+
+
+class Still:
+    """Stays where it is."""
+
+    def __init__(self, world: WalkWorld) -> None:
+        pass
+
+    def choose(self, cell: int, vehicles: NDArray[np.int64]) -> int | None:
+        return None
+
+
+class Wander:
+    """A new heading now and then, and where it is blocked."""
+
+    def __init__(self, world: WalkWorld) -> None:
+        self._world = world
+        self._heading = 0
+
+    def choose(self, cell: int, vehicles: NDArray[np.int64]) -> int | None:
+        chance, terrain = self._world.chance, self._world.terrain
+        if chance.random() < _TURN_SHARE:
+            self._heading = chance.randrange(8)
+        for turn in (0, 1, -1, 2, -2, 3, -3, 4):
+            heading = (self._heading + turn) % 8
+            to = terrain.step(cell, heading)
+            if to is not None:
+                self._heading = heading
+                return to
+        return None
+
+
+class Waypoints:
+    """To random places, by the cheapest way to each.
+
+    way     cells to come, the last first
+    led_to  where the last step led; elsewhere, `way` is of no use
+    """
+
+    def __init__(self, world: WalkWorld) -> None:
+        self.way: list[int] = []
+        self.led_to: int | None = None
+        self._world = world
+
+    def choose(self, cell: int, vehicles: NDArray[np.int64]) -> int | None:
+        if cell != self.led_to:  # it was put elsewhere
+            self.way = []
+        if not self.way and self._world.budget.take():
+            self.way = self._world.terrain.way(cell, self._world.chance)[::-1]
+        self.led_to = self.way.pop() if self.way else None
+        return self.led_to
+
+
+class Flee:
+    """To the neighbour with the fewest and farthest vehicles around it; wanders while none is near."""
+
+    def __init__(self, world: WalkWorld) -> None:
+        self._terrain = world.terrain
+        self._wander = Wander(world)
+
+    def choose(self, cell: int, vehicles: NDArray[np.int64]) -> int | None:
+        grid = self._terrain.grid
+        row, col = grid.row_col(cell)
+        rows, cols = np.divmod(vehicles, grid.cols)
+        near = np.maximum(abs(rows - row), abs(cols - col)) <= _FEAR_CELLS
+        if not near.any():
+            return self._wander.choose(cell, vehicles)
+        rows, cols = rows[near], cols[near]
+
+        def crowding(to: int) -> float:
+            to_row, to_col = grid.row_col(to)
+            return float((1.0 / ((rows - to_row) ** 2 + (cols - to_col) ** 2 + 0.25)).sum())
+
+        steps = self._terrain.steps(cell)
+        return min(steps, key=lambda step: (crowding(step[1]), step[1]))[1] if steps else None
+
+
+WALKS: Mapping[str, Callable[[WalkWorld], Walk]] = {
+    "still": Still,
+    "random": Wander,
+    "waypoints": Waypoints,
+    "evade": Flee,
+    "external": Still,
+}
+"""The built-in walks. That of an external target is another process's."""
+
+
+def walk_of(plugin: Plugin, world: WalkWorld, tell: Tell) -> Walk:
+    """The walk that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+    if plugin.factory is None:
+        return WALKS[plugin.named.name](world)
+    return PluginWalk(plugin.make(world), world.terrain, Door(plugin, tell))
+
+
+class PluginWalk:
+    """The steps that a plug-in chooses, each of them legal. The target stands still once it has failed."""
+
+    def __init__(self, walk: Walk, terrain: TrueTerrain, door: Door) -> None:
+        self._walk = walk
+        self._terrain = terrain
+        self._door = door
+
+    def choose(self, cell: int, vehicles: NDArray[np.int64]) -> int | None:
+        return self._door.ask(
+            lambda: self._walk.choose(cell, vehicles.copy()), lambda to: self._legal(cell, to), lambda: None
+        )
+
+    def _legal(self, cell: int, to: object) -> int | None:
+        if to is None:
+            return None
+        if not isinstance(to, (int, np.integer)) or isinstance(to, bool):
+            raise Nonsense(f"{type(to).__name__}, expected a cell or None")
+        allowed = [step for _, step in self._terrain.steps(cell)]
+        if to not in allowed:
+            raise Nonsense(f"cell {to}, which is no step from cell {cell}; expected one of {allowed} or None")
+        return int(to)
+
+
 @dataclass(eq=False)
 class Walker:
     """A target under way: on `cell`, or `progress_s` seconds into the step from there `towards` the next."""
@@ -151,28 +319,23 @@ class Walker:
     walk: Walk
     slowness: float
     """Factor on the pace of the terrain."""
-    chance: random.Random
     cell: int
     towards: int | None = None
     progress_s: float = 0.0
-    heading: int = 0
-    way: list[int] = field(default_factory=list)
-    """Cells to come, the last first."""
 
     def put(self, cell: int) -> None:
         """Places the target elsewhere."""
         self.cell = cell
         self.towards = None
         self.progress_s = 0.0
-        self.way = []
 
-    def advance(self, terrain: TrueTerrain, elapsed_s: float, vehicles: NDArray[np.int64], budget: Budget) -> None:
+    def advance(self, terrain: TrueTerrain, elapsed_s: float, vehicles: NDArray[np.int64]) -> None:
         """Moves on for some seconds. `vehicles` are the cells that an evader keeps away from."""
         if not math.isfinite(self.slowness):
             return
         for _ in range(_STEPS_PER_TICK):
             if self.towards is None:
-                self.towards = self.choose(terrain, vehicles, budget)
+                self.towards = self.walk.choose(self.cell, vehicles)
                 if self.towards is None:
                     return
             step_s = self._step_s(terrain)
@@ -195,58 +358,6 @@ class Walker:
         assert self.towards is not None
         pace = float(terrain.pace_s_per_m.flat[self.towards])
         return terrain.length_m(self.cell, self.towards) * pace * self.slowness
-
-    def choose(self, terrain: TrueTerrain, vehicles: NDArray[np.int64], budget: Budget) -> int | None:
-        """The cell of the next step; None while the target stands still or waits for the budget."""
-        match self.walk:
-            case "random":
-                return self._wander(terrain)
-            case "waypoints":
-                if not self.way and budget.take():
-                    self.way = terrain.way(self.cell, self.chance)[::-1]
-                return self.way.pop() if self.way else None
-            case "evade":
-                return self._flee(terrain, vehicles)
-            case "still" | "external":
-                return None
-
-    def _wander(self, terrain: TrueTerrain) -> int | None:
-        if self.chance.random() < _TURN_SHARE:
-            self.heading = self.chance.randrange(8)
-        for turn in (0, 1, -1, 2, -2, 3, -3, 4):
-            heading = (self.heading + turn) % 8
-            to = terrain.step(self.cell, heading)
-            if to is not None:
-                self.heading = heading
-                return to
-        return None
-
-    def _flee(self, terrain: TrueTerrain, vehicles: NDArray[np.int64]) -> int | None:
-        """The neighbour with the fewest and farthest vehicles around it; a random one while none is near."""
-        row, col = terrain.grid.row_col(self.cell)
-        rows, cols = np.divmod(vehicles, terrain.grid.cols)
-        near = np.maximum(abs(rows - row), abs(cols - col)) <= _FEAR_CELLS
-        if not near.any():
-            return self._wander(terrain)
-        rows, cols = rows[near], cols[near]
-
-        def crowding(to: int) -> float:
-            to_row, to_col = terrain.grid.row_col(to)
-            return float((1.0 / ((rows - to_row) ** 2 + (cols - to_col) ** 2 + 0.25)).sum())
-
-        steps = terrain.steps(self.cell)
-        return min(steps, key=lambda step: (crowding(step[1]), step[1]))[1] if steps else None
-
-
-@dataclass
-class Budget:
-    """Number of ways that may still be computed in this tick. Other walkers wait for the next."""
-
-    ways: int = 1
-
-    def take(self) -> bool:
-        self.ways -= 1
-        return self.ways >= 0
 
 
 def slowness_of(target: TargetConfig, cost: CostConfig) -> float:

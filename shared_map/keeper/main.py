@@ -13,6 +13,7 @@ from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 
 TICK_HZ = 10.0
 
@@ -32,9 +33,10 @@ def run(
     terrain = load_terrain(setup)
     if store_path is None and setup.run_dir is not None:
         store_path = setup.run_dir / ("map.sqlite" if setup.id == "0" else f"map-{setup.id}.sqlite")
+    network = setup.scenario.network
     with (
         KeeperStore(store_path or ":memory:", rebuild=rebuild) as store,
-        open_bus(setup.scenario.network, patient=True) as bus,
+        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
     ):
         inbox = Inbox()
         service = KeeperService(setup, terrain, bus, inbox.post, store)

@@ -5,21 +5,28 @@ from __future__ import annotations
 import logging
 from contextlib import suppress
 
+import msgspec
+
 from shared_map.keeper.base_map_transfer import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
+from shared_map.keeper.orders import KeptOrders
 from shared_map.keeper.store import Keeper, KeeperStore
+from shared_map.keeper.zones import free_name, rows_of, zone_sets, zones_of
+from shared_map.replication.marks import is_zone, standing
 from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Bus, Event, Heard, Post
+from swarm.bus.bus import Asked, Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
+from swarm.order_book import described
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.marks import Digest, MarkSet
+from swarm.wire.messages.orders import Order, ZoneOrder, Zones
 from swarm.wire.messages.targets import Sighted
-from swarm.wire.topics import SIGHTED
+from swarm.wire.topics import SIGHTED, ZONES
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +53,11 @@ class KeeperService:
         self.counters = self._member.counters
         self._bus = bus
         self._post = post
+        self._id = setup.id
+        self._terrain = terrain
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
+        self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
         self._keeper = Keeper()
         self.replica = MapReplica(terrain.grid)
         self._sync = MapSync(
@@ -65,7 +75,7 @@ class KeeperService:
         self._compact_after_ns = int(config.compact_after_s * NS_PER_S)
         self._plan = CompactionPlan(self._compact_after_ns, 0)
         self._compact_due_ns = 0
-        for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged"):
+        for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged", "orders_refused"):
             self.counters.count(name, 0)
         self._save_due_ns = 0
         self._sightings = Sightings(self.replica.filter)
@@ -83,11 +93,23 @@ class KeeperService:
         self._plan = CompactionPlan(self._compact_after_ns, now_ns, self._store.tiles_set_aside())
         self._sync.start(now_ns)
         self._bus.subscribe(SIGHTED, self._post)
+        self._bus.serve(ZONES, self._post, keeper=self._id)
+        self._orders.start(now_ns)
         log.info("keeper started: %d tiles in store %s", len(self.replica.held.tiles), self._store.path)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, Heard) and isinstance(event.message, Sighted):
             self._sightings.hear(event.message, now_ns)
+            return
+        if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
+            self._order_zone(event, event.request, now_ns)
+            return
+        ordered = self._orders.handle(event, now_ns)
+        if ordered is not False:
+            if isinstance(ordered, Order):
+                self._member.note(now_ns, "order", described(ordered))
+            elif isinstance(ordered, str):
+                self.counters.count("orders_refused")
             return
         if isinstance(event, Heard) and isinstance(event.message, Digest):
             self._plan.heard(event.message.author, now_ns)
@@ -103,6 +125,7 @@ class KeeperService:
         if now_ns >= self._sightings_due_ns:
             self._save_sightings(now_ns)
         self._sync.tick(now_ns)
+        self._orders.tick(now_ns)
         self._name_throttled(now_ns)
         counts = self.replica.counts
         self.counters.counts["marks_merged"] = counts["marks_merged"]
@@ -143,6 +166,35 @@ class KeeperService:
         self._keeper.accept(mark_set)
         self._plan.accepted(mark_set)
 
+    def _order_zone(self, asked: Asked, order: ZoneOrder, now_ns: int) -> None:
+        """Write the marks of a zone: on the disk first, as an answer promises that they stay."""
+        sets: list[MarkSet] = []
+        if order.action != "list":
+            if not order.name:
+                order = msgspec.structs.replace(order, name=free_name(self.replica))
+            found = zone_sets(order, self.replica, self._terrain, self._store.set_aside, now_ns)
+            try:
+                if isinstance(found, list):
+                    sets = found
+                    self._store.save(sets, now_ns)
+            except StoreError as error:
+                found = str(error)
+            if isinstance(found, str):
+                self.counters.count("orders_refused")
+                asked.refuse(found)
+                asked.end()
+                return
+            self.replica.merge(sets)
+            self._keeper.saved(sets)
+            for each in sets:
+                self._plan.accepted(each)
+            self._sync.publish(PublishSet(each) for each in sets)
+            self._member.note(now_ns, "order", f"zone {order.action} {order.name}")
+        zones = zones_of(self.replica, now_ns)
+        changed = order.name if sets else ""
+        asked.answer(Zones(keeper=self._id, zones=zones, changed=changed, sets=rows_of(sets)), keeper=self._id)
+        asked.end()
+
     def _compact(self, now_ns: int) -> None:
         """Compact what dead authors left, a few tiles at a time. The store is written before anything is published,
         so that it can always put back what was dropped."""
@@ -154,9 +206,14 @@ class KeeperService:
             for tile in tiles:
                 sets = self.replica.held.of_tile(tile)
                 dropped = self._store.set_aside(tile)
-                gone = {name for name in (*dropped, *(each.author for each in sets)) if plan.is_gone(name)}
-                new = compact(sets, dropped, gone, now_ns - self._compact_after_ns)
-                left = {each.author: each for each in sets if each.author in gone}
+                ended_ns = now_ns - self._compact_after_ns
+                # A zone has no process, and nothing of it may be missing from the map when one above it is removed.
+                zones = {each.author: each for each in sets if is_zone(each.author)}
+                stand = {name for name, each in zones.items() if len(standing(each, ended_ns).cells)}
+                named = {*dropped, *(each.author for each in sets)} - stand
+                gone = {name for name in named if plan.is_gone(name)}
+                new = compact(sets, dropped, gone, ended_ns)
+                left = {each.author: each for each in sets if each.author in gone or each.author in stand}
                 plan.compacted(tile, (left | {each.author: each for each in new}).values(), now_ns)
                 compacted.extend(new)
             if compacted:

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import quote
 
+import msgspec
+
 from shared_map.keeper.compaction import united, without
 from shared_map.replication.digest import Ledger
 from shared_map.replication.marks import base_seq, is_tombstone
@@ -21,6 +23,7 @@ from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.marks import SEQ_STEP, MarkSet
+from swarm.wire.messages.orders import Order
 from swarm.wire.messages.targets import Sighted
 
 log = logging.getLogger(__name__)
@@ -47,6 +50,10 @@ CREATE TABLE IF NOT EXISTS folded (
     untils_ns BLOB NOT NULL, since_ns INTEGER NOT NULL,
     PRIMARY KEY (tile, author)
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS orders (
+    subject TEXT NOT NULL, name TEXT NOT NULL, stamp_ns INTEGER NOT NULL, body BLOB NOT NULL,
+    PRIMARY KEY (subject, name)
+) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS sightings (
     target TEXT PRIMARY KEY, stamp_ns INTEGER NOT NULL, sighted BLOB NOT NULL
 ) WITHOUT ROWID;
@@ -56,6 +63,11 @@ _SEEN = """
 INSERT INTO sightings (target, stamp_ns, sighted) VALUES (?, ?, ?)
 ON CONFLICT (target) DO UPDATE SET stamp_ns = excluded.stamp_ns, sighted = excluded.sighted
 WHERE excluded.stamp_ns >= sightings.stamp_ns
+"""
+_ORDERED = """
+INSERT INTO orders (subject, name, stamp_ns, body) VALUES (?, ?, ?, ?)
+ON CONFLICT (subject, name) DO UPDATE SET stamp_ns = excluded.stamp_ns, body = excluded.body
+WHERE excluded.stamp_ns >= orders.stamp_ns
 """
 _FIELDS = ("tile", "author", "group", "epoch", "seq", "cells", "kinds", "paces", "stamps_ns", "untils_ns")
 _COLUMNS = tuple("grp" if field == "group" else field for field in _FIELDS)  # GROUP is a word of SQL
@@ -224,6 +236,25 @@ class KeeperStore:
             return []
         except (sqlite3.Error, ProtocolError) as error:
             raise StoreError(_damaged(self.path, str(error))) from error
+
+    def save_orders(self, orders: Iterable[Order]) -> None:
+        """Commit the newest orders. A StoreError leaves the store usable."""
+        rows = [(each.subject, each.name, each.stamp_ns, msgspec.json.encode(each)) for each in orders]
+        if not rows:
+            return
+        try:
+            with self._db:
+                self._db.executemany(_ORDERED, rows)
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+
+    def orders(self) -> list[Order]:
+        """The newest order about each subject."""
+        try:
+            rows = self._db.execute("SELECT body FROM orders ORDER BY subject, name").fetchall()
+            return [msgspec.json.decode(row[0], type=Order) for row in rows]
+        except (sqlite3.Error, msgspec.MsgspecError, ValueError) as error:
+            raise StoreError(_damaged(self.path, f"orders: {error}")) from error
 
     def close(self) -> None:
         """Release the file, and its lock."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from shared_map.replication.tiles import region_tiles
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import RESERVED_GROUP, Scenario
 from swarm.grid import GridSpec
 
 
@@ -56,17 +56,18 @@ def _names(listed: Sequence[str], group: str) -> bool:
 
 
 class MarkFilter:
-    """Which sets a replica takes in, by author and by tile. Either limit may be absent.
+    """Which sets a replica takes in, by author and by tile. Either limit may be absent. Zones of operators concern
+    every group.
 
     groups   whose statements count, by the id of their author and by what the set says; None: everybody's
     regions  about which regions; None: all
     """
 
     def __init__(self, grid: GridSpec, groups: frozenset[str] | None = None) -> None:
-        self.groups = groups
+        self.groups = None if groups is None else groups | {RESERVED_GROUP}
         self.regions: frozenset[int] | None = None
         self._grid = grid
-        self._prefixes = None if groups is None else tuple(f"{group}." for group in sorted(groups))
+        self._prefixes = None if self.groups is None else tuple(f"{group}." for group in sorted(self.groups))
         self._tiles: frozenset[int] | None = None  # those of `regions`
 
     def limit_to(self, regions: frozenset[int]) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from shared_map.replication.digest import Held, Ledger, fingerprint
 from shared_map.replication.limits import Capacity
 from shared_map.replication.marks import fault, is_tombstone, supersedes
 from shared_map.replication.tombstones import Tombstones
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.wire.messages.marks import MarkSet, MarksRequest
+from swarm.wire.messages.marks import DIGEST_ROW, DIGEST_ROW_BYTES, MarkSet, MarksRequest
 
 
 class HeldSets:
@@ -110,6 +112,15 @@ class HeldSets:
         newer = self.ledger.missing(theirs)
         possible = [(author, [tile for tile in tiles if self._could_hold(author, tile)]) for author, tiles in newer]
         return [(author, tiles) for author, tiles in possible if tiles]
+
+    def lacking(self, author: str, rows: bytes) -> list[int]:
+        """Tiles of which neither the author's set is held under the number in these rows, or above, nor a tombstone
+        that came after it."""
+        if len(rows) % DIGEST_ROW_BYTES:
+            return []
+        numbers = {tile: (epoch, seq) for tile, epoch, seq in np.frombuffer(rows, DIGEST_ROW).tolist()}
+        newer = [tile for _, tiles in self.ledger.missing({author: rows}) for tile in tiles]
+        return [tile for tile in newer if not self.tombstones.above(tile, author, numbers[tile])]
 
     def _could_hold(self, author: str, tile: int) -> bool:
         if tile >= self._tile_count:

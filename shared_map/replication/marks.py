@@ -12,13 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
+from swarm.config.scenario import RESERVED_GROUP
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.statements import FOREVER, STAMP_LIMIT_NS, TILE_AREA, MarkKind
 
+_ZONES = f"{RESERVED_GROUP}."
 NO_STATEMENT = -1
 """In place of a stamp: no author states anything about the cell."""
+
+
+def zone_author(name: str) -> str:
+    """The author of the marks which are a zone."""
+    return f"{_ZONES}{name}"
+
+
+def is_zone(author: str) -> bool:
+    """Whether what this author states is a zone: an operator's order, which wins over what vehicles find."""
+    return author.startswith(_ZONES)
 
 
 class Statements(NamedTuple):

@@ -1,9 +1,10 @@
 """The merge law: which statement about a cell wins, and which cells' winners change when sets of marks change.
 
 Of all statements about a cell that have not expired, the newest wins; of two with one stamp, that of the larger
-author id. The law reads nothing but the sets that are held, so the order, grouping and repetition in which they
-arrived cannot matter. A newer set, a tombstone, an expiry and a region that is left are all one `TileChange`: the
-sets of a tile before and after.
+author id. An operator's statement (a zone) wins over all others: a vehicle that sees open ground must not open what
+people have closed. The law reads nothing but the sets that are held, so the order, grouping and repetition in which
+they arrived cannot matter. A newer set, a tombstone, an expiry and a region that is left are all one `TileChange`:
+the sets of a tile before and after.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.marks import NO_STATEMENT, NO_STATEMENTS, Statements
+from shared_map.replication.marks import NO_STATEMENT, NO_STATEMENTS, Statements, is_zone
 from shared_map.replication.tiles import grid_cells, tile_corners
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column
@@ -110,8 +111,16 @@ def _new_winners_of_few(grid: GridSpec, changes: Sequence[TileChange], before_ns
     )
 
 
-def _winners_of_few(sets: Iterable[MarkSet], now_ns: int) -> dict[int, tuple[int, float, int]]:
+def _winners_of_few(sets: Sequence[MarkSet], now_ns: int) -> dict[int, tuple[int, float, int]]:
     """Cell in the tile -> (kind, pace, stamp) of its winner."""
+    zones = [each for each in sets if is_zone(each.author)]
+    if not zones:
+        return _newest_of_few(sets, now_ns)
+    others = [each for each in sets if not is_zone(each.author)]
+    return _newest_of_few(others, now_ns) | _newest_of_few(zones, now_ns)
+
+
+def _newest_of_few(sets: Iterable[MarkSet], now_ns: int) -> dict[int, tuple[int, float, int]]:
     won: dict[int, tuple[int, float, int]] = {}
     for each in sets:
         if not each.kinds:
@@ -155,15 +164,35 @@ class _Placed(NamedTuple):
 
 def _winners(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:
     """The winners of each (change, cell). `sets` are in increasing order of change, then of author."""
+    zones = [each for each in sets if is_zone(each[1].author)]
+    if not zones:
+        return _newest(sets, now_ns)
+    others = _newest([each for each in sets if not is_zone(each[1].author)], now_ns)
+    firm = _newest(zones, now_ns)
+    both = _Placed(
+        np.concatenate([others.places, firm.places]),
+        np.concatenate([others.kinds, firm.kinds]),
+        np.concatenate([others.paces, firm.paces]),
+        np.concatenate([others.stamps_ns, firm.stamps_ns]),
+    )
+    order = np.argsort(both.places, kind="stable")
+    return both.taken(order[_last_of_each(both.places[order])])
+
+
+def _newest(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:
     stated = _placed(sets, now_ns)
     places = stated.places
     if (places[1:] > places[:-1]).all():
         return stated  # no cell is disputed, as in nearly all traffic: nothing to sort
     order = np.lexsort((stated.stamps_ns, places))  # stable: on a tie the larger author stays behind
-    places = places[order]
+    return stated.taken(order[_last_of_each(places[order])])
+
+
+def _last_of_each(places: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which of these, in order, are the last of their value."""
     last = np.ones(len(places), bool)
     last[:-1] = places[1:] != places[:-1]
-    return stated.taken(order[last])
+    return last
 
 
 def _placed(sets: Sequence[tuple[int, MarkSet]], now_ns: int) -> _Placed:

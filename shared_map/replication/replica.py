@@ -22,6 +22,7 @@ from shared_map.replication.marks import (
     dense,
     is_ahead,
     is_tombstone,
+    is_zone,
     mark_set,
     next_expiry_ns,
     next_seq,
@@ -75,6 +76,7 @@ class MapReplica:
                    capacity), sets_foreign (of a group which is not read), sets_elsewhere (about tiles of no
                    interest), marks_merged (cells whose winner changed), marks_written
     over_capacity  author of the last set that was refused for lack of capacity; its reader sets it to None
+    zones_version  grows with every change of zones
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class MapReplica:
         self.held = HeldSets(grid, capacity or Capacity())
         self.filter = filter or MarkFilter(grid)
         self.over_capacity: str | None = None
+        self.zones_version = 0
         self._cost_map = cost_map
         self._clock = HybridClock()
         self._publish_ns = int(NS_PER_S / publish_hz)
@@ -140,6 +143,7 @@ class MapReplica:
         if not taken:
             return Merged([], [])
         self.counts["sets_merged"] += len(taken)
+        self.zones_version += any([is_zone(each.author) for each in taken])  # noqa: C419 - twice as fast
         counts = self._settle(before, self._now_ns, measured)
         if len(before) == len(taken):
             return Merged(taken, counts)
@@ -201,6 +205,11 @@ class MapReplica:
                     self._newest_ns = newest_ns
         return won.counts
 
+    @property
+    def now_ns(self) -> int:
+        """The time of which the cost map has the winners."""
+        return self._now_ns
+
     def take_newest_stamp_ns(self) -> int | None:
         """The newest stamp among the marks that changed the map since the last call; None if none did."""
         newest_ns, self._newest_ns = self._newest_ns, None
@@ -217,6 +226,7 @@ class MapReplica:
                 for each in before[tile]:
                     if each.author != self.author:
                         self.held.remove(each)
+        self.zones_version += 1
         self._settle(before, self._now_ns, False)
 
     # --- time -----------------------------------------------------------------------------------------------
@@ -259,6 +269,7 @@ class MapReplica:
                 expired[tile] = self.held.of_tile(tile)
         if not expired:
             return
+        self.zones_version += any(is_zone(each.author) for sets in expired.values() for each in sets)
         self._settle(expired, before_ns, False)
         for tile, sets in expired.items():
             self._await_expiry(tile, sets)
@@ -381,6 +392,11 @@ class MapReplica:
     def missing(self, theirs: Held) -> list[tuple[str, list[int]]]:
         """(author, tiles) to ask for: what they hold newer than we, and we would take in."""
         return self.filter.accepted(self.held.missing(theirs))
+
+    def lacking(self, author: str, rows: bytes) -> list[int]:
+        """Tiles of interest of which we do not hold what these rows of a digest name, or what came after it."""
+        wanted = self.filter.accepted([(author, self.held.lacking(author, rows))])
+        return [tile for _, tiles in wanted for tile in tiles]
 
     def own_digest(self) -> dict[str, bytes]:
         """Rows of all that we stated ourselves."""

@@ -183,6 +183,14 @@ class MapSync:
         for action in actions:
             self._put(action.mark_set)
 
+    def holds(self, author: str, rows: bytes, now_ns: int) -> bool:
+        """Whether the map has what these rows of a digest name of an author, as far as it is of interest here. What
+        is missing is asked for."""
+        lacking = self.replica.lacking(author, rows)
+        if lacking and not self._heard:  # else it may have come, and waits for the tick
+            self._fetch(author, lacking, now_ns)
+        return not lacking
+
     @property
     def throttled(self) -> list[str]:
         """Processes that exceed their quota, whose marks are delayed now."""
@@ -334,18 +342,21 @@ class MapSync:
         missing = self.replica.missing(digest.held)
         throttled = self.throttled
         for author, tiles in missing:
-            if owner_of(author) in throttled:
-                continue  # its sets wait here already
-            # Not only when an ask has ended: if its end is lost, it ends by timeout, seconds later.
-            asked_ns = self._asked_ns.get(author)
-            again = asked_ns is not None and now_ns - asked_ns >= _ASK_AGAIN_NS
-            if again or (asked_ns is None and len(self._asked_ns) < _MAX_ASKS):
-                self._asked_ns[author] = now_ns
-                request = MarksRequest(authors=[author], tiles=tiles, bulk=True)
-                self._bus.ask(MARKS, request, self._post, tag=_RESYNC + author, author=author)
+            if owner_of(author) not in throttled:  # else its sets wait here already
+                self._fetch(author, tiles, now_ns)
         if digest.role == "keeper" and digest.whole and not self._serves_all and pending.tries == 0:
             self._offer(digest.held, now_ns)
         self._digests.compared(pending, not missing, now_ns)
+
+    def _fetch(self, author: str, tiles: list[int], now_ns: int) -> None:
+        """Ask for an author's sets, unless they were asked for just now."""
+        # Not only when an ask has ended: if its end is lost, it ends by timeout, seconds later.
+        asked_ns = self._asked_ns.get(author)
+        again = asked_ns is not None and now_ns - asked_ns >= _ASK_AGAIN_NS
+        if again or (asked_ns is None and len(self._asked_ns) < _MAX_ASKS):
+            self._asked_ns[author] = now_ns
+            request = MarksRequest(authors=[author], tiles=tiles, bulk=True)
+            self._bus.ask(MARKS, request, self._post, tag=_RESYNC + author, author=author)
 
     def _offer(self, kept: Held, now_ns: int) -> None:
         """Put again what a keeper never got, and its author, being gone, cannot put again."""

@@ -30,6 +30,11 @@ class Tombstones:
         del self._deleted[received.tile, received.author]
         return False
 
+    def above(self, tile: int, author: str, number: tuple[int, int]) -> bool:
+        """Whether a tombstone of this (epoch, seq) or above is known."""
+        tombstone = self._deleted.get((tile, author))
+        return tombstone is not None and tombstone[:2] >= number
+
     def add(self, tombstone: MarkSet, now_ns: int) -> None:
         """Remember a tombstone; beyond 65,536 the oldest is forgotten."""
         self._deleted[tombstone.tile, tombstone.author] = (tombstone.epoch, tombstone.seq, now_ns)

@@ -5,6 +5,7 @@ The merge rule, per cell, in this order:
 1. pace = flat pace x slope factor x class factor x (1 + rough_per_m x roughness); on a road the road pace instead.
    Where `cost.directional`, the slope factor is left out, and each step costs by its rise instead (`step_climb`).
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
+   Then the scenario's own layers (`cost_layers`), one after the other; a void stays lethal.
 3. Zones in the order painted: a road sets the road pace (over cliffs and water too: a bridge, a cutting; not over a
    void), preferred halves, rough doubles; then every forbidden zone is lethal, whatever else was painted there.
 4. This is the ground. The prior map is the ground with inflation: a cell is lethal where a vehicle of

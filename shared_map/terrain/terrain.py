@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats, give_back_memory, open_array, save_array
+from shared_map.terrain.cost_layers import apply_cost_layers, cost_world
 from shared_map.terrain.hidden import true_ground
 from shared_map.terrain.homes import homes_of
 from shared_map.terrain.kept import fetch_kept, keep, kept_key
@@ -34,9 +35,11 @@ from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.zones import paint_zones
 from swarm.config.input_files import FileKind, read_text
+from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import CostConfig, Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
+from swarm.plugins.find import source_of
 from swarm.runtime.role import RoleSetup
 
 if TYPE_CHECKING:
@@ -103,6 +106,10 @@ def _built(scenario: Scenario, source: Source, progress: Progress) -> Terrain:
         classes = np.where(laid, np.uint8(TerrainClass.ROAD), classes)
         ground[laid] = np.float32(1 / cost.road_speed_m_per_s)
         notes.append(f"{scenario.terrain.roads} roads laid between seeded places, {int(laid.sum())} cells")
+    if cost.layers:
+        world = cost_world(grid, source.elevation_m, classes, source.photo, scenario.seed)
+        ground = apply_cost_layers(scenario, ground, world)
+        notes.append(f"cost layers: {', '.join(each.layer for each in cost.layers)}")
     if cost.zones:
         paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m))
     photo = source.photo
@@ -237,7 +244,8 @@ def scenario_key(scenario: Scenario) -> str:
     parts = {"format": FORMAT, "seed": scenario.seed, "terrain": scenario.terrain, "cost": scenario.cost}
     files = [name for name in (scenario.terrain.source, scenario.terrain.photo) if name]
     stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in map(Path, files) if path.is_file()]
-    payload = msgspec.json.encode([parts, stamps], order="sorted")
+    layers = [source_of(named, scenario.plugin_folder) for named in cost_layers_of(scenario)]
+    payload = msgspec.json.encode([parts, stamps, layers], order="sorted")
     return hashlib.blake2b(payload, digest_size=8).hexdigest()
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from swarm.errors import ConfigError
 from swarm.ranks import job_of
-from swarm.wire.access import MEMBERS, ROLES, Grant
+from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
 from swarm.wire.fields import check_id
 from swarm.wire.topics import ALIVE_KEY, TOPICS
 
@@ -29,8 +29,8 @@ _LOOPBACK = "loopback"
 class Bearer:
     """Who a certificate was issued to.
 
-    name    `ROLE.ID`, for an agent `agent.GROUP.ID`
-    author  what its ids as an author begin with: the group and id of an agent, else the id
+    name    `ROLE.ID`, for an agent `agent.GROUP.ID`, for a rover that marks `rover.GROUP.ID`
+    author  what its ids as an author begin with: the group and id of an agent or rover, else the id
     """
 
     name: str
@@ -55,7 +55,11 @@ def bearer(name: str) -> Bearer:
     if role not in (*ROLES, ROUTER) or not author or (role == "agent" and not (group and id)):
         roles = ", ".join((ROUTER, *ROLES))
         raise ConfigError(f"{name!r} is no name of a process: ROLE.ID or agent.GROUP.ID; the roles are {roles}")
-    return Bearer(name, role, id if role == "agent" else author, author)
+    if role == "agent" and group.split(".")[0] == OPERATOR:
+        raise ConfigError(
+            f"{name!r} is no name of a process: no group is called {OPERATOR!r}, as zones are its marks"
+        )
+    return Bearer(name, role, id if role in ("agent", "rover") else author, author)
 
 
 def common_name(name: str, revoked: Collection[str]) -> str:

@@ -41,6 +41,7 @@ from swarm.liveness import Peer
 from swarm.wire.authentication import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.base import Message
+from swarm.wire.readable import may_be_json, packed_json
 from swarm.wire.topics import Topic
 
 TOKEN_NS = 1_000_000
@@ -170,13 +171,17 @@ class MemoryBus:
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         self.publish_bytes(topic, encode(message), fields)
 
-    def publish_bytes(self, topic: Topic, payload: bytes, fields: Mapping[str, str | int]) -> None:
-        """Put any payload at all: tests send garbage with it."""
+    def publish_bytes(
+        self, topic: Topic, payload: bytes, fields: Mapping[str, str | int], *, in_json: bool = False
+    ) -> None:
+        """Put any payload at all: tests send garbage with it, and JSON."""
         if self.closed:
             return
         self.sent(payload)
         named = topic.one(fields)
-        sample = _Sample(topic, named, payload, code_of(self.authenticator, topic, topic.below(named), payload))
+        sample = _Sample(
+            topic, named, payload, code_of(self.authenticator, topic, topic.below(named), payload), in_json
+        )
         network = self.network
         for subscription in network.subscribers(self.namespace, topic.name, named):
             for when_ns in network.arrivals_ns(self, subscription.bus, topic.name):
@@ -350,13 +355,16 @@ class _Watcher:
 class _Sample:
     """One put, parsed and checked once: when the first subscription is reached."""
 
-    __slots__ = ("_checked_by", "_heard", "_parsed", "code", "fields", "payload", "topic")
+    __slots__ = ("_checked_by", "_heard", "_parsed", "code", "fields", "in_json", "payload", "topic")
 
-    def __init__(self, topic: Topic, fields: dict[str, str], payload: bytes, code: bytes | None) -> None:
+    def __init__(
+        self, topic: Topic, fields: dict[str, str], payload: bytes, code: bytes | None, in_json: bool
+    ) -> None:
         self.topic = topic
         self.fields = fields
         self.payload = payload
         self.code = code
+        self.in_json = in_json
         self._checked_by: Authenticator | None = None
         self._heard: Heard | None = None
         self._parsed = False
@@ -371,8 +379,11 @@ class _Sample:
             self._checked_by = bus.authenticator
         if not self._parsed:
             self._parsed = True
+            payload, kind = self.payload, self.topic.message
             try:
-                self._heard = Heard(self.topic, self.fields, decode(self.payload, self.topic.message))
+                if self.in_json and may_be_json(payload):
+                    payload = packed_json(payload, kind, self.fields)
+                self._heard = Heard(self.topic, self.fields, decode(payload, kind))
             except ProtocolError:
                 self._heard = None
         return self._heard

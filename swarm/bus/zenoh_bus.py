@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -34,14 +34,14 @@ from swarm.bus.bus import (
 from swarm.bus.endpoints import listening, wait_for_router
 from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
-from swarm.bus.zenoh_threads import attached, guarded, taken_after, taken_from, timeout_of, waiting_in
+from swarm.bus.zenoh_threads import attached, guarded, says_json, taken_after, taken_from, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.authentication import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, decode_either, decode_many, encode
 from swarm.wire.messages.base import Message
-from swarm.wire.readable import decode_parameters, encode_readable
+from swarm.wire.readable import decode_parameters, encode_readable, packed_json
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
 log = logging.getLogger(__name__)
@@ -172,10 +172,9 @@ class ZenohBus:
                 post(heard)
 
         def arrive_together(samples: list[zenoh.Sample]) -> None:
-            keys = [str(sample.key_expr) for sample in samples]
-            payloads = [sample.payload.to_bytes() for sample in samples]
-            self._received(*payloads)
-            decoded = decode_many(payloads, topic.message)
+            keyed = list(self._packed(topic, samples))
+            keys = [key for key, _ in keyed]
+            decoded = decode_many([payload for _, payload in keyed], topic.message)
             heard: list[tuple[str, Message]] = []
             for key, message in zip(keys, decoded, strict=True):
                 if isinstance(message, ProtocolError):
@@ -254,12 +253,28 @@ class ZenohBus:
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
 
+    def _packed(self, topic: Topic, samples: list[zenoh.Sample]) -> Iterator[tuple[str, bytes]]:
+        """Keys and payloads as MessagePack, without those that are broken JSON."""
+        payloads = [sample.payload.to_bytes() for sample in samples]
+        self._received(*payloads)
+        for sample, payload in zip(samples, payloads, strict=True):
+            key = str(sample.key_expr)
+            try:
+                if says_json(sample, payload):
+                    payload = packed_json(payload, topic.message, self._fields(topic, key))
+            except ProtocolError as error:
+                self._drop(key, error)
+            else:
+                yield key, payload
+
     def _heard(self, topic: Topic, sample: zenoh.Sample, payload: bytes) -> Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
         key = str(sample.key_expr)
         try:
             named = self._fields(topic, key)
             check_code(self._authenticator, attached(sample), topic, key, payload)
+            if says_json(sample, payload):
+                payload = packed_json(payload, topic.message, named)
             message = decode(payload, topic.message)
             topic.check_key(named, message)
         except ProtocolError as error:
@@ -277,7 +292,8 @@ class ZenohBus:
             key = str(query.key_expr)
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
             timeout = parameters.pop(TIMEOUT_PARAMETER, "")
-            as_json = parameters.get("format") == "json"
+            in_json = query.payload is not None and says_json(query, query.payload.to_bytes())
+            as_json = in_json or parameters.get("format") == "json"
             answerer = ZenohAnswerer(query, partial(self._reply, topic, concrete, as_json))
             self._received(answerer.asked)
             try:
@@ -285,6 +301,8 @@ class ZenohBus:
                 check_code(self._authenticator, attached(query), topic, key, answerer.asked)
                 if query.payload is None:
                     request = decode_parameters(parameters, request_type)
+                elif in_json:
+                    request = decode(packed_json(answerer.asked, request_type), request_type)
                 else:
                     request = decode(answerer.asked, request_type)
             except ProtocolError as error:

@@ -1,4 +1,4 @@
-"""What Zenoh hands over: threads of its own and those that read its channels, timeouts and attachments."""
+"""What Zenoh hands over: threads of its own and those that read its channels, timeouts, attachments, encodings."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from swarm.bus.bus import LONGEST_TIMEOUT_S, TIMEOUT_PARAMETER, USUAL_TIMEOUT_S
 from swarm.errors import ProtocolError
+from swarm.wire.readable import JSON_ENCODING, may_be_json
 
 MOST_TOGETHER = 1024
 """Most samples in one `HeardMany`, so that a tick does not wait for long."""
@@ -53,6 +54,11 @@ def attached(carrier: Any) -> bytes | None:
     """What was sent beside the payload of a sample or a query."""
     attachment: bytes | None = None if carrier.attachment is None else carrier.attachment.to_bytes()
     return attachment
+
+
+def says_json(carrier: Any, payload: bytes) -> bool:
+    """Whether a sample or query carries JSON, by its encoding: that costs more to look up than the first byte."""
+    return may_be_json(payload) and str(carrier.encoding).partition(";")[0] == JSON_ENCODING
 
 
 def timeout_of(said: str) -> float:

@@ -6,18 +6,23 @@ import ipaddress
 import re
 from collections import Counter
 from pathlib import Path
+from typing import get_args
 
 import msgspec
 
 from swarm.config.explain import explain, nearest
 from swarm.config.input_files import FileKind, parse_toml, read_text
+from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import (
     MOST_TARGETS,
+    RESERVED_GROUP,
     WHOLE_TREE_STRATEGIES,
     PlannerConfig,
     Scenario,
+    Strategy,
     TlsConfig,
     ZoneConfig,
+    ids_of,
 )
 from swarm.errors import ConfigError
 from swarm.ranks import split_rank
@@ -48,6 +53,9 @@ def _check(scenario: Scenario, source: str) -> None:
     doubled = sorted(id for id, times in Counter(ids).items() if times > 1)
     if doubled:
         raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+    rovers = Counter(id for rover in scenario.rovers for id in ids_of(rover))
+    if rovers and rovers.most_common(1)[0][1] > 1:
+        raise ConfigError(f"{source}: rovers: two rovers are called {rovers.most_common(1)[0][0]!r}; rename one")
     for id in ids:
         if split_rank(id)[1]:  # planner and standby of two targets would share an id
             raise ConfigError(f"{source}: targets: {id!r} is what a standby of another target is called; rename it")
@@ -60,12 +68,16 @@ def _check(scenario: Scenario, source: str) -> None:
                 raise ConfigError(f"{source}: {key}[{n}]: missing required field `polygon_m` (or `mask`)")
             if zone.polygon_m is not None and zone.mask is not None:
                 raise ConfigError(f"{source}: {key}[{n}]: polygon_m and mask exclude each other")
+    for plugin in plugins_of(scenario):
+        check_name(plugin, source)
     if scenario.cost.directional:
         _check_directional(scenario.planner, source)
     names = [group.name for group in scenario.groups]
     if len(set(names)) < len(names):
         raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
     for name in names:
+        if name.split(".")[0] == RESERVED_GROUP:
+            raise ConfigError(f"{source}: groups: {name!r} is not free: zones of operators are marks of that name")
         longer = [other for other in names if other.startswith(f"{name}.")]
         if longer:  # the id of an author begins with its group and a point
             raise ConfigError(
@@ -88,7 +100,7 @@ def _check(scenario: Scenario, source: str) -> None:
 
 
 def _check_directional(planner: PlannerConfig, source: str) -> None:
-    if planner.strategy not in WHOLE_TREE_STRATEGIES:
+    if planner.strategy in get_args(Strategy) and planner.strategy not in WHOLE_TREE_STRATEGIES:
         allowed = " or ".join(map(repr, WHOLE_TREE_STRATEGIES))
         raise ConfigError(
             f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
@@ -138,7 +150,8 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
         tls = TlsConfig(ca=str(base / tls.ca), certificate=str(base / tls.certificate), key=str(base / tls.key))
         network = msgspec.structs.replace(network, tls=tls)
     terrain = msgspec.structs.replace(terrain, source=source, photo=photo, labels=labels, hidden=hidden)
-    return msgspec.structs.replace(scenario, terrain=terrain, cost=cost, network=network)
+    folder = str(base / scenario.plugin_folder)
+    return msgspec.structs.replace(scenario, terrain=terrain, cost=cost, network=network, plugin_folder=folder)
 
 
 def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConfig, ...]:

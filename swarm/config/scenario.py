@@ -7,7 +7,7 @@ what was found and what is allowed.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -26,6 +26,8 @@ Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Point = tuple[Metres, Metres]
 Polygon = Annotated[tuple[Point, ...], Meta(min_length=3, max_length=10_000)]
 
+RESERVED_GROUP = "operator"
+"""No group is called so: zones are marks of this one, which every group hears."""
 MOST_TARGETS = 1000
 """Of all entries together."""
 
@@ -38,6 +40,26 @@ WHOLE_TREE_STRATEGIES: tuple[Strategy, ...] = ("auto", "full")
 SlopeRule = Literal["linear", "quadratic", "tobler", "energy"]
 
 Walk = Literal["still", "random", "waypoints", "evade", "external"]
+
+Sensor = Literal["truth"]
+
+Assigner = Literal["spread"]
+
+Dynamics = Literal["ground"]
+
+
+def _plugin(built_in: Any = None) -> Meta:
+    """Names of one kind: those that are built in, and those of plug-ins (`swarm.config.plugin_names`)."""
+    names = list(get_args(built_in))
+    return Meta(
+        pattern=r"^[\w.+-]{1,100}(:[\w.]{1,100})?$",
+        extra={"built_in": names},
+        extra_json_schema={"examples": [*names, "module:Name"]},
+    )
+
+
+Options = dict[str, Any]
+"""What is said to a plug-in: its own struct checks it."""
 
 ClassName = Literal["unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow"]
 
@@ -79,8 +101,8 @@ class HiddenConfig(Section, frozen=True, kw_only=True):
 class TerrainConfig(Section, frozen=True, kw_only=True):
     """Where elevation and photo come from.
 
-    source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .hgt, .vrt, .asc, .npz, .png, .map
-                   (MovingAI), .yaml or .yml (ROS)
+    source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2,
+                   .nc, .vrt, one of these in a .zip, .asc, .npz, .png, .map (MovingAI), .yaml or .yml (ROS)
     photo          a colour GeoTIFF on the same ground, or nothing
     labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
     resolution_m   cell size to bring everything to; the source's own if not given
@@ -117,6 +139,17 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     hidden: HiddenConfig = HiddenConfig()
 
 
+class CostLayerConfig(Section, frozen=True, kw_only=True):
+    """A rule of the user's own: it changes the pace that slope and ground give, before zones are painted.
+
+    layer    a plug-in
+    options  what it takes
+    """
+
+    layer: Annotated[str, _plugin()]
+    options: Options = msgspec.field(default_factory=dict)
+
+
 class CostConfig(Section, frozen=True, kw_only=True):
     """How terrain becomes pace.
 
@@ -132,6 +165,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     classes             whether what covers the ground (water, forest, rock ...) counts
     class_factor        pace of a class relative to open ground, or "lethal", instead of the built-in factors
     vehicle_radius_m    cells in whose middle a vehicle of this radius touches a lethal cell are lethal (inflation)
+    layers              rules of the user's own, one after the other; what is a void stays lethal
     zones               parts of the terrain with a cost of their own, painted in order; forbidden ones last
     """
 
@@ -145,6 +179,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     classes: bool = True
     class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
     vehicle_radius_m: NotNegative = 0.0
+    layers: Annotated[tuple[CostLayerConfig, ...], Meta(max_length=32)] = ()
     zones: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
 
 
@@ -154,26 +189,47 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     name           id of the target, or what the ids begin with
     count          how many targets
     walk           still; random: a new heading now and then; waypoints: to random places by the cheapest way;
-                   evade: away from the nearest vehicles; external: another process publishes its pose
+                   evade: away from the nearest vehicles; external: another process publishes its pose; or a plug-in
+    walk_options   what a plug-in for `walk` takes
     speed_m_per_s  its speed on level open ground, elsewhere slower or faster as vehicles are
     tracker        always: its pose is published all the time; sighted: only vehicles which see it tell where it is,
                    and planners use the last sighting
     caught         jump: a captured target goes on from another place; stay: it goes on from where it is
     start          [row, col]; a random passable cell if not given
+    body_radius_m  vehicles keep out of the cells within so many metres of it, and of those that it drives to;
+                   if not given, they may share its cell
     """
 
     name: Name = "t"
     count: Annotated[int, Meta(ge=1, le=MOST_TARGETS)] = 1
-    walk: Walk = "waypoints"
+    walk: Annotated[str, _plugin(Walk)] = "waypoints"
+    walk_options: Options = msgspec.field(default_factory=dict)
     speed_m_per_s: NotNegative = 4.0
     tracker: Literal["always", "sighted"] = "always"
     caught: Literal["jump", "stay"] = "jump"
     start: tuple[int, int] | None = None
+    body_radius_m: Annotated[float, Meta(ge=0, le=100)] | None = None
 
     @property
     def is_simulated(self) -> bool:
         """Whether the run moves it; the pose of an external target comes from another process."""
         return self.walk != "external"
+
+
+class RoverConfig(Section, frozen=True, kw_only=True):
+    """A simulated outside vehicle, or `count` alike: it says where it is, speaks no right of way and looks out for
+    nobody. Ids as those of targets.
+
+    name           id of the rover, or what the ids begin with
+    count          how many rovers
+    speed_m_per_s  its speed, on any ground
+    radius_m       what vehicles keep away from, around its middle
+    """
+
+    name: Name = "r"
+    count: Annotated[int, Meta(ge=1, le=256)] = 1
+    speed_m_per_s: NotNegative = 2.0
+    radius_m: Annotated[float, Meta(ge=0, le=100)] = 1.0
 
 
 class GroupConfig(Section, frozen=True, kw_only=True):
@@ -200,13 +256,19 @@ class GroupConfig(Section, frozen=True, kw_only=True):
 class VehicleConfig(Section, frozen=True, kw_only=True):
     """How vehicles behave.
 
-    per_agent         vehicles that one agent process hosts, at most
-    tick_hz           how often an agent moves its vehicles and publishes their positions
-    sense_range_m     radius within which the simulated sensor sees the true ground
-    capture_range_m   a target this near is captured
-    route_cells       steps of a route asked for at a time; 0 is the whole route
-    reserve_cells     cells ahead of itself that a vehicle may be granted
-    reassign_s        how often a vehicle asks which target is the cheapest
+    per_agent           vehicles that one agent process hosts, at most
+    tick_hz             how often an agent moves its vehicles and publishes their positions
+    sense_range_m       radius within which the simulated sensor sees the true ground
+    capture_range_m     a target this near is captured
+    route_cells         steps of a route asked for at a time; 0 is the whole route
+    reserve_cells       cells ahead of itself that a vehicle may be granted
+    reassign_s          how often a vehicle asks which target is the cheapest
+    sensor              truth: sees the true ground within `sense_range_m`; or a plug-in
+    sensor_options      what a plug-in for `sensor` takes
+    assignment          spread: the cheapest pairs first, to each target an even share of the vehicles; or a plug-in
+    assignment_options  what a plug-in for `assignment` takes
+    dynamics            ground: vehicles are as fast as the ground allows; or a plug-in, which only slows
+    dynamics_options    what a plug-in for `dynamics` takes
     """
 
     per_agent: Annotated[int, Meta(ge=1, le=1000)] = 25
@@ -216,25 +278,33 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     route_cells: Annotated[int, Meta(ge=0)] = 0
     reserve_cells: Annotated[int, Meta(ge=1, le=16)] = 3
     reassign_s: Positive = 5.0
+    sensor: Annotated[str, _plugin(Sensor)] = "truth"
+    sensor_options: Options = msgspec.field(default_factory=dict)
+    assignment: Annotated[str, _plugin(Assigner)] = "spread"
+    assignment_options: Options = msgspec.field(default_factory=dict)
+    dynamics: Annotated[str, _plugin(Dynamics)] = "ground"
+    dynamics_options: Options = msgspec.field(default_factory=dict)
 
 
 class PlannerConfig(Section, frozen=True, kw_only=True):
     """How a planner keeps its tree.
 
-    strategy        what is grown again when the target has moved; auto chooses by `cpu_budget`
-    tick_hz         how often a planner follows its target and its map
-    edge            octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
-    neighbours      cells that one step reaches: 4, or 8 with the diagonal ones
-    corner_cutting  whether a diagonal step may pass the corner of a lethal cell
-    length_weight   lambda of the paper's length-aware key, seconds per metre
-    k_min           smallest block exponent, as in the paper: the narrowest window of variable range is
-                    2**(k_min+1) + 1 cells wide; that of the other strategies 2**(k_min+3) + 1
-    full_every      rotation: a full growth every so many moves, on small maps sooner
-    cpu_budget      auto: share of one core that this planner may use
-    push_s          newer routes are pushed to a vehicle at most this often
+    strategy          what is grown again when the target has moved; auto chooses by `cpu_budget`; or a plug-in
+    strategy_options  what a plug-in for `strategy` takes
+    tick_hz           how often a planner follows its target and its map
+    edge              octile: a diagonal step is sqrt(2) long; paper: every step costs what its cell costs
+    neighbours        cells that one step reaches: 4, or 8 with the diagonal ones
+    corner_cutting    whether a diagonal step may pass the corner of a lethal cell
+    length_weight     lambda of the paper's length-aware key, seconds per metre
+    k_min             smallest block exponent, as in the paper: the narrowest window of variable range is
+                      2**(k_min+1) + 1 cells wide; that of the other strategies 2**(k_min+3) + 1
+    full_every        rotation: a full growth every so many moves, on small maps sooner
+    cpu_budget        auto: share of one core that this planner may use
+    push_s            newer routes are pushed to a vehicle at most this often
     """
 
-    strategy: Strategy = "auto"
+    strategy: Annotated[str, _plugin(Strategy)] = "auto"
+    strategy_options: Options = msgspec.field(default_factory=dict)
     tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
     edge: Literal["octile", "paper"] = "octile"
     neighbours: Literal[4, 8] = 8
@@ -303,7 +373,7 @@ class NetworkConfig(Section, frozen=True, kw_only=True):
                        not answer; while no router listens, processes wait
     tls                certificates, for endpoints beyond loopback
     admit              names in certificates that a router lets take part, beside those of the scenario's processes:
-                       router.north, keeper.east, operator.anna
+                       router.north, keeper.east, operator.anna, rover.all.r1
     revoked            names in certificates that a router denies everything
     """
 
@@ -334,20 +404,22 @@ class MonitorConfig(Section, frozen=True, kw_only=True):
 class Scenario(Section, frozen=True, kw_only=True):
     """One run, whole.
 
-    name        what reports call it
-    seed        decides roads, hidden obstacles, starts and walks; a simulated run is decided by it entirely
-    seconds     how long the run lasts
-    time_scale  seconds on the terrain per second of the run: motion is that much faster than real
-    terrain     where elevation and photo come from
-    cost        how terrain becomes pace
-    targets     what is chased
-    groups      which vehicles there are
-    vehicles    how vehicles behave
-    planner     how a planner keeps its tree
-    standbys    which processes stand by
-    map         how the shared map is replicated
-    network     where processes meet
-    monitor     the live view
+    name           what reports call it
+    seed           decides roads, hidden obstacles, starts and walks; a simulated run is decided by it entirely
+    seconds        how long the run lasts
+    time_scale     seconds on the terrain per second of the run: motion is that much faster than real
+    terrain        where elevation and photo come from
+    cost           how terrain becomes pace
+    targets        what is chased
+    groups         which vehicles there are
+    rovers         simulated outside vehicles that the swarm's must not drive into
+    vehicles       how vehicles behave
+    planner        how a planner keeps its tree
+    standbys       which processes stand by
+    map            how the shared map is replicated
+    network        where processes meet
+    monitor        the live view
+    plugin_folder  where the modules of plug-ins lie that are not installed: the scenario's own folder if not given
     """
 
     name: Name = "unnamed"
@@ -358,12 +430,14 @@ class Scenario(Section, frozen=True, kw_only=True):
     cost: CostConfig = CostConfig()
     targets: Annotated[tuple[TargetConfig, ...], Meta(min_length=1, max_length=MOST_TARGETS)] = (TargetConfig(),)
     groups: Annotated[tuple[GroupConfig, ...], Meta(min_length=1, max_length=256)] = (GroupConfig(),)
+    rovers: Annotated[tuple[RoverConfig, ...], Meta(max_length=256)] = ()
     vehicles: VehicleConfig = VehicleConfig()
     planner: PlannerConfig = PlannerConfig()
     standbys: StandbyConfig = StandbyConfig()
     map: MapConfig = MapConfig()
     network: NetworkConfig = NetworkConfig()
     monitor: MonitorConfig = MonitorConfig()
+    plugin_folder: str = "."
 
     @property
     def target_ids(self) -> list[str]:
@@ -379,8 +453,8 @@ class Scenario(Section, frozen=True, kw_only=True):
         return sum(group.vehicles for group in self.groups)
 
 
-def ids_of(target: TargetConfig) -> list[str]:
-    """Ids of a target: `name` for one, `name0, name1, ...` for several."""
-    if target.count == 1:
-        return [target.name]
-    return [f"{target.name}{n}" for n in range(target.count)]
+def ids_of(some: TargetConfig | RoverConfig) -> list[str]:
+    """Ids of a target or rover: `name` for one, `name0, name1, ...` for several."""
+    if some.count == 1:
+        return [some.name]
+    return [f"{some.name}{n}" for n in range(some.count)]

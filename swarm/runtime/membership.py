@@ -121,6 +121,18 @@ class Member:
         note = Note(role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text[:MOST_TEXT], cell=cell)
         self._bus.publish(NOTE, note, role=info.role, id=info.id)
 
+    def warn(self, now_ns: int, kind: str, text: str) -> None:
+        """Say what went wrong in the log and to people who watch the run, and count it as `kind`."""
+        log.warning("%s: %s", kind, text)
+        self.counters.count(kind)
+        self.note(now_ns, kind, text)
+
+    def tell_faults(self, faults: list[str], now_ns: int) -> None:
+        """Say what plug-ins did wrong, and clear the list."""
+        for fault in faults:
+            self.warn(now_ns, "plugin_failed", fault)
+        faults.clear()
+
     def _compare(self, other: RunInfo) -> None:
         peer = Peer(other.role, other.id, other.incarnation)
         if NO_RUN in (self.info.run_id, other.run_id) or peer == self.peer:

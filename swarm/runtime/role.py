@@ -43,6 +43,9 @@ class RoleSetup:
             cols=grid.cols,
             resolution_m=grid.resolution_m,
             started_ns=self.started_ns,
+            west_m=grid.west_m,
+            north_m=grid.north_m,
+            crs=grid.crs,
         )
 
     @property

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-MEMBERS = "keeper planner agent targets tracker monitor"
-"""The roles of the processes of a run. A `tracker` publishes the pose of one real target; an external process."""
+MEMBERS = "keeper planner agent targets tracker rover monitor"
+"""The roles of the processes of a run. Two are external: a `tracker` publishes the pose of one real target, a
+`rover` where one vehicle is that no agent drives."""
 OPERATOR = "operator"
-"""People's tools and the launcher: hear and ask everything, change nothing."""
+"""People's tools and the launcher: hear and ask everything, and so give orders. No group is called so, as zones are
+marks of this one."""
 ROLES = (*MEMBERS.split(), OPERATOR)
 """Every role but the router's."""
 MEMBERS_OWN = " ".join(f"{role}:role,id" for role in MEMBERS.split())

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import msgpack
 import msgspec
-import numpy as np
 
 from swarm.errors import ProtocolError
+from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import faulty_sets
@@ -62,7 +62,7 @@ def decode_either(payload: bytes, usual: type[M], other: type[N] | None) -> M | 
 
 def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | ProtocolError]:
     """As `decode` of each payload, errors in place. The statements of many mark sets are checked at once."""
-    at_once = len(payloads) >= _MANY_SETS
+    at_once = len(payloads) >= _MANY_SETS and numpy_loaded()
     found: list[M | ProtocolError] = []
     unchecked: list[tuple[int, MarkSet]] = []
     for payload in payloads:
@@ -109,6 +109,8 @@ def _unpacked(payload: bytes) -> dict[Any, Any]:
     """The fields in a payload, with a `schema` of any value. Raises ProtocolError."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ProtocolError(f"payload of {len(payload)} bytes, at most {MAX_PAYLOAD_BYTES}")
+    if payload[:1] == b"{":
+        raise ProtocolError("it looks like JSON, which needs Zenoh's encoding application/json")
     # msgpack allocates a list as long as it claims to be: none has more items than the payload has bytes.
     longest = min(len(payload), MAX_ITEMS)
     # A short payload cannot hold too many items, so the usual one is not slowed down by counting them.

@@ -15,12 +15,16 @@ import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Annotated, Any
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
-import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
+
+from swarm.lazy_numpy import np, numpy_loaded
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 assert sys.byteorder == "little", "columns travel as little-endian bytes"
 
@@ -37,13 +41,13 @@ class Characters:
 class Column:
     """In an annotation of bytes: the values that they hold. `Bounded` checks it.
 
-    dtype        of the values; NaN is refused
+    dtype        of the values, as NumPy writes it, or the names and types of a row; NaN is refused
     per          the field of the same struct that has as many items as this column values; "" if there is none
     least, most  bounds of the values; None where the dtype has no other, or `relate` says more
     checked      false where the struct checks it itself: the statements of many sets of marks at once
     """
 
-    dtype: np.dtype[Any] | str
+    dtype: str | tuple[tuple[str, str], ...]
     per: str = ""
     least: float | None = None
     most: float | None = None
@@ -51,8 +55,8 @@ class Column:
 
     def describe(self) -> str:
         """As in the reference of the wire: "column of float32, 0 ... inf"."""
-        dtype = np.dtype(self.dtype)
-        name = f"rows of {dtype.itemsize} bytes" if dtype.names else f"column of {dtype.name}"
+        dtype = self.dtype
+        name = f"column of {name_of(dtype)}" if isinstance(dtype, str) else f"rows of {width_of(dtype)} bytes"
         return name + (f", one for each of `{self.per}`" if self.per else "")
 
 
@@ -89,6 +93,12 @@ Millis = Annotated[float, Meta(ge=0, le=1e12)]
 """What something took, in ms."""
 AgeMillis = Annotated[float, Meta(ge=0), OR_INFINITE]
 """How old something is, in ms; inf while it is not there yet."""
+LONGEST_LEASE_S = 60.0
+"""For so long a single lie may stand."""
+LeaseSeconds = Annotated[float, Meta(ge=0, le=LONGEST_LEASE_S)]
+"""For how long a sender counts as alive after each message."""
+AgeSeconds = Annotated[float, Meta(ge=0, le=1e10)]
+"""How long ago something was heard."""
 Gap = Annotated[float, Meta(ge=0), OR_INFINITE]
 """Cost over optimum or lower bound: 1 but for rounding, or more; inf is nothing proven."""
 Gauge = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
@@ -141,6 +151,16 @@ MOST_IDS = 1 << 12
 SMALL, LARGE = Meta(max_length=MOST_VEHICLES), Meta(max_length=100_000)
 """Bounds of lists and maps: as many as an agent has vehicles, or as one request may name cells."""
 IDS = Meta(max_length=MOST_IDS)
+
+
+def width_of(dtype: str | tuple[tuple[str, str], ...]) -> int:
+    """Bytes of a value, or of a row."""
+    return int(dtype[2:]) if isinstance(dtype, str) else sum(width_of(part) for _, part in dtype)
+
+
+def name_of(dtype: str) -> str:
+    """As people say it: float32 for "<f4"."""
+    return {"u": "uint", "i": "int", "f": "float"}[dtype[1]] + str(8 * width_of(dtype))
 
 
 def pack_column(values: Any, dtype: str) -> bytes:
@@ -209,7 +229,7 @@ def _rules_of(struct: type[Bounded]) -> tuple[Rule, ...]:
         if any(isinstance(note, Characters) for note in notes):
             ids.append(name)
         if any(isinstance(note, Characters) for note in parts):
-            rules.append(_all_ids(name))
+            rules.append(_id_or_none(name) if NoneType in typing.get_args(bare) else _all_ids(name))
         rules.extend(_column_rule(name, note) for note in notes if isinstance(note, Column) and note.checked)
         rules.extend(_columns_rule(name, note) for note in parts if isinstance(note, Column))
     if ids:
@@ -242,6 +262,17 @@ def _each_id(names: list[str]) -> Rule:
     return rule
 
 
+def _id_or_none(name: str) -> Rule:
+    get = attrgetter(name)
+
+    def rule(struct: Any) -> None:
+        value = get(struct)
+        if value is not None and value not in _KNOWN_IDS:
+            check_id(name, value)
+
+    return rule
+
+
 def _all_ids(name: str) -> Rule:
     """Ids in a list, or those which are the keys of a map."""
     get = attrgetter(name)
@@ -257,7 +288,7 @@ def _all_ids(name: str) -> Rule:
 
 def _column_rule(name: str, column: Column) -> Rule:
     get, per = attrgetter(name), attrgetter(column.per) if column.per else None
-    width, check = np.dtype(column.dtype).itemsize, _values_check(column)
+    width, check = width_of(column.dtype), _values_check(column)
 
     def rule(struct: Any) -> None:
         data = get(struct)
@@ -280,35 +311,37 @@ def _columns_rule(name: str, column: Column) -> Rule:
     return rule
 
 
-_CODES = {"<u1": "B", "<u2": "H", "<u4": "I", "<u8": "Q", "<i4": "i", "<i8": "q", "<f4": "f", "<f8": "d"}
+CODES = {"<u1": "B", "<u2": "H", "<u4": "I", "<u8": "Q", "<i4": "i", "<i8": "q", "<f4": "f", "<f8": "d"}
 _FEW = 800
 """Bytes of a column up to which a list is checked faster than an array."""
 
 
 def _values_check(column: Column) -> Callable[[str, bytes], None]:
-    dtype, least, most = np.dtype(column.dtype), column.least, column.most
-    width = dtype.itemsize
+    dtype, least, most, width = column.dtype, column.least, column.most, width_of(column.dtype)
     if least is None or most is None:
-        assert dtype.kind != "f", "a column of floats has bounds"
+        assert dtype[1] != "f", "a column of floats has bounds"
 
         def check_length(name: str, data: bytes) -> None:
             if len(data) % width:
                 raise ValueError(f"{name} has {len(data)} bytes, not a multiple of {width}")
 
         return check_length
-    code: Any = _CODES[str(column.dtype)]
+    assert isinstance(dtype, str), "rows have no bounds"
+    code: Any = CODES[dtype]
+    word = name_of(dtype)
+    expected = f"{word} of {least:g} ... {most:g}" + (", without NaN" if dtype[1] == "f" else "")
     if code == "B":
 
         def check_bytes(name: str, data: bytes) -> None:
             if max(data, default=0) > most:
-                raise ValueError(f"{name} has {max(data)}, expected {dtype.name} of {least:g} ... {most:g}")
+                raise ValueError(f"{name} has {max(data)}, expected {expected}")
 
         return check_bytes
 
     def check(name: str, data: bytes) -> None:
         if len(data) % width:
-            raise ValueError(f"{name} has {len(data)} bytes, not a column of {dtype.name}")
-        if len(data) <= _FEW:
+            raise ValueError(f"{name} has {len(data)} bytes, not a column of {word}")
+        if len(data) <= _FEW or not numpy_loaded():
             values = memoryview(data).cast(code).tolist()
             low, high, total = min(values, default=least), max(values, default=most), sum(values)
         else:
@@ -318,7 +351,6 @@ def _values_check(column: Column) -> Callable[[str, bytes], None]:
         # A list's min and max may miss a NaN, its sum does not.
         if not (least <= low and high <= most and total == total):
             worst = high if high > most else low
-            expected = f"{dtype.name} of {least:g} ... {most:g}" + (", without NaN" if dtype.kind == "f" else "")
             raise ValueError(f"{name} has {worst}, expected {expected}")
 
     return check

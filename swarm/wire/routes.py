@@ -7,13 +7,16 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any
+from itertools import accumulate
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.fields import Bounded, Cell, Column, Cost, Directions, Length, check_column, column, pack_column
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 class RouteStatus(enum.StrEnum):
@@ -168,6 +171,14 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     remaining_s: _Numbers
 
     def relate(self) -> None:
+        if not numpy_loaded():
+            steps = sum(_listed(self.steps, "I"))
+            check_column(f"directions of {steps} steps", self.directions, 3, -(-steps // 8))
+            for name in _NUMBERS:
+                numbers = _listed(getattr(self, name), "d")
+                if any(status == OK and math.isinf(n) for status, n in zip(self.statuses, numbers, strict=True)):
+                    raise ValueError(f"{name} of a route whose status is ok is not finite")
+            return
         steps = int(column(self.steps, "<u4").sum(dtype=np.int64))
         check_column(f"directions of {steps} steps", self.directions, 3, -(-steps // 8))
         found = column(self.statuses, "u1") == OK
@@ -188,14 +199,32 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
             *(column(getattr(self, name), "<f8") for name in _NUMBERS),
         )
 
+    @cached_property
+    def listed(self) -> list[Route]:
+        """As `Route`s, read without NumPy, made once."""
+        steps = _listed(self.steps, "I")
+        codes = _unpacked(self.directions)
+        ends = accumulate(steps)
+        numbers = zip(*(_listed(getattr(self, name), "d") for name in _NUMBERS), strict=True)
+        columns = zip(self.statuses, _listed(self.starts, "q"), steps, ends, numbers, strict=True)
+        return [
+            Route(
+                status=STATUSES[status],
+                start=start,
+                directions=codes[end - many : end],
+                **dict(zip(_NUMBERS, each, strict=True)),
+            )
+            for status, start, many, end, each in columns
+        ]
+
     def __len__(self) -> int:
         return len(self.statuses)
 
     def __getitem__(self, index: int) -> Route:
-        return self.batch[index]
+        return (self.batch if numpy_loaded() else self.listed)[index]
 
     def __iter__(self) -> Iterator[Route]:
-        return iter(self.batch)
+        return iter(self.batch if numpy_loaded() else self.listed)
 
 
 _NUMBERS = ("cost_s", "lower_bound_s", "length_m", "remaining_s")
@@ -207,9 +236,9 @@ def pack_directions(codes: NDArray[np.uint8]) -> bytes:
     padded[: codes.size] = codes
     # Eight codes are one word: neighbours move together three times, two, four and then all eight of them.
     words: NDArray[np.uint64] = padded.view("<u8")
-    words = (words | words >> _U(5)) & _U(0x003F003F003F003F)
-    words = (words | words >> _U(10)) & _U(0x00000FFF00000FFF)
-    words = (words | words >> _U(20)) & _U(0xFFFFFF)
+    words = (words | words >> np.uint64(5)) & np.uint64(0x003F003F003F003F)
+    words = (words | words >> np.uint64(10)) & np.uint64(0x00000FFF00000FFF)
+    words = (words | words >> np.uint64(20)) & np.uint64(0xFFFFFF)
     return words.view(np.uint8).reshape(-1, 8)[:, :3].tobytes()
 
 
@@ -218,10 +247,20 @@ def unpack_directions(packed: bytes, many: int) -> NDArray[np.uint8]:
     words: NDArray[Any] = np.zeros((-(-many // 8), 8), np.uint8)
     words[:, :3] = np.frombuffer(packed, np.uint8).reshape(-1, 3)
     words = words.reshape(-1).view("<u8")
-    words = (words | words << _U(20)) & _U(0x00000FFF00000FFF)
-    words = (words | words << _U(10)) & _U(0x003F003F003F003F)
-    words = (words | words << _U(5)) & _U(0x0707070707070707)
+    words = (words | words << np.uint64(20)) & np.uint64(0x00000FFF00000FFF)
+    words = (words | words << np.uint64(10)) & np.uint64(0x003F003F003F003F)
+    words = (words | words << np.uint64(5)) & np.uint64(0x0707070707070707)
     return words.view(np.uint8)[:many]
 
 
-_U = np.uint64
+def _unpacked(packed: bytes) -> bytes:
+    """As `unpack_directions`, without NumPy, of all that there are."""
+    codes = bytearray()
+    for at in range(0, len(packed), 3):
+        word = int.from_bytes(packed[at : at + 3], "little")
+        codes += bytes([word >> shift & 7 for shift in range(0, 24, 3)])
+    return bytes(codes)
+
+
+def _listed(packed: bytes, code: Any) -> list[Any]:
+    return memoryview(packed).cast(code).tolist()

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import enum
-
-import numpy as np
-from numpy.typing import NDArray
+import struct
+from typing import TYPE_CHECKING
 
 from swarm.grid import TILE_CELLS
+from swarm.lazy_numpy import np, numpy_loaded
 from swarm.wire.fields import check_column, column
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 TILE_AREA = TILE_CELLS * TILE_CELLS
 
 STAMP_LIMIT_NS = 1 << 62
 """Marks stamped from here on (year 2116) are rejected by all processes, so that there is always a newer stamp."""
 
-PACE_LEAST = float(np.float32(1 / 340))
+PACE_LEAST: float = struct.unpack("<f", struct.pack("<f", 1 / 340))[0]
 """s/m; what drives quicker than sound is no vehicle. Float32, as marks are."""
 PACE_MOST = 100.0
 """s/m, a cell of 10 m in 17 minutes: slower ground is better told as lethal. Both bound what one wrong mark can do
@@ -65,7 +68,7 @@ def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes)
     """Raise ValueError with the rule that the columns of one set break. It has one or more statements."""
     if max(kinds) > LAST_KIND:
         raise ValueError(f"kind {max(kinds)} is not in 0..{LAST_KIND}")
-    if len(kinds) > _FEW:
+    if len(kinds) > _FEW and numpy_loaded():
         array = column(cells, "<u2")
         rising = bool((array[1:] > array[:-1]).all())
         last = int(array[-1])

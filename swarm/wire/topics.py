@@ -14,8 +14,10 @@ from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, access
 from swarm.wire.codec import prime
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
@@ -145,6 +147,10 @@ def _chunk(value: str | int) -> str:
 _REPLICAS = "agent keeper planner monitor"
 """Roles which hold a replica of the map."""
 
+OBEYING = "agent planner targets keeper"
+"""Roles which go by orders."""
+OBEYING_OWN = " ".join(f"{role}:role,id" for role in OBEYING.split())
+
 RUN = Topic(
     "run", "run/{role}/{id}", RunInfo, "which run and terrain a process belongs to", "asked at every start",
     access(serve=MEMBERS_OWN, ask=MEMBERS),
@@ -154,12 +160,15 @@ MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", MarkSet,
     "an author's whole set for a tile; the author and the keeper answer for it",
     "on change, at most 10 Hz a tile",
-    access(put="agent:author keeper planner", serve="agent:author keeper", ask=_REPLICAS, hear=_REPLICAS),
+    access(
+        put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
+        hear=f"{_REPLICAS} rover:author",
+    ),
     request=MarksRequest, bulk=MarkSets, buffer=8192,
 )  # fmt: skip
 DIGEST = Topic(
     "digest", "digest/{author}", Digest, "which sets a replica holds", "1 Hz, and on change",
-    access(put="agent:author keeper:author", hear=_REPLICAS),
+    access(put="agent:author rover:author keeper:author", hear=_REPLICAS),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 BASE_MAP = Topic(
@@ -226,11 +235,13 @@ FOLLOWED = Topic(
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", PushedRoute,
     "a newer route for a vehicle in the updated range; an agent listens to those of all its vehicles", "per update",
-    access(put="planner", hear="agent:agent"),
+    access(put="planner", hear="agent:agent rover:agent"),
 )  # fmt: skip
 POSE = Topic(
-    "pose", "target/{target}/pose", TargetPose, "where a target is", "per quarter of a cell, at least 2 Hz",
-    access(put="targets tracker:target", hear="agent planner targets monitor"),
+    "pose", "target/{target}/pose", TargetPose,
+    "where a target is, by a tracker of it; each counts, as one tracker must not hide another's words",
+    "per quarter of a cell, at least 2 Hz",
+    access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
 )  # fmt: skip
 TRUE_POSE = Topic(
     "true-pose", "world/target/{target}/pose", TargetPose,
@@ -242,19 +253,27 @@ SIGHTED = Topic(
     "while it is in sight, at most 2 Hz",
     access(put="agent:author", hear="agent planner keeper monitor"),
 )  # fmt: skip
+BODY = Topic(
+    "body", "body/{id}", Body,
+    "where something is that vehicles must not drive into, though it speaks no right of way: an outside vehicle, "
+    "a person; each counts, as two senders under one id must not hide each other",
+    "10 Hz while it moves, else before its lease ends",
+    access(put="rover:id targets", hear="agent rover targets monitor"), newest=False,
+    priority=Priority.INTERACTIVE,
+)  # fmt: skip
 ROUTE = Topic(
     "route", "target/{target}/route", RouteReply, "routes from cells to the target", "asked",
-    access(serve="planner:target", ask="agent"),
+    access(serve="planner:target", ask="agent rover"),
     request=RouteRequest, published=False,
 )  # fmt: skip
 COST = Topic(
     "cost", "target/{target}/cost", CostReply, "cost-to-go of a batch of cells", "asked",
-    access(serve="planner:target", ask="agent targets"),
+    access(serve="planner:target", ask="agent targets rover"),
     request=CostRequest, published=False,
 )  # fmt: skip
 STATUS = Topic(
     "status", "target/{target}/status", PlannerStatus, "how a planner is doing", "2 Hz",
-    access(put="planner:target", hear="targets monitor"),
+    access(put="planner:target", hear="targets monitor tracker:target"),
     priority=Priority.BACKGROUND,
 )  # fmt: skip
 LEAD = Topic(
@@ -262,6 +281,27 @@ LEAD = Topic(
     "10 Hz, where there are standbys",
     access(put="planner:role,id targets:role,id", hear="planner targets monitor"),
     priority=Priority.INTERACTIVE,
+)  # fmt: skip
+ZONES = Topic(
+    "zones", "order/{keeper}/zones", Zones, "adds, removes and lists zones: areas that operators close",
+    "asked by people", access(serve="keeper:keeper"),
+    request=ZoneOrder, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+GIVE_ORDER = Topic(
+    "give-order", "order/{keeper}/give", Orders,
+    "enters an order into a keeper's book: pause, stop, whom to chase, which targets, settings", "asked by people",
+    access(serve="keeper:keeper"), request=GiveOrder, published=False, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+ORDERS = Topic(
+    "orders", "orders/{role}/{id}", Orders,
+    "what is ordered: keepers tell it, and everybody answers who starts and hears no keeper", "1 Hz, and on change",
+    access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
+    request=Nothing, trusted=True, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+OBEYED = Topic(
+    "obeyed", "obeyed/{role}/{id}", Obeyed, "that a process obeys an order, as soon as it does",
+    "asked after each order", access(serve="agent:role,id planner:role,id targets:role,id"),
+    request=Obey, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STATS = Topic(
     "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz",
@@ -276,7 +316,8 @@ NOTE = Topic(
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, LEAVE,
-    FOLLOWED,    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, ROUTE, COST, STATUS, LEAD, STATS, NOTE,
+    FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER, ORDERS,
+    OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

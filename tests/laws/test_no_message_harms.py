@@ -25,10 +25,11 @@ from swarm.liveness import Peer
 from swarm.wire.authentication import Authenticator
 from swarm.wire.fields import unbounded
 from swarm.wire.messages.base import Message
+from swarm.wire.messages.orders import GiveOrder, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.routes import RouteStatus
 from swarm.wire.statements import MarkKind
-from swarm.wire.topics import ROUTE, RUN
+from swarm.wire.topics import GIVE_ORDER, ROUTE, RUN, ZONES
 from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
@@ -118,6 +119,28 @@ class Lied(SwarmModel):
         self.run(0.1)
         return heard
 
+    def take_back(self) -> None:
+        """Whoever reaches the router may give orders, so an operator takes back what was ordered."""
+        heard: list[Event] = []
+        self.ear.ask(GIVE_ORDER, GiveOrder(), heard.append, tag="o", keeper="0")
+        self.ear.ask(ZONES, ZoneOrder(), heard.append, tag="z", keeper="0")
+        self.run(0.2)
+        for event in heard:
+            match event:
+                case Replied(message=Orders(orders=orders)):
+                    for order in orders:
+                        given = GiveOrder(subject=order.subject, name=order.name, off=True)
+                        if order.subject == "target":
+                            given = GiveOrder(
+                                subject="target", name=order.name, new=order.off, cell=80, walk="still"
+                            )
+                        self.ear.ask(GIVE_ORDER, given, ignore, tag="o", keeper="0")
+                case Replied(message=Zones(zones=zones)):
+                    for zone in zones:
+                        removal = ZoneOrder(action="remove", name=zone.name)
+                        self.ear.ask(ZONES, removal, ignore, tag="z", keeper="0")
+        self.run(0.2)
+
     def close(self) -> None:
         for store in self.stores:
             store.close()
@@ -164,6 +187,7 @@ def test_no_service_raises_on_what_passes_the_door_in_any_state(state: str) -> N
 @pytest.mark.parametrize("state", [state for state in STATES if state != "without target"])
 def test_after_the_lies_each_service_does_its_work_again(state: str) -> None:
     swarm = lied_to(state, 7, 16)
+    swarm.take_back()
     swarm.run(8)
     [targets] = [each for name, each in swarm.services.items() if name == "targets-0"]
     truth = targets._world._targets["t0"].walker.cell

@@ -87,8 +87,11 @@ class ZenohWorld:
         self.buses.append(open_bus(self.network(namespace), authenticator=authenticator))
         return self.buses[-1]
 
-    def put_bytes(self, bus: ZenohBus, topic: Topic, payload: bytes, **fields: str) -> None:
-        bus.session.put(topic.keyed(bus.namespace, **fields), payload)
+    def put_bytes(
+        self, bus: ZenohBus, topic: Topic, payload: bytes, *, in_json: bool = False, **fields: str
+    ) -> None:
+        encoding = zenoh.Encoding.APPLICATION_JSON if in_json else zenoh.Encoding.ZENOH_BYTES
+        bus.session.put(topic.keyed(bus.namespace, **fields), payload, encoding=encoding)
 
     def until(self, true: Callable[[], object], within_s: float = 5.0) -> None:
         deadline_s = time.monotonic() + within_s
@@ -384,3 +387,32 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
     assert len(asked(world, ours, TABLE, Claim(epoch=3), plot=0, agent="a0").of(Replied)) == 1
     assert asked(world, ours, TABLE, Claim(epoch=6), plot=0, agent="a0").of(Replied) == []
     spy.undeclare()
+
+
+def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(world: ZenohWorld):
+    a, b = world.bus("a"), world.bus("b")
+    heard = Box()
+
+    def answer(event):
+        heard.append(event)
+        reply = CostReply(
+            target="t0", incarnation=1, target_cell=3, map_version=1, tree_age_ms=1.0,
+            cost_to_go_s=pack_column([7.5], "<f4"),
+        )  # fmt: skip
+        event.answer(reply)
+        event.end()
+
+    a.serve(COST, answer, target="t0")
+    world.settle()
+
+    def get(text: str):
+        encoding = zenoh.Encoding.APPLICATION_JSON
+        (reply,) = b.session.get("swarm/target/t0/cost", payload=text, encoding=encoding, timeout=3.0)
+        return reply
+
+    reply = get('{"row": 4, "col": 2}')
+    assert json.loads(reply.ok.payload.to_bytes())["cost_to_go_s"] == [7.5]
+    assert heard[0].request == CostRequest(row=4, col=2)
+    wrong = get('{"rwo": 4}').err.payload.to_string()
+    assert wrong == "cost: unknown field 'rwo'; CostRequest has cells, row, col"
+    assert a.counts["payloads_dropped"] == 1

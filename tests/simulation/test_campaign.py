@@ -12,7 +12,7 @@ from launch_scripts.simulation.campaign import MIX, parse_seeds, run_seeds, worl
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trial import Trial, Verdict, try_seed
-from launch_scripts.simulation.worlds import SMALL, WORLDS, seeded
+from launch_scripts.simulation.worlds import MIXED, SMALL, seeded
 from swarm.errors import ConfigError
 
 
@@ -28,7 +28,7 @@ def test_seeds_do_the_same_one_by_one_and_side_by_side():
 
 
 def test_the_mix_takes_every_world_in_turn_and_a_replay_names_it():
-    assert [world_of(MIX, seed) for seed in range(6)] == list(WORLDS)
+    assert [world_of(MIX, seed) for seed in range(6)] == list(MIXED)
     verdict = Verdict(world=world_of(MIX, 9), seed=9, seconds=30.0, broken=[])
     assert verdict.replay == "swarm simulate doors --seeds 9:10"
     assert msgspec.structs.replace(verdict, seconds=5.0).replay.endswith("--seconds 5")

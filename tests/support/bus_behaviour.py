@@ -6,13 +6,16 @@ from __future__ import annotations
 import pytest
 from support.bus_world import Box, World, answering, asked, marks, note, pose, run_info
 
+from launch_scripts.reference.json_examples import example, key_fields, put_from_outside
+from launch_scripts.reference.wire_page import PATH as WIRE_PAGE
 from shared_map.replication.mark_sets import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.liveness import Peer
 from swarm.wire.codec import encode
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import MarksRequest
-from swarm.wire.topics import MARKS, NOTE, POSE, RUN
+from swarm.wire.readable import encode_readable
+from swarm.wire.topics import MARKS, NOTE, RUN, TRUE_POSE
 
 # --- publish and subscribe ----------------------------------------------------------------------------------
 
@@ -20,11 +23,11 @@ from swarm.wire.topics import MARKS, NOTE, POSE, RUN
 def test_a_subscriber_hears_the_message_and_the_fields_of_its_key(world: World):
     a, b = world.bus("a"), world.bus("b")
     box = Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
-    a.publish(POSE, pose(), target="t0")
+    a.publish(TRUE_POSE, pose(), target="t0")
     world.until(lambda: box)
-    assert box == [Heard(POSE, {"target": "t0"}, pose())]
+    assert box == [Heard(TRUE_POSE, {"target": "t0"}, pose())]
     assert a.counts["messages_out"] == 1
     assert b.counts["messages_in"] == 1
     assert a.counts["bytes_out"] == b.counts["bytes_in"] == len(encode(pose()))
@@ -32,9 +35,9 @@ def test_a_subscriber_hears_the_message_and_the_fields_of_its_key(world: World):
 
 def test_a_process_hears_itself(world: World):
     a, box = world.bus("a"), Box()
-    a.subscribe(POSE, box)
+    a.subscribe(TRUE_POSE, box)
     world.settle()
-    a.publish(POSE, pose(), target="t0")
+    a.publish(TRUE_POSE, pose(), target="t0")
     world.until(lambda: box)
     assert [event.message for event in box] == [pose()]
 
@@ -55,19 +58,60 @@ def test_samples_that_wait_are_heard_together_in_order_with_their_keys_and_witho
     assert len(box.of(HeardMany)) == len(box)
 
 
+def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    alone, together = Box(), Box()
+    b.subscribe(TRUE_POSE, alone)
+    b.collect(TRUE_POSE)
+    b.subscribe(MARKS, together, together=True)
+    world.settle()
+    short = b' {"incarnation": 1, "seq": 1, "stamp_ns": 5, "cell": 3, "x_m": 1, "y_m": 2.0}'
+    world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t0")
+    world.put_bytes(a, TRUE_POSE, short, target="t1")  # without the encoding it is garbage
+    world.put_bytes(
+        a, TRUE_POSE, encode(pose("t2")), in_json=True, target="t2"
+    )  # whatever it says, this is MessagePack
+    world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:], in_json=True, target="t3")
+    world.put_bytes(a, MARKS, encode_readable(marks("a0.1", 7)), in_json=True, region="0", tile="7", author="a0.1")
+    world.put_bytes(a, MARKS, b'{"epoch": "x"', in_json=True, region="0", tile="8", author="a0.1")
+    world.until(lambda: len(alone) == 2 and together)
+    assert [event.message for event in alone] == [pose(), pose("t2")]
+    assert together == [HeardMany(MARKS, [("marks/0/7/a0.1", marks("a0.1", 7))])]
+    world.until(lambda: b.counts["payloads_dropped"] == 3)
+    assert [event.message for event in b.collected(TRUE_POSE)] == [pose(), pose("t2")]
+
+
+def test_the_least_json_of_the_reference_is_heard_on_each_key_where_programs_outside_may_put(world: World):
+    a, b, page = world.bus("a"), world.bus("b"), WIRE_PAGE.read_text()
+    topics = put_from_outside()
+    assert {topic.name for topic in topics} >= {"pose", "body", "marks", "note"}
+    for topic in topics:
+        assert f"| `{topic.below(key_fields(topic))}` | `{example(topic)}` |" in page
+        box = Box()
+        b.subscribe(topic, box)
+        world.settle()
+        world.put_bytes(a, topic, example(topic).encode(), in_json=True, **key_fields(topic))
+        world.until(lambda box=box: box)
+        assert [type(event.message) for event in box] == [topic.message]
+        assert box[0].fields == key_fields(topic)
+    assert b.counts["payloads_dropped"] == 0
+
+
 def test_what_is_collected_waits_and_of_each_key_the_newest_is_left(world: World):
     a, b = world.bus("a"), world.bus("b")
-    b.collect(POSE)
+    b.collect(TRUE_POSE)
     box = Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
     for seq in range(5):
         for target in ("t0", "t1"):
-            a.publish(POSE, pose(target, seq=seq), target=target)
-        world.put_bytes(a, POSE, b"garbage", target="t1")
+            a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
+        world.put_bytes(a, TRUE_POSE, b"garbage", target="t1")
     world.until(lambda: len(box) == 10 and b.counts["payloads_dropped"] == 5)
-    assert b.collected(POSE) == [Heard(POSE, {"target": each}, pose(each, seq=4)) for each in ("t0", "t1")]
-    assert b.collected(POSE) == []
+    assert b.collected(TRUE_POSE) == [
+        Heard(TRUE_POSE, {"target": each}, pose(each, seq=4)) for each in ("t0", "t1")
+    ]
+    assert b.collected(TRUE_POSE) == []
     assert b.counts["payloads_dropped"] == 6  # each that was heard; of those collected the one after the newest
 
 
@@ -94,19 +138,19 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
 
 def test_a_slow_reader_gets_the_newest_of_each_key_at_its_own_pace(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box, every_s=0.5)
+    b.subscribe(TRUE_POSE, box, every_s=0.5)
     world.settle()
     for seq in range(1, 21):
         for target in ("t0", "t1"):
-            a.publish(POSE, pose(target, seq=seq), target=target)
-    world.put_bytes(a, POSE, b"garbage", target="t2")
+            a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
+    world.put_bytes(a, TRUE_POSE, b"garbage", target="t2")
     world.until(lambda: len(box) == 2)
     assert {(event.fields["target"], event.message.seq) for event in box} == {("t0", 20), ("t1", 20)}
     world.until(lambda: b.counts["payloads_dropped"] == 1)
-    a.publish(POSE, pose("t0", seq=21), target="t0")
+    a.publish(TRUE_POSE, pose("t0", seq=21), target="t0")
     world.until(lambda: len(box) == 3)
     assert box[2].message.seq == 21
-    b.unsubscribe(POSE)
+    b.unsubscribe(TRUE_POSE)
     world.settle()
     with pytest.raises(TypeError, match="each of its messages counts"):
         b.subscribe(NOTE, box, every_s=0.5)
@@ -125,31 +169,31 @@ def test_an_answer_may_carry_many_values_where_the_topic_says_so(world: World):
 def test_an_ended_subscription_hears_nothing_more_and_the_others_go_on(world: World):
     a, b = world.bus("a"), world.bus("b")
     one, every = Box(), Box()
-    b.subscribe(POSE, one, target="t0")
-    b.subscribe(POSE, every)
+    b.subscribe(TRUE_POSE, one, target="t0")
+    b.subscribe(TRUE_POSE, every)
     world.settle()
-    a.publish(POSE, pose("t0", seq=1), target="t0")
+    a.publish(TRUE_POSE, pose("t0", seq=1), target="t0")
     world.until(lambda: one and every)
-    b.unsubscribe(POSE, target="t0")
-    b.unsubscribe(POSE, target="t7")  # of what never was there is nothing to end
+    b.unsubscribe(TRUE_POSE, target="t0")
+    b.unsubscribe(TRUE_POSE, target="t7")  # of what never was there is nothing to end
     world.settle()
-    a.publish(POSE, pose("t0", seq=2), target="t0")
+    a.publish(TRUE_POSE, pose("t0", seq=2), target="t0")
     world.until(lambda: len(every) == 2)
     assert len(one) == 1
-    b.subscribe(POSE, one, target="t0")
+    b.subscribe(TRUE_POSE, one, target="t0")
     world.settle()
-    a.publish(POSE, pose("t0", seq=3), target="t0")
+    a.publish(TRUE_POSE, pose("t0", seq=3), target="t0")
     world.until(lambda: len(one) == 2)
 
 
 def test_a_subscription_with_a_field_hears_only_that_key(world: World):
     a, b = world.bus("a"), world.bus("b")
     one, every = Box(), Box()
-    b.subscribe(POSE, one, target="t1")
-    b.subscribe(POSE, every)
+    b.subscribe(TRUE_POSE, one, target="t1")
+    b.subscribe(TRUE_POSE, every)
     world.settle()
     for target in ("t0", "t1", "t10"):
-        a.publish(POSE, pose(target), target=target)
+        a.publish(TRUE_POSE, pose(target), target=target)
     world.until(lambda: len(every) == 3 and one)
     assert [event.fields["target"] for event in every] == ["t0", "t1", "t10"]
     assert [event.fields["target"] for event in one] == ["t1"]
@@ -173,10 +217,10 @@ def test_what_is_served_no_more_is_not_asked_and_may_be_served_again(world: Worl
 
 def test_samples_of_one_sender_come_in_order(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
     for seq in range(200):
-        a.publish(POSE, pose(seq=seq), target="t0")
+        a.publish(TRUE_POSE, pose(seq=seq), target="t0")
     world.until(lambda: len(box) == 200)
     assert [event.message.seq for event in box] == list(range(200))
 
@@ -196,11 +240,11 @@ def test_two_namespaces_do_not_hear_each_other(world: World):
 
 def test_garbage_is_counted_and_dropped_and_what_follows_is_heard(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
     for payload in (b"", b"\xc1", b"garbage", b"\x81\xa6schema\xa6pose/9"):
-        world.put_bytes(a, POSE, payload, target="t0")
-    a.publish(POSE, pose(), target="t0")
+        world.put_bytes(a, TRUE_POSE, payload, target="t0")
+    a.publish(TRUE_POSE, pose(), target="t0")
     world.until(lambda: box)
     assert len(box) == 1
     assert b.counts["payloads_dropped"] == 4
@@ -208,10 +252,10 @@ def test_garbage_is_counted_and_dropped_and_what_follows_is_heard(world: World):
 
 def test_what_says_that_it_is_anothers_than_its_key_says_is_dropped(world: World):
     a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box)
+    b.subscribe(TRUE_POSE, box)
     world.settle()
-    a.publish(POSE, pose("t1"), target="t0")
-    a.publish(POSE, pose("t0"), target="t0")
+    a.publish(TRUE_POSE, pose("t1"), target="t0")
+    a.publish(TRUE_POSE, pose("t0"), target="t0")
     world.until(lambda: box)
     assert [event.message for event in box] == [pose("t0")]
     assert b.counts["payloads_dropped"] == 1
@@ -220,11 +264,11 @@ def test_what_says_that_it_is_anothers_than_its_key_says_is_dropped(world: World
 def test_a_key_that_is_not_one_value_is_a_bug_that_raises(world: World):
     a = world.bus("a")
     with pytest.raises(TypeError, match="needs the field target"):
-        a.publish(POSE, pose())
+        a.publish(TRUE_POSE, pose())
     with pytest.raises(ValueError, match="part of a key"):
-        a.publish(POSE, pose(), target="t/0")
+        a.publish(TRUE_POSE, pose(), target="t/0")
     with pytest.raises(TypeError, match="not a queryable"):
-        a.serve(POSE, Box())
+        a.serve(TRUE_POSE, Box())
 
 
 # --- tokens and links ---------------------------------------------------------------------------------------

@@ -25,6 +25,8 @@ settings.load_profile("shared-cores")
 GRID = GridSpec(40, 70, 10.0)
 """2 x 3 tiles, those at the border cut off."""
 AUTHORS = ("a1.1", "a2.1", "a2.2", "b1.1")
+ZONES = ("operator.z1", "operator.z2")
+"""Authors of zones, whose statements win over all others."""
 
 
 def set_of(
@@ -71,9 +73,10 @@ def mark_sets(draw: st.DrawFn) -> MarkSet:
             st.tuples(st.sampled_from(list(MarkKind)), st.sampled_from([0.5, 1.0, 2.0]), st.integers(0, 3)),
         )
     )
-    return set_of(
-        draw(st.sampled_from(AUTHORS)), tile, draw(st.integers(0, 3)), said, epoch=draw(st.integers(1, 2))
-    )
+    author = draw(st.sampled_from((*AUTHORS, *ZONES)))
+    group = "operator" if author in ZONES else "all"
+    seq, epoch = draw(st.integers(0, 3)), draw(st.integers(1, 2))
+    return set_of(author, tile, seq, said, epoch=epoch, group=group)
 
 
 class Composite:
@@ -112,7 +115,7 @@ def naive_winners(sets: Sequence[MarkSet]) -> dict[tuple[int, int], tuple[int, f
         key = (each.epoch, each.seq, each.cells, each.kinds, each.paces, each.stamps_ns)
         if held is None or key > (held.epoch, held.seq, held.cells, held.kinds, held.paces, held.stamps_ns):
             newest[each.tile, each.author] = each
-    best: dict[tuple[int, int], tuple[int, str, int, float]] = {}
+    best: dict[tuple[int, int], tuple[bool, int, str, int, float]] = {}
     for (tile, author), each in newest.items():
         rows = zip(
             np.frombuffer(each.cells, "<u2").tolist(),
@@ -122,10 +125,10 @@ def naive_winners(sets: Sequence[MarkSet]) -> dict[tuple[int, int], tuple[int, f
             strict=True,
         )
         for cell, kind, pace, stamp_ns in rows:
-            said = (stamp_ns, author, kind, pace if kind == MarkKind.PACE else 0.0)
-            if (tile, cell) not in best or said[:2] > best[tile, cell][:2]:
+            said = (author in ZONES, stamp_ns, author, kind, pace if kind == MarkKind.PACE else 0.0)
+            if (tile, cell) not in best or said[:3] > best[tile, cell][:3]:
                 best[tile, cell] = said
-    return {at: (kind, pace) for at, (_, _, kind, pace) in best.items()}
+    return {at: (kind, pace) for at, (_, _, _, kind, pace) in best.items()}
 
 
 def held_winners(replica: MapReplica) -> dict[tuple[int, int], tuple[int, float]]:

@@ -10,6 +10,7 @@ from support import slow_twins as naive
 from support.planner_strategies import Job, Marks, Move
 
 from planner_service.full_growth import GrownTree
+from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.corridors import CorridorSearch
 from swarm.config.scenario import PlannerConfig
@@ -30,11 +31,12 @@ class Play:
         all_kernels: Callable[[], bool] = lambda: True,
         *,
         has_worker: bool = False,
+        chosen_by: Strategy | None = None,
     ) -> None:
         self.pace = pace
         self.config = config
         self.grid = GridSpec(*pace.shape, 1.0)
-        self.tree = TargetTree(self.grid, config, None, all_kernels, has_worker=has_worker)
+        self.tree = TargetTree(self.grid, config, None, all_kernels, has_worker=has_worker, chosen_by=chosen_by)
         self.has_worker = has_worker
         self.version = 0
         self.target = int(np.flatnonzero(np.isfinite(pace))[0])

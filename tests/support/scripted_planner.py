@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.actions import Action, GrowTree
+from planner_service.actions import Action, GrowTree, Tell
 from planner_service.full_growth import GrownTree
 from planner_service.planner import Planner
 from planner_service.target_tree import TargetTree
@@ -142,6 +142,7 @@ class World:
         )
         self.now_ns = 0
         self.told: list[PlannerStatus] = []
+        self.notes: list[Tell] = []
 
     def _newest(self) -> int | None:
         stamp_ns, self.newest_mark_ns = self.newest_mark_ns, None
@@ -157,11 +158,12 @@ class World:
         self.newest_mark_ns = stamp_ns
 
     def tick(self) -> list[Action]:
-        """All that a tick brings, but for the status twice a second."""
+        """All that a tick brings, but for the status twice a second and sentences for people."""
         self.now_ns += TICK
         actions = self.planner.tick(self.now_ns)
         self.told.extend(action for action in actions if isinstance(action, PlannerStatus))
-        return [action for action in actions if not isinstance(action, PlannerStatus)]
+        self.notes.extend(action for action in actions if isinstance(action, Tell))
+        return [action for action in actions if not isinstance(action, PlannerStatus | Tell)]
 
     def ask(self, *cells: int, **fields: Any) -> RouteReply:
         request = RouteRequest(cells=list(cells), **fields)
@@ -180,7 +182,9 @@ class World:
 
 
 def pose(cell: int, seq: int = 1, incarnation: int = 1, target: str = "t0") -> TargetPose:
-    return TargetPose(target=target, incarnation=incarnation, seq=seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
+    return TargetPose(
+        target=target, tracker="radar", incarnation=incarnation, seq=seq, stamp_ns=0, cell=cell, x_m=0, y_m=0
+    )
 
 
 def chasers(*vehicles: tuple[str, int], stamp_ns: int, target: str = "t0", author: str = "all.a0.1") -> Chasers:

@@ -12,8 +12,10 @@ from shared_map.replication.mark_sets import packed
 from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET, pack_column
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
+from swarm.wire.messages.bodies import LONGEST_LEASE_S, Body
 from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
+from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, Zone, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
     CostReply,
     CostRequest,
@@ -172,6 +174,13 @@ stands = st.builds(
     better=st.integers(0, 8), age_ms=milliseconds,
 )  # fmt: skip
 
+names = st.text("abXY09_-", min_size=1, max_size=40)
+orders = st.builds(
+    Order, subject=st.sampled_from(["pause", "vehicle", "group", "target", "set"]), name=ids, stamp_ns=naturals,
+    off=st.booleans(), targets=st.lists(ids, max_size=3), value=st.none() | finite,
+    cell=st.none() | st.integers(0, (1 << 32) - 1), added=st.booleans(),
+)  # fmt: skip
+
 MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     RunInfo: st.builds(
         RunInfo, run_id=texts, role=ids, id=ids, incarnation=naturals, scenario=texts, terrain=texts, rows=sides,
@@ -226,8 +235,13 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         lower_bound_s=finite_costs,
     ),
     TargetPose: st.builds(
-        TargetPose, target=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, cell=cells, x_m=metres,
-        y_m=metres, captures=counts, jumps=counts,
+        TargetPose, target=ids, tracker=st.none() | ids, incarnation=naturals, seq=naturals, stamp_ns=naturals,
+        lease_s=st.floats(0, 60), cell=cells, x_m=metres, y_m=metres, captures=counts, jumps=counts,
+    ),
+    Body: st.builds(
+        Body, id=ids, group=ids, incarnation=naturals, seq=naturals, stamp_ns=naturals, x_m=metres, y_m=metres,
+        heading_rad=st.none() | st.floats(-12.5, 12.5), speed_m_per_s=st.floats(0, 1e6), radius_m=st.floats(0, 1e9),
+        lease_s=st.floats(0, LONGEST_LEASE_S),
     ),
     Sighted: st.builds(
         Sighted, author=ids, group=ids, target=ids, seq=naturals, stamp_ns=naturals, until_ns=naturals, cell=cells,
@@ -238,6 +252,7 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         RouteReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=counts,
         tree_age_ms=ages, rows=sides, cols=sides,
         routes=st.lists(routes, max_size=3).map(lambda some: RouteBatch.of(some).columns()),
+        pose_age_s=st.none() | st.floats(0, 1e10), tracker_lost=st.booleans(),
     ),
     PushedRoute: st.builds(
         PushedRoute, vehicle=ids, target=ids, incarnation=naturals, target_cell=cells, map_version=counts,
@@ -248,12 +263,15 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         CostReply, target=ids, incarnation=naturals, target_cell=optional_cells, map_version=counts,
         tree_age_ms=ages,
         cost_to_go_s=st.lists(st.floats(0, width=32), max_size=5).map(lambda column: pack_column(column, "<f4")),
+        pose_age_s=st.none() | st.floats(0, 1e10), tracker_lost=st.booleans(),
     ),
     PlannerStatus: st.builds(
         PlannerStatus, target=ids, incarnation=naturals, stamp_ns=naturals, strategy=texts,
         target_cell=optional_cells, map_version=counts, tree_age_ms=ages,
         window=st.sampled_from([[], [0, 0, 8, 8]]), growths=counts, window_growths=counts, growth_ms=millis,
-        routes_served=counts, following=counts, gap_mean=gaps, gap_p95=gaps, gap_max=gaps,
+        routes_served=counts, following=counts, tracker=st.none() | ids,
+        pose_age_s=st.none() | st.floats(0, 1e10), tracker_lost=st.booleans(),
+        gap_mean=gaps, gap_p95=gaps, gap_max=gaps,
     ),
     Stats: st.builds(
         Stats, role=ids, id=ids, incarnation=naturals, stamp_ns=naturals,
@@ -262,6 +280,33 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
             texts, st.dictionaries(st.integers(ZERO_BUCKET, TOP_BUCKET), counts, max_size=3), max_size=2
         ),
     ),
+    ZoneOrder: st.builds(
+        ZoneOrder, action=st.sampled_from(["add", "remove"]), name=names, kind=st.just("pace"),
+        pace_s_per_m=st.floats(0.1, 100), polygon=st.lists(st.tuples(metres, metres), min_size=3, max_size=5),
+        lasts_s=st.none() | st.floats(1e-3, 1e9),
+    ),
+    Zones: st.builds(
+        Zones, keeper=ids, changed=names,
+        zones=st.lists(
+            st.builds(
+                Zone, name=names, kind=st.just("pace"), pace_s_per_m=st.none() | st.floats(0.1, 100), cells=counts,
+                window=st.just([0, 1, 2, 3]), until_ns=st.none() | naturals,
+            ), max_size=2,
+        ),
+    ),
+    GiveOrder: st.builds(
+        GiveOrder, subject=st.sampled_from(["pause", "vehicle", "group", "target", "set"]), name=ids,
+        off=st.booleans(), targets=st.lists(ids, max_size=3), value=st.none() | finite,
+        cell=st.integers(0, (1 << 32) - 1), new=st.booleans(), speed_m_per_s=st.floats(0, 1e4),
+    ),
+    Orders: st.builds(Orders, role=ids, id=ids, orders=st.lists(orders, max_size=3), given=st.none() | orders),
+    Obey: st.builds(
+        Obey, author=ids, sets=st.lists(st.tuples(tiles, naturals, naturals), max_size=3).map(
+            lambda rows: np.array(rows, DIGEST_ROW).tobytes()
+        ),
+        subject=st.none() | st.just("pause"), name=ids, stamp_ns=naturals,
+    ),
+    Obeyed: st.builds(Obeyed, role=ids, id=ids, incarnation=naturals),
     Beat: st.builds(Beat, role=ids, id=ids, incarnation=naturals, ready=st.booleans(), leads=st.booleans()),
     Note: st.builds(Note, role=ids, id=ids, stamp_ns=naturals, kind=texts, text=texts, cell=optional_cells),
 }  # fmt: skip
@@ -322,6 +367,10 @@ EXAMPLES: tuple[Message, ...] = (
         author="all.a0.7", group="all", target="t0", seq=2, stamp_ns=10, until_ns=90, cell=9, x_m=1.5, y_m=-2.5,
         uncertainty_m=8.0,
     ),
+    Body(
+        id="r1", group="blue", incarnation=7, seq=3, stamp_ns=10, x_m=1.5, y_m=-2.5, heading_rad=0.5,
+        speed_m_per_s=2.0, radius_m=1.2, lease_s=2.0,
+    ),
     RouteRequest(cells=[4, 5], vehicles=["a0-00", "a0-01"], max_cells=50, force=True),
     RouteReply(
         target="t0", incarnation=7, target_cell=9, map_version=3, tree_age_ms=12.5, rows=10, cols=10,
@@ -347,6 +396,17 @@ EXAMPLES: tuple[Message, ...] = (
         role="agent", id="a0", incarnation=7, stamp_ns=10, counts={"marks": 3}, gauges={"lost": 0.0},
         histograms={"tick_ms": {-3: 4}},
     ),
+    ZoneOrder(action="add", name="z", polygon=[(2.0, 3.0), (2.0, 8.0), (6.0, 8.0)], lasts_s=60.0),
+    Zones(
+        keeper="0", changed="z", sets=np.array([(3, 1, 1 << 16)], DIGEST_ROW).tobytes(),
+        zones=[
+            Zone(name="z", kind="lethal", pace_s_per_m=None, cells=10, window=[2, 3, 6, 8], until_ns=90),
+        ],
+    ),
+    GiveOrder(subject="target", name="x", cell=9, walk="still", new=True),
+    Orders(role="keeper", id="0", orders=[Order(subject="pause", name="", stamp_ns=10)]),
+    Obey(author="operator.z", sets=np.array([(3, 1, 1 << 16)], DIGEST_ROW).tobytes()),
+    Obeyed(role="agent", id="a0", incarnation=7),
     Beat(role="planner", id="t0.r1", incarnation=7, ready=True, leads=False),
     Note(role="agent", id="a0", stamp_ns=10, kind="closure", text="road closed", cell=9),
 )  # fmt: skip

@@ -37,6 +37,11 @@ class Motion:
         return self.done_m / self._length_m if self._length_m else 0.0
 
     @property
+    def left_m(self) -> float:
+        """Metres of the step that are not driven yet."""
+        return self._length_m - self.done_m
+
+    @property
     def at_rest(self) -> bool:
         """Whether it stands in the middle of a cell, so that it may set out in any direction."""
         return self.tail == self.head

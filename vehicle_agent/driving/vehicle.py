@@ -87,6 +87,7 @@ class Vehicle:
 
     target        the target that it goes for, None before the first assignment
     in_reach      whether that target is within capture range
+    tracked       whether that target has a tracker that lives; else it was in reach, and may be anywhere
     planner_gone  whether that target's planner is dead, since `gone_since_ns`
     asked         the target of the open route request, None if there is none
     """
@@ -98,6 +99,7 @@ class Vehicle:
         self.motion = Motion(grid, cell)
         self.route = Follower()
         self.in_reach = False
+        self.tracked = True
         self.planner_gone = False
         self.gone_since_ns = 0
         self.asked: str | None = None
@@ -126,6 +128,13 @@ class Vehicle:
             self.state = VehicleState.WAITING
         self._need_route(Reason.ASSIGNED, now_ns)
 
+    def release(self) -> None:
+        """Go for no target any more, until another is assigned."""
+        self.target = self.asked = self._need = None
+        self.in_reach = self.planner_gone = False
+        self.route.drop()
+        self.state = VehicleState.IDLE
+
     def no_way(self) -> None:
         """Every planner has answered, and none knows a route from here."""
         if not self.in_reach and not self.route.left:
@@ -148,6 +157,11 @@ class Vehicle:
         self.in_reach = in_reach
         if in_reach:
             self._need = None
+        self._settle()
+
+    def set_tracked(self, tracked: bool) -> None:
+        """Whether its target has a tracker that lives: without one it goes on, by an old pose."""
+        self.tracked = tracked
         self._settle()
 
     def target_jumped(self, now_ns: int) -> None:
@@ -246,10 +260,10 @@ class Vehicle:
         if self.target is None:
             return
         if self.in_reach:
-            self.state = VehicleState.ARRIVED
+            self.state = VehicleState.ARRIVED if self.tracked else VehicleState.OUTDATED
         elif self.planner_gone:
             self.state = VehicleState.LOST
         elif self.route.left:
-            self.state = VehicleState.FOLLOWING
+            self.state = VehicleState.FOLLOWING if self.tracked else VehicleState.OUTDATED
         elif self.state is not VehicleState.STRANDED:
             self.state = VehicleState.WAITING

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import GridSpec
-from swarm.wire.statements import MarkKind
+from swarm.plugins.door import Door, Nonsense, Tell
+from swarm.plugins.find import Plugin
+from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
 
 _TOLERANCE = np.float32(0.01)
 """Paces that differ by less than this share count as equal."""
@@ -36,9 +38,30 @@ class Findings:
         return len(self.cells)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorWorld:
+    """What a sensor is made with.
+
+    truth_s_per_m  float32 (rows, cols), the true pace, inf if lethal, read-only; it may change during a run
+    range_m        `vehicles.sense_range_m`
+    agent          id of the agent whose vehicles it serves
+    seed           of the run
+    """
+
+    grid: GridSpec
+    truth_s_per_m: NDArray[np.float32]
+    range_m: float
+    agent: str
+    seed: int
+
+
 class Sensor(Protocol):
+    """Sees the ground around vehicles. A plug-in is made as `Name(world: SensorWorld, options)`."""
+
     def look(self, cells: Sequence[int]) -> Sight:
-        """What is seen from these cells: at least each cell itself and its eight neighbours."""
+        """What is seen from these cells, the places of vehicles that have come there: cells on the grid with their
+        pace, `PACE_LEAST` to `PACE_MOST` s/m, or inf where lethal. A built-in sensor sees at least each cell itself
+        and its eight neighbours; to a plug-in's sight these are added."""
         ...
 
 
@@ -65,6 +88,61 @@ class TruthSensor:
         inside = (rows >= 0) & (rows < self._grid.rows) & (cols >= 0) & (cols < self._grid.cols)
         seen = (rows * self._grid.cols + cols)[inside]
         return Sight(seen, self._truth.reshape(-1)[seen])
+
+
+SENSORS: Mapping[str, Callable[[SensorWorld], Sensor]] = {
+    "truth": lambda world: TruthSensor(world.grid, world.truth_s_per_m, world.range_m),
+}
+"""The built-in sensors."""
+
+
+def sensor_of(plugin: Plugin, world: SensorWorld, tell: Tell) -> Sensor:
+    """The sensor that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+    if plugin.factory is None:
+        return SENSORS[plugin.named.name](world)
+    truth = world.truth_s_per_m.view()
+    truth.flags.writeable = False
+    world = SensorWorld(world.grid, truth, world.range_m, world.agent, world.seed)
+    return PluginSensor(plugin.make(world), world, Door(plugin, tell))
+
+
+class PluginSensor:
+    """A plug-in's sight, and of the cells next to a vehicle the truth: a bumper, which no plug-in takes away, and
+    whose word counts where they differ. So no vehicle stands for ever before what its sensor does not see."""
+
+    def __init__(self, sensor: Sensor, world: SensorWorld, door: Door) -> None:
+        self._sensor = sensor
+        self._cells = world.grid.cells
+        self._bumper = TruthSensor(world.grid, world.truth_s_per_m, 0.0)
+        self._door = door
+
+    def look(self, cells: Sequence[int]) -> Sight:
+        near = self._bumper.look(cells)
+        return self._door.ask(
+            lambda: self._sensor.look(list(cells)), lambda sight: self._beside(near, sight), lambda: near
+        )
+
+    def _beside(self, near: Sight, sight: object) -> Sight:
+        if not hasattr(sight, "cells") or not hasattr(sight, "paces"):
+            raise Nonsense(f"{type(sight).__name__}, expected a Sight")
+        cells, paces = np.asarray(sight.cells), np.asarray(sight.paces)
+        if cells.ndim != 1 or cells.shape != paces.shape:
+            raise Nonsense(f"cells {cells.shape} and paces {paces.shape}, expected one pace for each cell")
+        if not cells.size:
+            return near
+        if cells.dtype.kind not in "iu" or paces.dtype.kind not in "iuf":
+            raise Nonsense(f"cells of {cells.dtype} and paces of {paces.dtype}, expected whole numbers and numbers")
+        least, most = int(cells.min()), int(cells.max())
+        if least < 0 or most >= self._cells:
+            raise Nonsense(f"cell {least if least < 0 else most}, expected cells 0 to {self._cells - 1}")
+        told = paces.astype(np.float64)
+        wrong = ~(((told >= PACE_LEAST) & (told <= PACE_MOST)) | (told == np.inf))
+        if wrong.any():
+            found = f"pace {told[wrong][0]:g} at cell {cells[wrong][0]}"
+            raise Nonsense(f"{found}, expected {PACE_LEAST:.3g} to {PACE_MOST:g} s/m, or inf where lethal")
+        far = ~np.isin(cells, near.cells)
+        seen, told = cells[far].astype(np.int64), told[far]
+        return Sight(np.concatenate((near.cells, seen)), np.concatenate((near.paces, told.astype(np.float32))))
 
 
 def compare(sight: Sight, ground: NDArray[np.float32], prior: NDArray[np.float32]) -> Findings:

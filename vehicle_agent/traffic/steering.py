@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +14,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish
+from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.vehicle import Vehicle
 
 _NEAR_CELLS = 8
@@ -37,6 +38,9 @@ class Steering:
     pace         float32 (rows, cols), s/m; inf is lethal; read at each call
     reserve      cells ahead of itself that a vehicle may be granted
     occupied     whether another vehicle holds a cell
+    bodies       what speaks no right of way: its cells are passed as lethal ones are, but by routes
+
+    ways_out     cell that only an operator's zone closes -> steps from there out of it: who stands there leaves
     """
 
     def __init__(
@@ -47,6 +51,7 @@ class Steering:
         reserve: int,
         chance: random.Random,
         occupied: Callable[[int], bool],
+        bodies: Bodies,
     ) -> None:
         self._grid = grid
         self._pace = pace.reshape(-1)
@@ -55,17 +60,22 @@ class Steering:
         self._reserve = reserve
         self._chance = chance
         self._occupied = occupied
+        self._bodies = bodies
+        self._shut = bodies.closed
+        self.ways_out: Mapping[int, int] = {}
         self._since_ns: dict[str, int] = {}
         """Vehicle -> since when it has been on its way to a target."""
         self._stood_ns: dict[str, tuple[int, int]] = {}
         """Vehicle -> the cell on which it waits, and since when."""
 
     def closed(self, cell: int) -> bool:
-        """Whether a cell is lethal."""
-        return not math.isfinite(self._pace[cell])
+        """Whether a cell is lethal, or a body closes it."""
+        return cell in self._shut or not math.isfinite(self._pace[cell])
 
     def passable(self, tail: int, head: int) -> bool:
         """Whether the map allows the step between two neighbours; a diagonal also needs the cells beside it."""
+        if tail in self.ways_out:
+            return head in self._out_of(tail)
         if self.closed(head):
             return False
         cols = self._grid.cols
@@ -75,7 +85,8 @@ class Steering:
         return not (self.closed(tail + col) or self.closed(tail + rows * cols))
 
     def passable_steps(self, cells: Sequence[int]) -> int:
-        """How many steps along some cells, each next to the one before, the map allows."""
+        """How many steps along some cells, each next to the one before, the map allows. Bodies count for none: they
+        may be gone before the vehicle is there."""
         if len(cells) < 2:
             return 0
         at = np.array(cells, np.int64)
@@ -96,11 +107,24 @@ class Steering:
         in_reach   whether the target is within capture range of a cell
         """
         still = len(path) == 1
+        if path[0] in self.ways_out:
+            age_ms = (now_ns - self._since_ns.setdefault(vehicle.id, now_ns)) // _MS
+            wants = sorted(self.steps(path[0]) if still else (), key=self._occupied)
+            return Wish((), wants, len(wants), max(1, min(age_ms, _OLDEST_MS), pushed_ms))
         if vehicle.in_reach or vehicle.target is None:
             self._since_ns[vehicle.id] = now_ns
             steps = self.steps(path[0]) if still else []
+            flees = still and self.threatened(path[0])
+            if flees:
+                pushed_ms = _OLDEST_MS
             wants = sorted(
-                steps, key=lambda cell: (not in_reach(cell), self._occupied(cell), self._chance.random())
+                steps,
+                key=lambda cell: (
+                    self._bodies.danger(cell) if flees else 0.0,
+                    not in_reach(cell),
+                    self._occupied(cell),
+                    self._chance.random(),
+                ),
             )
             return Wish((), wants, len(wants) if pushed_ms else 0, pushed_ms)
         age_ms = (now_ns - self._since_ns.setdefault(vehicle.id, now_ns)) // _MS
@@ -110,10 +134,17 @@ class Steering:
             return Wish(ahead, (), 0, age_ms)
         near = self._places(vehicle.route.near(_NEAR_CELLS))
         cost = {cell: self._cost(cell, near) + _OCCUPIED * self._occupied(cell) for cell in self.steps(path[0])}
+        if self.threatened(path[0]):
+            wants = sorted(cost, key=lambda cell: (self._bodies.danger(cell), cost[cell], self._chance.random()))
+            return Wish(ahead, wants, len(wants), _OLDEST_MS)
         wants = sorted(cost, key=lambda cell: (cost[cell], self._chance.random()))
         here = self._cost(path[0], near)
         better = len(wants) if pushed_ms else sum(each < here for each in cost.values())
         return Wish(ahead, wants, better, age_ms)
+
+    def threatened(self, cell: int) -> bool:
+        """Whether a body is on a cell or comes to it: who stands there makes way before all others."""
+        return self._bodies.any and (cell in self._shut or self._bodies.danger(cell) > 0.0)
 
     def blocked(self, vehicle: Vehicle, path: Sequence[int], now_ns: int) -> bool:
         """Whether it stands though its route goes on. Asks for another route after a while."""
@@ -135,8 +166,17 @@ class Steering:
                 return ahead[:index]
         return ahead
 
+    def _out_of(self, cell: int) -> list[int]:
+        """The neighbours straight beside a cell in a zone that are nearer to its border, or open."""
+        depth = self.ways_out[cell]
+        beside = [neighbour for direction, neighbour in self._grid.neighbours(cell) if direction % 2 == 0]
+        outwards = [each for each in beside if not self.closed(each) or self.ways_out.get(each, depth) < depth]
+        return [each for each in outwards if each not in self._shut]
+
     def steps(self, cell: int) -> list[int]:
         """The neighbours that the map allows to drive to."""
+        if cell in self.ways_out:
+            return self._out_of(cell)
         around: list[int | None] = [None] * 8
         for direction, neighbour in self._grid.neighbours(cell):
             if not self.closed(neighbour):

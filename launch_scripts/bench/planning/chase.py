@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from launch_scripts.bench.machine import memory_free
 from launch_scripts.bench.planning.fields import Field
 from launch_scripts.bench.tables import Progress
-from launch_scripts.world.walks import Budget, Walker
-from planner_service.strategy import OnMove, row_of
+from launch_scripts.world.walks import WALKS, Budget, Walker, WalkWorld
+from planner_service.strategy import ROWS, STAGES, OnMove
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig, Strategy, Walk
 from swarm.errors import ConfigError
@@ -148,7 +148,7 @@ def chase(
     tallies = {name: Tally(batches=len(batches)) for name in entrants}
     each = RUN_IN + plan.frames
     for done, batch in enumerate(batches):
-        walkers = [Walker(f"t{n}", plan.walk, 1.0, random.Random(plan.seed * 1000 + n), roots[n]) for n in batch]
+        walkers = [_walker(field, plan, n, roots[n]) for n in batch]
         exact = msgspec.structs.replace(next(iter(entrants.values())), strategy="full")
         crowd = _Crowd(field, plan, exact, walkers, [places[n] for n in batch], rng)
         racers = [
@@ -189,6 +189,11 @@ def _race(crowd: _Crowd, racers: Sequence[_Racer], plan: Plan, batches: int, tel
     tell(RUN_IN + plan.frames)
 
 
+def _walker(field: Field, plan: Plan, n: int, cell: int) -> Walker:
+    world = WalkWorld(f"t{n}", field.terrain, random.Random(plan.seed * 1000 + n), Budget())
+    return Walker(world.target, WALKS[plan.walk](world), 1.0, cell)
+
+
 class _Crowd:
     """Places of targets and vehicles, and optimal costs between them."""
 
@@ -213,7 +218,7 @@ class _Crowd:
         """Moves targets and vehicles by one frame."""
         vehicles = np.concatenate(self.places)
         for n, walker in enumerate(self._walkers):
-            to = walker.choose(self._field.terrain, vehicles, Budget())
+            to = walker.walk.choose(walker.cell, vehicles)
             walker.cell = walker.cell if to is None else to
             self.targets[n] = walker.cell
             if self._plan.speed:
@@ -262,7 +267,7 @@ class _Racer:
         """Strategies that grow the whole tree now and then do so once now, one target after the other, or all would
         in the same frame ever after."""
         # The row of `auto` is that of the stage in which it has windows.
-        row = row_of(self._strategy, "rotate", only_whole=False)
+        row = ROWS.get(self._strategy, STAGES["rotate"])
         if row.on_move is OnMove.WHOLE_TREE:
             return
         grows = row.grows_whole_trees

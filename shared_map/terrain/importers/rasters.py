@@ -19,26 +19,14 @@ from numpy.typing import NDArray
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.georeference import crs_of, plan_grid, resampling
 from shared_map.terrain.importers.level_ground import level_ground, notes_of_level, notes_of_voids, undeclared_voids
+from shared_map.terrain.importers.raster_kinds import kind_of
 from shared_map.terrain.row_bands import Progress, bands, no_progress
-from swarm.config.input_files import FileKind, check_bytes, size
+from swarm.config.input_files import size
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
-_DRIVERS = {
-    b"II*\0": "GTiff",
-    b"MM\0*": "GTiff",
-    b"II+\0": "GTiff",
-    b"MM\0+": "GTiff",
-    b"<VRTDataset": "VRT",
-    b"\x89PNG": "PNG",
-    b"\xff\xd8\xff": "JPEG",
-    b"\0\0\0\x0cjP  ": "JP2OpenJPEG",
-    b"RIFF": "WEBP",
-    b"BM": "BMP",
-}
-"""First bytes -> GDAL's driver. GDAL knows 150 formats, most of which nobody has tried to break for long."""
-_BY_ROWS = ("GTiff", "SRTMHGT", "VRT")
+_BY_ROWS = ("GTiff", "SRTMHGT", "VRT", "EHdr", "ENVI", "HFA")
 _MAX_PIXELS = 16 * MAX_CELLS
 """Of formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
@@ -93,36 +81,23 @@ def opened(path: Path, what: str) -> Iterator[Any]:
     if not path.is_file():
         raise TerrainError(f"{what} {path} does not exist")
     try:
-        driver = _driver_of(path, what)
+        name, driver = kind_of(path, what)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             # A .vrt names other files: none of them may be somewhere on the network.
             with (
                 rasterio.Env(GDAL_CACHEMAX=128, CPL_LOG="/dev/null", CPL_VSIL_CURL_ALLOWED_EXTENSIONS=".none"),
-                rasterio.open(path, driver=driver) as dataset,
+                rasterio.open(name, driver=driver) as dataset,
             ):
                 _check_size(dataset, f"{what} {path}")
-                _check_length(path, dataset, what)
+                if name is path:
+                    _check_length(path, dataset, what)
                 yield dataset
     except (RasterioError, CPLE_BaseError) as error:
         reason = str(error.__cause__ or error).strip().splitlines()[0][:_LONGEST_REASON]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
     except OSError as error:
         raise TerrainError(f"cannot read {what} {path}: {error.strerror or error}") from error
-
-
-def _driver_of(path: Path, what: str) -> str:
-    if path.suffix.lower() == ".hgt":
-        return "SRTMHGT"
-    with path.open("rb") as file:
-        head = file.read(16)
-    driver = next((driver for magic, driver in _DRIVERS.items() if head.startswith(magic)), None)
-    if driver is None:
-        known = ", ".join(dict.fromkeys(_DRIVERS.values()))
-        raise TerrainError(f"{what} {path} is no raster: it begins with {head[:8]!r}, as none of {known} does")
-    if driver == "VRT":
-        check_bytes(path, FileKind.VIRTUAL_RASTER)
-    return driver
 
 
 def _check_size(dataset: Any, what: str) -> None:

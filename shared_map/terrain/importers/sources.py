@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.terrain.importers.raster_kinds import is_raster
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.input_files import FileKind, check_bytes
@@ -139,9 +140,9 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     if path.is_dir():
         raise TerrainError(f"terrain {path} is a folder; give a file: {FILE_KINDS}")
     suffix = path.suffix.lower()
-    if suffix not in _READERS:
+    if suffix not in _READERS and not is_raster(path):
         raise TerrainError(f"terrain {path}: {suffix or 'a file without ending'} is unknown; give {FILE_KINDS}")
-    return _READERS[suffix](path, config, progress)
+    return _READERS.get(suffix, _raster)(path, config, progress)
 
 
 def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
@@ -270,6 +271,13 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".tiff": _raster,
     ".hgt": _raster,
     ".vrt": _raster,
+    ".img": _raster,
+    ".bil": _raster,
+    ".flt": _raster,
+    ".dem": _raster,
+    ".nc": _raster,
+    ".dt2": _raster,
+    ".zip": _raster,
     ".asc": _heights,
     ".npz": _heights,
     ".png": _png,
@@ -277,13 +285,13 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".yaml": _map,
     ".yml": _map,
 }
-"""Ending -> reader. A new kind of file is a row here."""
+"""Ending -> reader. A new kind of file is a row here; a raster of any other name is known by how it begins."""
 FILE_KINDS = ", ".join(_READERS)
 
 
 def is_terrain(path: Path) -> bool:
-    """Whether a file is named as one that holds a terrain."""
-    return path.suffix.lower() in _READERS
+    """Whether a file is named as one that holds a terrain, or begins as a raster."""
+    return path.suffix.lower() in _READERS or is_raster(path)
 
 
 # --- onto the grid ------------------------------------------------------------------------------------------

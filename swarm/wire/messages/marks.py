@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import numpy as np
 from msgspec import Meta
 
-from swarm.wire.fields import Column, Id, Natural, Tile, Word, check_column, column
+from swarm.lazy_numpy import np, numpy_loaded
+from swarm.wire.fields import Column, Id, Natural, Tile, Word, check_column, column, width_of
 from swarm.wire.messages.base import Message, schema_of
 from swarm.wire.statements import (
     LAST_KIND,
@@ -22,10 +22,13 @@ from swarm.wire.statements import (
 
 SEQ_STEP = 1 << 16
 """An author's own numbers are multiples of this."""
-DIGEST_ROW = np.dtype([("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8")])
+_ROW = (("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8"))
+DIGEST_ROW = list(_ROW)
+"""As NumPy wants it."""
+DIGEST_ROW_BYTES = width_of(_ROW)
 MOST_TILES = 1 << 18
 """Named in one message: every tile of a map of 16,384 x 16,384 cells."""
-_ROWS = Meta(max_length=DIGEST_ROW.itemsize * MOST_TILES)
+DigestRows = Annotated[bytes, Meta(max_length=DIGEST_ROW_BYTES * MOST_TILES), Column(_ROW)]
 _AUTHORS = Meta(max_length=1 << 16)
 _Cells = Annotated[bytes, Column("<u2", per="kinds", least=0, most=TILE_AREA - 1, checked=False)]
 _Kinds = Annotated[bytes, Column("<u1", least=0, most=LAST_KIND, checked=False)]
@@ -108,6 +111,8 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
         self.check_bounds()
 
     def relate(self) -> None:
+        if not numpy_loaded():
+            raise ValueError("many sets at once are read with NumPy only: ask without `bulk`")
         sets = len(self.ending)
         counts = column(self.counts, "<u2").astype(np.int64)
         ending = column(self.ending, "<u1")
@@ -130,7 +135,7 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
 
     author: Id
     role: Word
-    held: Annotated[dict[Id, Annotated[bytes, _ROWS, Column(DIGEST_ROW)]], _AUTHORS]
+    held: Annotated[dict[Id, DigestRows], _AUTHORS]
     whole: bool = True
     seq: Natural = 0
 

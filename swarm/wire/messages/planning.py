@@ -11,6 +11,7 @@ from swarm.wire.fields import (
     LARGE,
     SMALL,
     AgeMillis,
+    AgeSeconds,
     Cell,
     Column,
     Count,
@@ -55,6 +56,8 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     incarnation  of the planner
     map_version  number of changes of its replica
     tree_age_ms  time since the last full growth
+    pose_age_s   time since the pose arrived that the route leads to; None before the first
+    tracker_lost  nobody tracks the target now: it was there, and may be anywhere
     """
 
     target: Id
@@ -65,6 +68,8 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     rows: GridSide
     cols: GridSide
     routes: Routes
+    pose_age_s: AgeSeconds | None = None
+    tracker_lost: bool = False
 
 
 class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-route")):
@@ -91,7 +96,8 @@ class CostRequest(Message, frozen=True, kw_only=True, tag=schema_of("cost-reques
 
 
 class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
-    """cost_to_go_s  float32 per asked cell, inf where there is no way or the cell is outside."""
+    """cost_to_go_s  float32 per asked cell, inf where there is no way or the cell is outside. Else as in
+    `RouteReply`."""
 
     target: Id
     incarnation: Incarnation
@@ -99,13 +105,16 @@ class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
     map_version: Count
     tree_age_ms: AgeMillis
     cost_to_go_s: Annotated[bytes, Meta(max_length=4 * 100_001), Column("<f4", least=0, most=math.inf)]
+    pose_age_s: AgeSeconds | None = None
+    tracker_lost: bool = False
 
 
 class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-status")):
     """State of a planner.
 
-    window  [row0, col0, row1, col1] of the part grown last
-    gap_*   driven cost over optimum of the vehicles that follow, at the last full growth; None before the first
+    window   [row0, col0, row1, col1] of the part grown last
+    tracker  whose pose the target was placed by last; None if that tracker has no name. Ages as in `RouteReply`
+    gap_*    driven cost over optimum of the vehicles that follow, at the last full growth; None before the first
     """
 
     target: Id
@@ -121,6 +130,9 @@ class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-s
     growth_ms: Millis
     routes_served: Count
     following: Count
+    tracker: Id | None = None
+    pose_age_s: AgeSeconds | None = None
+    tracker_lost: bool = False
     gap_mean: Gap | None = None
     gap_p95: Gap | None = None
     gap_max: Gap | None = None

@@ -16,6 +16,8 @@ from swarm.wire.fields import (
     GridSideOrNone,
     Id,
     Incarnation,
+    LongText,
+    Metres,
     StampNs,
     Text,
     Word,
@@ -25,7 +27,11 @@ from swarm.wire.messages.base import Message, schema_of
 
 class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     """The run that a process belongs to. `terrain` is a digest of grid, prior pace and cost rules: processes with
-    different ones must not share a map."""
+    different ones must not share a map.
+
+    rows, cols, resolution_m    of the grid; 0 of a router, which has none
+    west_m, north_m, crs        where its north-west corner is, and in which coordinate system
+    """
 
     run_id: Word
     role: Id
@@ -37,6 +43,9 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     cols: GridSideOrNone
     resolution_m: Distance
     started_ns: StampNs
+    west_m: Metres = 0.0
+    north_m: Metres = 0.0
+    crs: LongText = "local"
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):

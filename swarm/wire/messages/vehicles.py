@@ -44,6 +44,8 @@ class VehicleState(enum.IntEnum):
     """No way to any target from here."""
     LOST = 5
     """Its planner is gone: keeps the last route it has, and says so."""
+    OUTDATED = 6
+    """Goes by an old pose: its target's tracker is lost."""
 
 
 NO_TARGET = 255
@@ -73,7 +75,7 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
     east_m: _Place
     south_m: _Place
     heading_rad: Annotated[bytes, Column("<f4", per="ids", least=-2 * math.tau, most=2 * math.tau)]
-    states: Annotated[bytes, Column("<u1", per="ids", least=0, most=int(VehicleState.LOST))]
+    states: Annotated[bytes, Column("<u1", per="ids", least=0, most=int(max(VehicleState)))]
     targets: Annotated[bytes, Column("<u1", per="ids")]
 
     def relate(self) -> None:

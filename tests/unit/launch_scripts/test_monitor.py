@@ -33,6 +33,7 @@ from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import Sighted
@@ -123,6 +124,19 @@ def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
     rig.run(3)
     rig.close()
     assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 2
+
+
+def test_a_body_is_drawn_where_it_says_and_taken_away_when_its_lease_ends(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
+    grid = terrain.grid
+    x_m, y_m = grid.centre_m(grid.cell(5, 5))
+    body = Body(id="r1", incarnation=1, seq=1, x_m=x_m, y_m=y_m, radius_m=2.0, lease_s=0.7)
+    rig.play([(NS_PER_S // 2, body), (NS_PER_S, msgspec.structs.replace(body, seq=2, x_m=x_m + 30.0))])
+    rig.run(3)
+    rig.close()
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/bodies"] == 3
 
 
 def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(

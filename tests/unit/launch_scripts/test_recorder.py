@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from launch_scripts.launcher.live_table import plain_line
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.samples import Sample, Samples
 from launch_scripts.report.tracks import Tracks
@@ -236,7 +237,8 @@ def test_a_vehicle_that_crosses_into_another_region_is_counted_once_where_it_is_
     assert vehicles.chasing("t1").tolist() == []
     summary = recorder.summary(2 * NS_PER_S)
     assert summary.states == {
-        "idle": 0, "waiting": 0, "following": 1, "arrived": 1, "stranded": 0, "lost": 0
+        "idle": 0, "waiting": 0, "following": 1, "arrived": 1, "stranded": 0, "lost": 0,
+            "outdated": 0,
     }  # fmt: skip
 
 
@@ -308,6 +310,30 @@ def test_the_live_table_has_a_line_per_target(recorder: Recorder) -> None:
     assert (first.id, first.planner_up, first.following, first.nearest_m) == ("t0", True, 2, 50.0)
     assert (first.growths, first.growth_ms, first.gap) == (5, 1.5, 1.02)
     assert (second.id, second.planner_up, second.following, second.nearest_m) == ("t1", False, 0, None)
+
+
+def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_it_is_back(
+    recorder: Recorder,
+) -> None:
+    recorder.alive(Peer("planner", "t0", 1), True, 0)
+    recorder.alive(Peer("planner", "t1", 1), True, 0)
+    hear(recorder, pose("t0", 100.0, 100.0, 1), at_s=1.0)
+    hear(recorder, pose("t1", 100.0, 100.0, 1), at_s=9.0)
+    first, second = recorder.summary(10 * NS_PER_S).targets
+    assert (first.title, first.lost, first.pose_age_s) == ("t0 (lost 9 s)", True, 9.0)
+    assert (second.title, second.lost, second.pose_age_s) == ("t1", False, 1.0)
+    assert plain_line(recorder.summary(10 * NS_PER_S), {}, 0).endswith("; lost targets: t0")
+    assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
+    hear(recorder, pose("t0", 100.0, 100.0, 2), at_s=10.0)
+    assert [line.lost for line in recorder.summary(10 * NS_PER_S).targets] == [False, False]
+    assert recorder.report()["tracking"]["lost_at_end"] == []
+
+
+def test_of_a_target_that_only_vehicles_see_its_planner_tells_whether_it_is_lost(recorder: Recorder) -> None:
+    lost = msgspec.structs.replace(status("t0", 1.0), tracker_lost=True, pose_age_s=31.0)
+    hear(recorder, lost)
+    line = recorder.summary(0).targets[0]
+    assert (line.lost, line.pose_age_s) == (True, 31.0)
 
 
 def test_the_run_is_ready_when_all_processes_are_alive_and_a_vehicle_has_a_route(recorder: Recorder) -> None:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from support.target_reports import fleet
 
 from launch_scripts.world.referee import Collision, LethalEntry, Referee
+from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import Fleet
 
 
 def judged(*reports: Fleet, truth: NDArray[np.float32] | None = None) -> list[Collision | LethalEntry]:
-    referee = Referee(np.ones(100, np.float32) if truth is None else truth)
+    referee = Referee(np.ones(100, np.float32) if truth is None else truth, GridSpec(10, 10, 10.0))
     return [broken for report in reports for broken in referee.hear(report)]
 
 

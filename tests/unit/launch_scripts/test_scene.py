@@ -8,6 +8,7 @@ import pytest
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.scene import (
     LETHAL_MARK,
+    LOST_TARGET_COLOUR,
     STATE_COLOURS,
     RouteNow,
     TerrainMesh,
@@ -143,6 +144,8 @@ def test_vehicles_are_shades_of_green_and_targets_red() -> None:
     targets = target_points(mesh, {"t0": (50.0, 60.0)})
     red, green, blue = targets.colours[0].tolist()
     assert red > 4 * max(green, blue)
+    lost = target_points(mesh, {"t0": (50.0, 60.0), "t1": (0.0, 0.0)}, {"t1"})
+    assert lost.colours.tolist() == [[red, green, blue], list(LOST_TARGET_COLOUR)]
     (pole,) = poles(mesh, targets)
     assert pole[:, :2].tolist() == [[50.0, -60.0], [50.0, -60.0]]
     assert pole[0, 2] < pole[1, 2] < label_places(mesh, targets)[0, 2]

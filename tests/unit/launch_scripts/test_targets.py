@@ -220,7 +220,7 @@ def test_an_external_target_is_not_driven_but_can_be_caught() -> None:
     cell = world.grid.cell(5, 5)
     x_m, y_m = world.grid.centre_m(cell)
     pose = TargetPose(target="t", incarnation=9, seq=1, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m)
-    world.world.hear_pose(pose, 0)
+    world.world.hear_pose(pose, world.now_ns)
     assert world.poses() == {}
     assert world.hear(cell) == [Captured("t", "v", cell)]
     assert world.hear(cell) == []

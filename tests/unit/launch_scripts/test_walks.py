@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.target_reports import FLAT, RES, flat
 
-from launch_scripts.world.walks import Budget, TrueTerrain, Walker, far_place, slowness_of
+from launch_scripts.world.walks import (
+    WALKS,
+    Budget,
+    TrueTerrain,
+    Walker,
+    WalkWorld,
+    Waypoints,
+    far_place,
+    slowness_of,
+)
 from swarm.config.scenario import CostConfig, TargetConfig, Walk
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -33,8 +42,16 @@ def rough(seed: int, rows: int = 30, cols: int = 34, lethal: float = 0.3) -> NDA
     return pace
 
 
-def walker(where: TrueTerrain, cell: int, walk: Walk, slowness: float = 1.0, seed: int = 1) -> Walker:
-    return Walker("t", walk, slowness, random.Random(seed), cell)
+def walker(
+    where: TrueTerrain,
+    cell: int,
+    walk: Walk,
+    slowness: float = 1.0,
+    seed: int = 1,
+    budget: Budget | None = None,
+) -> Walker:
+    world = WalkWorld("t", where, random.Random(seed), budget or Budget())
+    return Walker("t", WALKS[walk](world), slowness, cell)
 
 
 def test_the_largest_part_is_what_legal_steps_connect() -> None:
@@ -67,7 +84,7 @@ def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
     vehicles = where.home[:3]
     for _ in range(80):
         before, heading_to = one.cell, one.towards
-        one.advance(where, 3.0, vehicles, Budget())
+        one.advance(where, 3.0, vehicles)
         if one.towards is not None:
             assert one.towards in [to for _, to in where.steps(one.cell)]
         assert not where.lethal(one.cell)
@@ -112,7 +129,7 @@ def test_a_walled_in_target_stays_where_it_is() -> None:
     walks: tuple[Walk, ...] = ("random", "waypoints", "evade")
     for walk in walks:
         one = walker(where, 12, walk)
-        one.advance(where, 100.0, NOBODY, Budget())
+        one.advance(where, 100.0, NOBODY)
         assert one.cell == 12
 
 
@@ -132,9 +149,10 @@ def test_ten_seconds_of_driving(speed: float, pace: float, metres: float) -> Non
     where = terrain(np.full((1, 40), pace, np.float32))
     config = TargetConfig(speed_m_per_s=speed)
     one = walker(where, 0, "waypoints", slowness_of(config, CostConfig(flat_speed_m_per_s=10.0)))
-    one.way = list(range(39, 0, -1))
+    assert isinstance(one.walk, Waypoints)
+    one.walk.way, one.walk.led_to = list(range(39, 0, -1)), 0
     for _ in range(100):
-        one.advance(where, 0.1, NOBODY, Budget())
+        one.advance(where, 0.1, NOBODY)
     x_m, _ = one.position_m(where)
     assert x_m - 5.0 == pytest.approx(metres, abs=1e-4)
 
@@ -144,18 +162,19 @@ def test_an_evader_gets_away_from_the_vehicles_near_it() -> None:
     grid = where.grid
     one = walker(where, grid.cell(20, 25), "evade")
     vehicles = np.array([grid.cell(20, 22), grid.cell(18, 23)])
-    one.advance(where, 8.0, vehicles, Budget())
+    one.advance(where, 8.0, vehicles)
     assert min(grid.distance_cells(one.cell, cell) for cell in vehicles.tolist()) >= 7
 
 
 def test_ways_are_computed_one_a_tick() -> None:
     where = terrain(flat())
-    walkers = [walker(where, 100 * n, "waypoints") for n in range(4)]
+    budget = Budget()
+    walkers = [walker(where, 100 * n, "waypoints", budget=budget) for n in range(4)]
     for ticked in range(1, 5):
-        budget = Budget()
+        budget.ways = 1
         for one in walkers:
-            one.advance(where, 0.1, NOBODY, budget)
-        assert sum(1 for one in walkers if one.way) == ticked
+            one.advance(where, 0.1, NOBODY)
+        assert sum(1 for one in walkers if one.towards is not None) == ticked
 
 
 def test_a_jump_leads_far_away_and_clear_of_vehicles() -> None:

@@ -13,7 +13,7 @@ from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
 from planner_service import target_tree
-from planner_service.strategy import AutoStage
+from planner_service.strategy import Auto, Growths
 from planner_service.tree import corridors as corridor_graphs
 from planner_service.tree.corridors import CorridorGraph, find_corridors
 from planner_service.tree.cost_grid import CostGrid
@@ -141,10 +141,10 @@ def test_a_window_reaches_sixteen_times_as_far_as_the_target_came_since_one_so_w
 
 
 def test_auto_grows_exactly_then_rotates_then_coarsens_and_does_not_flap() -> None:
-    auto = AutoStage(budget_ns=10e6)
+    auto = Auto()
     stages = []
     for full_ms in (2, 9, 11, 9, 8, 6, 11, 150, 330, 300, 250, 200, 50, 6):
-        auto.observe(full_ms * 1e6, widest=512)
+        auto.row(Growths(full_ms * 1e6, budget_ns=10e6, widest_cells=512, map_cells=1 << 20))
         stages.append(auto.stage)
     assert stages == [
         *("exact", "exact", "rotate", "rotate", "rotate", "exact", "rotate"),

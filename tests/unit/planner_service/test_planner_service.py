@@ -124,18 +124,38 @@ def test_a_person_asks_by_row_and_col_and_outside_is_a_status() -> None:
     assert [route.status for route in swarm.ear.routes(row=10, col=COLS).routes] == [RouteStatus.OUTSIDE]
 
 
-def test_a_target_on_lethal_ground_or_outside_has_no_routes_until_it_is_back() -> None:
+def test_a_target_on_lethal_ground_has_no_routes_until_it_is_back() -> None:
     pace = flat()
     pace[5, 5] = np.inf
     swarm = Swarm(pace)
-    for cell in (GRID.cell(5, 5), GRID.cells + 3):
+    for _ in range(2):
         swarm.cells["t"] = GRID.cell(10, 10)
         swarm.run(0.3)
         assert swarm.ear.routes(0).routes[0].status is RouteStatus.OK
-        swarm.cells["t"] = cell
+        swarm.cells["t"] = GRID.cell(5, 5)
         swarm.run(0.3)
         reply = swarm.ear.routes(0)
         assert (reply.target_cell, reply.routes[0].status) == (None, RouteStatus.NO_TARGET)
+
+
+def test_a_pose_outside_of_the_terrain_is_not_used_and_the_target_is_lost_until_the_next_inside() -> None:
+    swarm = Swarm()
+    swarm.cells["t"] = GRID.cell(10, 10)
+    swarm.run(0.3)
+    swarm.cells["t"] = GRID.cells + 3
+    swarm.run(1.0)
+    reply = swarm.ear.routes(0)
+    assert (reply.target_cell, reply.routes[0].status) == (GRID.cell(10, 10), RouteStatus.OK)
+    assert not reply.tracker_lost
+    swarm.run(2.0)
+    reply = swarm.ear.routes(0)
+    assert (reply.target_cell, reply.tracker_lost) == (GRID.cell(10, 10), True)
+    assert reply.pose_age_s is not None
+    assert 2.7 < reply.pose_age_s < 3.2
+    swarm.cells["t"] = GRID.cell(10, 12)
+    swarm.run(0.3)
+    reply = swarm.ear.routes(0)
+    assert (reply.target_cell, reply.tracker_lost) == (GRID.cell(10, 12), False)
 
 
 def test_a_mark_reaches_the_tree_and_the_followers_whose_route_it_cuts() -> None:

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
-from typing import get_args
+from dataclasses import fields
+from itertools import product
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
+from support.planner_play import Play
+from support.planner_strategies import Job, Marks, Move, random_pace
 
-from planner_service import strategy as table
-from planner_service.strategy import STAGES, STRATEGIES, FullGrowth, OnMove, StrategyRow, row_of
+from planner_service.strategy import (
+    ROWS,
+    STAGES,
+    STRATEGIES,
+    FullGrowth,
+    Growths,
+    OnMove,
+    Stage,
+    StrategyRow,
+    StrategyWorld,
+    strategy_of,
+    whole_trees_only,
+)
 from planner_service.target_tree import TargetTree
+from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.scenario import WHOLE_TREE_STRATEGIES, PlannerConfig, Strategy
 from swarm.grid import GridSpec
+from swarm.plugins.find import Plugin
 
 GRID = GridSpec(96, 96, 1.0)
 
 
-def kinds_of_moves(config: PlannerConfig, moves: int) -> list[str]:
+def kinds_of_moves(config: PlannerConfig, row: StrategyRow, moves: int) -> list[str]:
     """What each of so many moves of one cell to the east grew; "!" if a full growth, "~" if corridors were asked
     for."""
     pace = np.ones((GRID.rows, GRID.cols), np.float32)
-    tree = TargetTree(GRID, config)
+    tree = TargetTree(GRID, config, chosen_by=row)
     tree.update(pace, GRID.cell(48, 20), [], 0)
     updates = [tree.update(pace, GRID.cell(48, 21 + n), [], 0) for n in range(moves)]
     asked = "~" if tree.wants_corridors else ""
@@ -28,9 +45,9 @@ def kinds_of_moves(config: PlannerConfig, moves: int) -> list[str]:
 
 
 def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None:
-    assert {*STRATEGIES, "auto"} == set(get_args(Strategy))
-    assert set(STAGES) == set(get_args(table.Stage))
-    exact = {name for name, row in STRATEGIES.items() if row.on_move is OnMove.WHOLE_TREE}
+    assert set(STRATEGIES) == {*ROWS, "auto"} == set(get_args(Strategy))
+    assert set(STAGES) == set(get_args(Stage))
+    exact = {name for name, row in ROWS.items() if row.on_move is OnMove.WHOLE_TREE}
     assert {*exact, "auto"} == set(WHOLE_TREE_STRATEGIES)
 
 
@@ -45,18 +62,103 @@ def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None
     ],
 )
 def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(
-    row: StrategyRow, expected: list[str], monkeypatch: pytest.MonkeyPatch
+    row: StrategyRow, expected: list[str]
 ) -> None:
-    monkeypatch.setitem(STRATEGIES, "rotation", row)  # type: ignore[arg-type]
-    assert kinds_of_moves(PlannerConfig(strategy="rotation", k_min=0, full_every=3), 5) == expected
+    assert kinds_of_moves(PlannerConfig(strategy="auto", k_min=0, full_every=3), row, 5) == expected
 
 
-@pytest.mark.parametrize("strategy", get_args(Strategy))
-@pytest.mark.parametrize("stage", get_args(table.Stage))
-def test_where_uphill_is_not_downhill_every_strategy_grows_whole_trees(
-    strategy: Strategy, stage: table.Stage
-) -> None:
-    row = row_of(strategy, stage, only_whole=True)
-    assert row.on_move is OnMove.WHOLE_TREE
-    assert not row.thins_far_cells
-    assert row.renews_loose_bounds == row_of(strategy, stage, only_whole=False).renews_loose_bounds
+def test_where_uphill_is_not_downhill_every_row_grows_whole_trees() -> None:
+    for row in every_row():
+        whole = whole_trees_only(row)
+        assert whole.on_move is OnMove.WHOLE_TREE
+        assert not whole.thins_far_cells
+        assert whole.renews_loose_bounds == row.renews_loose_bounds
+
+
+def every_row() -> list[StrategyRow]:
+    hints = get_type_hints(StrategyRow)
+    values = [
+        (False, True) if hints[field.name] is bool else tuple(hints[field.name]) for field in fields(StrategyRow)
+    ]
+    return [StrategyRow(*each) for each in product(*values)]
+
+
+ASKED_TIMES = 7
+"""How often a strategy is asked in one history."""
+
+
+class AnyRow:
+    """Another row each time: of all histories together, every row."""
+
+    def __init__(self, seed: int) -> None:
+        rows = every_row()
+        order = np.random.default_rng(1).permutation(len(rows))
+        self.rows = [rows[order[(seed * ASKED_TIMES + n) % len(rows)]] for n in range(ASKED_TIMES)]
+
+    def row(self, growths: Growths) -> StrategyRow:
+        return self.rows.pop()
+
+
+@pytest.mark.parametrize("seed", range(11))
+def test_whatever_rows_a_strategy_chooses_routes_keep_the_laws(seed: int) -> None:
+    chance = np.random.default_rng(seed)
+    pace = random_pace(chance, 40, 37, 10.0, 0.15)
+    play = Play(pace, PlannerConfig(k_min=1, cpu_budget=1e-9, full_every=5), chosen_by=AnyRow(seed))
+    for step in range(60):
+        play.happen(Move(int(chance.integers(-1, 2)), int(chance.integers(-1, 2))))
+        if step % 3 == 0:
+            play.happen(Marks(step, 2))
+        if step % 10 == 5:
+            play.happen(Job("begin"))
+        if step % 10 == 8:
+            play.happen(Job("end"))
+            play.tree.observe_full_ns(int(chance.integers(1, 10**8)))
+        play.check()
+    assert not play.tree._chosen_by.rows  # type: ignore[attr-defined]
+
+
+# --- plug-ins ---------------------------------------------------------------------------------------------------
+
+
+def plugged(answer: Any) -> tuple[Any, list[str]]:
+    """A strategy whose plug-in answers with this, and what is told of it."""
+
+    class Answers:
+        def row(self, growths: Growths) -> Any:
+            return answer() if callable(answer) else answer
+
+    named = NamedPlugin(PLUGIN_KINDS["strategy"], "planner.strategy", "my:Own", {})
+    told: list[str] = []
+    plugin = Plugin(named, lambda world, options: Answers(), {})
+    return strategy_of(plugin, StrategyWorld("t", GRID, PlannerConfig()), told.append), told
+
+
+ASKED = Growths(1e6, 1e7, 64, GRID.cells)
+
+
+def test_a_plugins_row_is_in_force() -> None:
+    row = StrategyRow(OnMove.BLOCK_WINDOW, FullGrowth.EVERY_FEW_MOVES)
+    strategy, told = plugged(row)
+    assert strategy.row(ASKED) == row
+    assert TargetTree(GRID, PlannerConfig(strategy="my:Own"), chosen_by=strategy).strategy == row
+    assert not told
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        (lambda: 1 / 0, "raised ZeroDivisionError"),
+        (None, "returned NoneType, expected a StrategyRow"),
+        ("full", "returned str, expected a StrategyRow"),
+        (StrategyRow("whole tree"), "on_move is 'whole tree', expected a OnMove"),  # type: ignore[arg-type]
+        (StrategyRow(OnMove.WHOLE_TREE, thins_far_cells=1), "thins_far_cells is 1, expected a bool"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_strategy_that_fails_is_named_and_whole_trees_are_grown(answer: object, said: str) -> None:
+    strategy, told = plugged(answer)
+    assert strategy.row(ASKED).on_move is OnMove.WHOLE_TREE
+    assert strategy.row(ASKED).on_move is OnMove.WHOLE_TREE
+    (fault,) = told
+    assert "strategy plug-in 'my:Own' of planner.strategy: row r" in fault
+    assert said in fault
+    assert fault.endswith("this planner grows whole trees now")

@@ -16,6 +16,7 @@ from shared_map.terrain.importers.level_ground import level_ground, undeclared_v
 from shared_map.terrain.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.scenario import TerrainConfig
+from swarm.errors import TerrainError
 
 SIDE = 200
 
@@ -234,3 +235,54 @@ def test_heights_in_centimetres_and_what_a_map_in_feet_does_not_say(tmp_path: Pa
     assert load(path).elevation_m.max() == pytest.approx(500, rel=1e-3)
     notes = load(written(tmp_path / "ft.tif", hills(2, 500), crs="EPSG:2264")).notes
     assert any("terrain.height_scale = 0.3048" in note for note in notes)
+
+
+# --- kinds of files -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "driver", "dtype"),
+    [
+        ("a.img", "HFA", "float32"),
+        ("a.bil", "EHdr", "int16"),
+        ("a.flt", "EHdr", "float32"),
+        ("a.anything", "GTiff", "float32"),
+        ("without_ending", "GTiff", "int16"),
+        ("a.nc", "netCDF", "float32"),
+        ("a.sdat", "SAGA", "float32"),
+    ],
+)
+def test_rasters_of_many_kinds_are_read(tmp_path: Path, name: str, driver: str, dtype: str) -> None:
+    import rasterio
+    from rasterio.shutil import copy
+
+    plain = written(tmp_path / "plain.tif", np.round(hills(1, 500)), dtype)
+    copy(plain, tmp_path / name, driver=driver)
+    keys = {} if driver != "SAGA" else {"crs": "EPSG:32632"}
+    source = load(tmp_path / name, **keys)
+    np.testing.assert_allclose(source.elevation_m, load(plain).elevation_m)
+    assert rasterio.open(tmp_path / name).shape == (SIDE, SIDE)
+
+
+def test_a_raster_in_a_zip_is_read_and_a_bad_zip_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    import zipfile
+
+    plain = written(tmp_path / "plain.tif", hills(1, 500))
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.write(plain, "inside/dem.tif")
+        archive.writestr("readme.txt", "heights")
+    np.testing.assert_array_equal(load(tmp_path / "a.zip").elevation_m, load(plain).elevation_m)
+    with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
+        archive.write(plain, "a.tif")
+        archive.write(plain, "b.tif")
+    with pytest.raises(TerrainError, match="holds 2 rasters"):
+        load(tmp_path / "two.zip")
+    (tmp_path / "no.zip").write_bytes(b"PK no")
+    with pytest.raises(TerrainError, match=r"damaged or no \.zip"):
+        load(tmp_path / "no.zip")
+    (tmp_path / "cut.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-40000])
+    with pytest.raises(TerrainError, match=r"damaged or no \.zip"):
+        load(tmp_path / "cut.zip")
+    (tmp_path / "text").write_text("hello")
+    with pytest.raises(TerrainError, match="a file without ending is unknown"):
+        load(tmp_path / "text")

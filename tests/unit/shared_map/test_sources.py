@@ -355,4 +355,4 @@ def test_jacksboro_from_its_file_is_jacksboro() -> None:
 
 def test_the_words_about_kinds_of_files_name_every_reader() -> None:
     for text in (meanings(TerrainConfig)["source"], info.__doc__ or ""):
-        assert set(re.findall(r"\.[a-z]{3,4}\b", text)) >= set(FILE_KINDS.split(", "))
+        assert set(re.findall(r"\.[a-z0-9]{2,4}\b", text)) >= set(FILE_KINDS.split(", "))

@@ -49,6 +49,7 @@ def test_what_only_one_process_knows_only_that_process_says() -> None:
         ("pushed-route", "put", "planner"),
         ("pose", "put", "targets"),  # it moves all simulated targets
         ("true-pose", "put", "targets"),
+        ("body", "put", "targets"),  # and all simulated rovers
     }
 
 

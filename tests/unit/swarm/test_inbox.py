@@ -12,7 +12,7 @@ from swarm.runtime.inbox import CAPACITY, Inbox
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.topics import COST, NOTE, POSE, ROUTE, RUN, Topic
+from swarm.wire.topics import COST, NOTE, ROUTE, RUN, TRUE_POSE, Topic
 
 
 class Time:
@@ -52,7 +52,7 @@ def note(n: int) -> Heard:
 
 def pose(target: str, seq: int) -> Heard:
     message = TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
-    return Heard(POSE, {"target": target}, message)
+    return Heard(TRUE_POSE, {"target": target}, message)
 
 
 def drain(inbox: Inbox) -> list[Event]:

@@ -18,12 +18,12 @@ from swarm.runtime.process import Process, ThreadWorker
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.topics import NOTE, POSE
+from swarm.wire.topics import NOTE, TRUE_POSE
 
 
 def pose(target: str, seq: int) -> Heard:
     message = TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
-    return Heard(POSE, {"target": target}, message)
+    return Heard(TRUE_POSE, {"target": target}, message)
 
 
 def note(text: str) -> Heard:

@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from vehicle_agent.assignment import HYSTERESIS, spread
+from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
+from swarm.plugins.find import Plugin
+from vehicle_agent.assignment import HYSTERESIS, AssignmentWorld, CostTable, assigner_of, spread
 
 
 @st.composite
@@ -71,3 +73,46 @@ def test_vehicles_keep_their_targets_unless_another_is_cheaper_by_15_percent() -
     assert spread(np.array([[10.0, 10.0], [9.0, 8.0]]), [0, 0]).tolist() == [0, 1]
     assert spread(np.array([[10.0, 8.6], [8.6, 10.0]]), [0, 1]).tolist() == [0, 1]
     assert spread(np.array([[10.0, 8.4], [8.4, 10.0]]), [0, 1]).tolist() == [1, 0]
+
+
+# --- plug-ins ---------------------------------------------------------------------------------------------------
+
+answers = st.one_of(
+    st.lists(st.integers(-3, 6), max_size=13),
+    st.lists(st.floats(), max_size=3),
+    st.none(),
+    st.text(max_size=3),
+    st.lists(st.lists(st.integers(0, 1), max_size=2), max_size=2),
+)
+
+
+@given(worlds(), answers)
+@settings(deadline=None)
+def test_whatever_a_plugin_assigns_vehicles_go_only_where_they_have_a_route(
+    world: tuple[NDArray[np.float64], list[int]], answer: object
+) -> None:
+    costs_s, current = world
+    given_s = costs_s.copy()
+    told: list[str] = []
+
+    class Says:
+        def assign(self, table: CostTable) -> object:
+            table.costs_s[:] = -1.0  # what it does to its own table is nobody's loss
+            return answer
+
+    named = NamedPlugin(PLUGIN_KINDS["assignment"], "vehicles.assignment", "my:Own", {})
+    plugin = Plugin(named, lambda world, options: Says(), {})
+    assigner = assigner_of(plugin, AssignmentWorld("a0", "all", (), 1), told.append)
+    names = tuple(f"v{n}" for n in range(costs_s.shape[1]))
+    table = CostTable(tuple(f"t{n}" for n in range(costs_s.shape[0])), names, costs_s, tuple(current))
+    chosen = assigner.assign(table)
+    assert np.array_equal(costs_s, given_s)
+    assert chosen.shape == (len(names),)
+    for vehicle, target in enumerate(chosen.tolist()):
+        assert target == -1 or np.isfinite(costs_s[target, vehicle])
+    if told:
+        assert chosen.tolist() == spread(costs_s, current).tolist()
+        assert "assignment plug-in 'my:Own' of vehicles.assignment: assign r" in told[0]
+        assert told[0].endswith("this agent spreads its vehicles evenly now")
+    else:
+        assert chosen.tolist() == answer

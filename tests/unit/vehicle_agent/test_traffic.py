@@ -19,6 +19,7 @@ from swarm.right_of_way.lives import BEAT_NS, first_life, is_far_ahead
 from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.traffic import Grant, Granted, Known, KnownRequest, Shut, Stand, Standing, Stored, Table
 from swarm.wire.topics import STANDING
+from vehicle_agent.bodies import Bodies
 from vehicle_agent.traffic.member import Member, Refused, Save
 from vehicle_agent.traffic.pibt import Mover, Round
 from vehicle_agent.traffic.right_of_way import OwnRecord, RightOfWay
@@ -96,7 +97,7 @@ def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(
     chance = random.Random(seed)
     pace = np.where([chance.random() < share for _ in range(GRID.cells)], np.inf, 0.1).astype(np.float32)
     rules = PlannerConfig(corner_cutting=corners)
-    steering = Steering(GRID, pace.reshape(8, 8), rules, 4, chance, lambda cell: False)
+    steering = Steering(GRID, pace.reshape(8, 8), rules, 4, chance, lambda cell: False, Bodies(GRID))
     cells = [chance.randrange(GRID.cells)]
     for _ in range(chance.randint(0, 20)):
         cells.append(chance.choice([other for _, other in GRID.neighbours(cells[-1])]))

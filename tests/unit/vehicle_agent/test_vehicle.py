@@ -172,6 +172,18 @@ def test_no_way_to_any_target_is_stranded_even_before_it_had_one(vehicle: Vehicl
     assert vehicle.route_request(2 * S, vehicle.cell) == AskRoute("v", "t1", 11, False, Reason.ASSIGNED)
 
 
+def test_its_target_s_tracker_lost_it_drives_on_and_says_that_it_goes_by_an_old_pose(follower: Vehicle) -> None:
+    follower.set_tracked(False)
+    assert follower.state is VehicleState.OUTDATED
+    assert follower.route.ahead() == [12, 13, 14]
+    follower.set_in_reach(True)
+    assert follower.state is VehicleState.OUTDATED, "nobody has arrived at a target that may be anywhere"
+    follower.set_tracked(True)
+    assert follower.state is VehicleState.ARRIVED
+    follower.set_in_reach(False)
+    assert follower.state is VehicleState.FOLLOWING
+
+
 def test_a_jump_of_its_target_makes_it_ask_at_once(follower: Vehicle) -> None:
     follower.target_jumped(2 * S)
     assert follower.route_request(3 * S, follower.cell) == AskRoute("v", "t0", 11, False, Reason.JUMPED)
@@ -203,6 +215,8 @@ happenings: st.SearchStrategy[Happening] = st.sampled_from(
         lambda vehicle, now_ns: vehicle.regain_planner(now_ns),
         lambda vehicle, now_ns: vehicle.set_in_reach(True),
         lambda vehicle, now_ns: vehicle.set_in_reach(False),
+        lambda vehicle, now_ns: vehicle.set_tracked(True),
+        lambda vehicle, now_ns: vehicle.set_tracked(False),
         lambda vehicle, now_ns: vehicle.target_jumped(now_ns),
         lambda vehicle, now_ns: vehicle.cut_route(now_ns),
         lambda vehicle, now_ns: vehicle.blocked_for_long(now_ns),
@@ -217,7 +231,11 @@ def test_whatever_happens_the_state_tells_what_is_so_and_it_never_gives_up(happe
         happening(vehicle, second * S)
         vehicle.route_request(second * S, vehicle.cell)
         if vehicle.target is not None:
-            assert (vehicle.state is VehicleState.ARRIVED) == vehicle.in_reach
+            assert (vehicle.state is VehicleState.ARRIVED) == (vehicle.in_reach and vehicle.tracked)
+            if vehicle.state is VehicleState.OUTDATED:
+                assert not vehicle.tracked
+            if vehicle.state in (VehicleState.FOLLOWING, VehicleState.ARRIVED):
+                assert vehicle.tracked
             assert (vehicle.state is VehicleState.LOST) == (vehicle.planner_gone and not vehicle.in_reach)
             assert vehicle.state is not VehicleState.IDLE
             if vehicle.state is VehicleState.FOLLOWING:

@@ -1,0 +1,65 @@
+"""What the commands that give orders share."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from launch_scripts.commands.query import Where
+    from launch_scripts.commands.shared_options import Tls
+    from swarm.orders import Acknowledged
+    from swarm.wire.messages.base import Message
+    from swarm.wire.messages.orders import GiveOrder
+
+M = TypeVar("M", bound="Message")
+
+
+def checked(kind: type[M], fields: dict[str, Any]) -> M:
+    """The order of these fields; those which are None are left out. Raises ConfigError."""
+    import msgspec
+
+    from swarm.errors import ConfigError
+    from swarm.wire.codec import schema_of_type
+
+    try:
+        given = {name: value for name, value in fields.items() if value is not None}
+        return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
+    except (msgspec.ValidationError, ValueError) as error:
+        raise ConfigError(f"the order is not possible: {error}") from None
+
+
+def give(orders: list[GiveOrder], where: Where, tls: Tls, as_json: bool) -> None:
+    """Give orders, one after the other, and print who obeys. Exit code 1 if somebody has not said so."""
+    import msgspec
+
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.orders import Operator
+
+    silent = False
+    printed: list[dict[str, Any]] = []
+    with open_bus(where.network(tls)) as bus:
+        operator = Operator(bus)
+        for order in orders:
+            given, acknowledged = operator.give(order)
+            silent = silent or bool(acknowledged.silent)
+            if as_json:
+                fields = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
+                printed.append({"given": msgspec.to_builtins(given), **fields})
+            else:
+                print_obeyed(acknowledged)
+    if as_json:
+        typer.echo(json.dumps(printed[0] if len(printed) == 1 else printed, indent=2))
+    if silent:
+        raise typer.Exit(1)
+
+
+def print_obeyed(acknowledged: Acknowledged) -> None:
+    """Who obeys an order, and who has not said so."""
+    took_ms = max(acknowledged.obeyed.values(), default=0.0) * 1e3
+    typer.echo(f"{len(acknowledged.obeyed)} processes obey, the last after {took_ms:.0f} ms")
+    if acknowledged.silent:
+        names = ", ".join(acknowledged.silent)
+        typer.echo(f"no answer yet from {names}: they obey as soon as they hear a keeper", err=True)

@@ -1,0 +1,55 @@
+"""`swarm plugins`: which plug-ins there are, and whether one keeps what its kind promises."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from swarm.errors import ConfigError
+
+app = typer.Typer(no_args_is_help=True, help="List plug-ins, and check one of your own.")
+
+
+@app.command(name="list")
+def list_plugins() -> None:
+    """Print every name that a scenario may use, by kind: those built in, and those of installed packages."""
+    from swarm.config.plugin_names import PLUGIN_KINDS, installed
+
+    for kind in PLUGIN_KINDS.values():
+        typer.echo(f"{kind.name} ({kind.group})")
+        for name in kind.built_in:
+            typer.echo(f"  {name}")
+        for name, points in sorted(installed(kind).items()):
+            for point in points:
+                typer.echo(f"  {name}  {point.value}, of {point.dist.name if point.dist else 'an unknown package'}")
+
+
+@app.command()
+def check(
+    kind: Annotated[str, typer.Argument(help="sensor, walk, cost_layer, assignment, strategy or dynamics.")],
+    name: Annotated[str, typer.Argument(help="As in a scenario: module:Name, or an installed one's name.")],
+    options: Annotated[str, typer.Option(help="Its options, as a JSON object.")] = "{}",
+    folder: Annotated[Path, typer.Option(help="Where its module lies, if it is not installed.")] = Path(),
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="In how many sets of worlds it is asked.")] = 4,
+) -> None:
+    """Ask a plug-in as a run would, and print which promises of its kind it breaks. It runs the plug-in's code.
+
+    swarm plugins check sensor camera:Camera --options '{"misses": 0.5}'
+    """
+    from launch_scripts.plugin_check import check_plugin
+
+    try:
+        table = json.loads(options)
+    except ValueError as error:
+        raise ConfigError(f"--options: {error}; expected a JSON object") from error
+    if not isinstance(table, dict):
+        raise ConfigError(f"--options: found {options[:40]!r}, expected a JSON object")
+    broken = check_plugin(kind, name, table, str(folder), range(seeds))
+    for sentence in broken:
+        typer.echo(f"broken: {sentence}")
+    typer.echo(f"{name} breaks {len(broken)} promises" if broken else f"{name} keeps what a {kind} promises")
+    if broken:
+        raise typer.Exit(1)

@@ -1,0 +1,171 @@
+"""`swarm zone`: areas that operators close or slow down while the swarm runs."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch_scripts.commands.order_options import checked, print_obeyed
+from launch_scripts.commands.query import Where
+from launch_scripts.commands.shared_options import AsJson, Tls, spread
+
+if TYPE_CHECKING:
+    from swarm.orders import Acknowledged
+    from swarm.wire.messages.orders import Zone, Zones
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.callback()
+def _root() -> None:
+    """Close areas of the terrain, slow them down, and open them again, while the swarm runs.
+
+    A zone is held by the shared map: every planner and vehicle goes by it, processes that start later do, too, and
+    what vehicles find there does not change it.
+    """
+
+
+@app.command()
+@spread
+def add(
+    where: Where,
+    tls: Tls,
+    polygon: Annotated[
+        str | None,
+        typer.Option(help="Corners as 'row,col row,col ...'; 0,0 is the north-west corner of the terrain."),
+    ] = None,
+    polygon_m: Annotated[
+        str | None, typer.Option("--polygon-m", help="Corners as 'x,y x,y ...' in metres, as poses have them.")
+    ] = None,
+    kind: Annotated[str, typer.Option(help="lethal, or pace:X for X seconds per metre.")] = "lethal",
+    until: Annotated[
+        str | None, typer.Option(help="How long it lasts: 90s, 10m, 2h. Until it is removed, if not given.")
+    ] = None,
+    name: Annotated[str, typer.Option(help="Its name; an existing zone of that name is replaced.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Close an area, or set its pace. Returns once all maps and trees go by it.
+
+    swarm zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --until 10m --name bridge
+
+    swarm zone add --polygon-m "500,-200 700,-200 700,-400" --kind pace:0.5
+    """
+    from swarm.wire.messages.orders import ZoneOrder
+
+    fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _seconds(until)}
+    fields["polygon"] = _corners("--polygon", polygon)
+    fields["polygon_m"] = _corners("--polygon-m", polygon_m)
+    _give(checked(ZoneOrder, fields), where, tls, as_json)
+
+
+@app.command()
+@spread
+def remove(
+    name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, tls: Tls, as_json: AsJson = False
+) -> None:
+    """Open a zone again."""
+    from swarm.wire.messages.orders import ZoneOrder
+
+    _give(checked(ZoneOrder, {"action": "remove", "name": name}), where, tls, as_json)
+
+
+@app.command(name="list")
+@spread
+def list_zones(where: Where, tls: Tls, as_json: AsJson = False) -> None:
+    """Print the zones that stand."""
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.orders import Operator
+
+    with open_bus(where.network(tls)) as bus:
+        zones = Operator(bus).zones()
+    _print(zones, None, as_json)
+
+
+def _give(order: object, where: Where, tls: Tls, as_json: bool) -> None:
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.orders import Operator
+    from swarm.wire.messages.orders import ZoneOrder
+
+    assert isinstance(order, ZoneOrder)
+    with open_bus(where.network(tls)) as bus:
+        zones, acknowledged = Operator(bus).zone(order)
+    _print(zones, acknowledged, as_json)
+    if acknowledged.silent:
+        raise typer.Exit(1)
+
+
+def _print(zones: Zones, acknowledged: Acknowledged | None, as_json: bool) -> None:
+    if as_json:
+        import msgspec
+
+        fields: dict[str, object] = {"zones": [msgspec.to_builtins(zone) for zone in zones.zones]}
+        if acknowledged is not None:
+            fields |= {"changed": zones.changed, "obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
+        typer.echo(json.dumps(fields, indent=2))
+        return
+    if acknowledged is None:
+        for zone in zones.zones:
+            typer.echo(_line(zone))
+        if not zones.zones:
+            typer.echo("no zones")
+        return
+    stands = [zone for zone in zones.zones if zone.name == zones.changed]
+    typer.echo(_line(stands[0]) if stands else f"zone {zones.changed} is removed")
+    print_obeyed(acknowledged)
+
+
+def _line(zone: Zone) -> str:
+    row0, col0, row1, col1 = zone.window
+    kind = "lethal" if zone.pace_s_per_m is None else f"pace {zone.pace_s_per_m:g} s/m"
+    left = "" if zone.until_ns is None else f", ends in {max(zone.until_ns / 1e9 - time.time(), 0):.0f} s"
+    return f"zone {zone.name}: {kind}, {zone.cells} cells in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}{left}"
+
+
+# --- options ------------------------------------------------------------------------------------------------------
+
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+
+
+def _kind(text: str) -> dict[str, object]:
+    from swarm.errors import ConfigError
+
+    if text == "lethal":
+        return {"kind": "lethal"}
+    head, _, value = text.partition(":")
+    try:
+        if head == "pace" and math.isfinite(pace := float(value)):
+            return {"kind": "pace", "pace_s_per_m": pace}
+    except ValueError:
+        pass
+    raise ConfigError(f"--kind: {text!r} is neither lethal nor pace:X, with X in seconds per metre")
+
+
+def _seconds(text: str | None) -> float | None:
+    from swarm.errors import ConfigError
+
+    if text is None:
+        return None
+    match = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,6})?)([smhd])", text)
+    if match is None or not float(match[1]) > 0:
+        raise ConfigError(f"--until: {text!r} is no time such as 90s, 10m, 2h or 1d")
+    return float(match[1]) * _UNITS[match[2]]
+
+
+def _corners(option: str, text: str | None) -> list[tuple[float, float]]:
+    from swarm.errors import ConfigError
+
+    corners = []
+    for word in (text or "").split():
+        try:
+            one, other = (float(number) for number in word.split(","))
+        except ValueError:
+            raise ConfigError(f"{option}: {word!r} is no corner, expected two numbers such as 40,200") from None
+        corners.append((one, other))
+    if text is not None and not corners:
+        raise ConfigError(f"{option}: there is no corner in {text!r}, expected at least three such as 40,200")
+    return corners

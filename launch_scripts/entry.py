@@ -1,0 +1,22 @@
+"""The command `swarm`. A small install has the client library only, and this says what to install."""
+
+from __future__ import annotations
+
+import sys
+
+_OURS = ("launch_scripts", "planner_service", "shared_map", "swarm", "vehicle_agent")
+
+
+def main() -> int:
+    try:
+        from launch_scripts.cli import main as run
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in _OURS:
+            raise  # a fault of ours
+        print(
+            f"swarm: the command needs {error.name}, which is not installed: pip install 'terrain-swarm[all]' "
+            "(without [all] there is the library swarm.client only)",
+            file=sys.stderr,
+        )
+        return 1
+    return run()

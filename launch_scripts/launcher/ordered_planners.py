@@ -1,0 +1,81 @@
+"""The planners of targets that operators add while the swarm runs, and the end of those whose target is removed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection
+
+import msgspec
+
+from launch_scripts.launcher.local_swarm import LocalSwarm
+from launch_scripts.process_table import planner_spec
+from swarm.config.scenario import Scenario
+from swarm.errors import SwarmError
+from swarm.order_book import OrderBook
+from swarm.ranks import job_of, ranked_id
+
+log = logging.getLogger(__name__)
+
+LEAVES_TO_OTHERS_S = 3.0
+"""A launcher of a part of a swarm starts such a planner only if none has appeared for so long."""
+
+
+class OrderedPlanners:
+    """Brings the planners on this machine to what is ordered.
+
+    ranks  which of each target's planners to start here
+    whole  whether this launcher started the whole swarm: then no other will start them
+    say    tells the user
+    """
+
+    def __init__(
+        self, scenario: Scenario, swarm: LocalSwarm, ranks: Collection[int], whole: bool, say: Callable[[str], None]
+    ) -> None:
+        self._scenario = scenario
+        self._swarm = swarm
+        self._ranks = ranks
+        self._wait_s = 0.0 if whole else LEAVES_TO_OTHERS_S
+        self._say = say
+        self._missing_s: dict[str, float] = {}
+        """Planner -> since when it has been missing."""
+        self._refused: set[str] = set()
+
+    def look(self, book: OrderBook, alive: Collection[tuple[str, str]], now_s: float) -> None:
+        """Start what is missing, and end what is not wanted any more.
+
+        alive  (role, id) of the processes that are up, anywhere
+        """
+        targets = book.targets(self._scenario)
+        usual = set(self._scenario.target_ids)
+        wanted = {ranked_id(id, rank) for id in targets if id not in usual for rank in self._ranks}
+        here = {running.spec.id for running in self._swarm.running if running.spec.role == "planner"}
+        for id in sorted(here):
+            if job_of(id) not in targets:
+                self._swarm.dismiss(planner_spec(id))
+        for id in sorted(wanted - here - self._refused):
+            if ("planner", id) in alive:
+                self._missing_s.pop(id, None)
+            elif now_s - self._missing_s.setdefault(id, now_s) >= self._wait_s:
+                self._start(id)
+        # One that the scenario has, and that was removed, is wanted again when its removal is taken back.
+        for id in sorted({ranked_id(id, rank) for id in targets if id in usual for rank in self._ranks} - here):
+            if any(order.subject == "target" and order.name == job_of(id) for order in book):
+                self._start(id)
+
+    def _start(self, id: str) -> None:
+        try:
+            self._swarm.add(planner_spec(id))
+        except SwarmError as error:
+            self._refused.add(id)
+            self._say(f"planner-{id}: {error}")
+            return
+        self._missing_s.pop(id, None)
+        self._say(f"planner-{id} starts: its target was added")
+
+
+def with_target(scenario: Scenario, book: OrderBook, id: str) -> Scenario:
+    """The scenario with a target that was added, for the process that plans for it."""
+    added = book.targets(scenario).get(id)
+    if added is None or id in scenario.target_ids:
+        return scenario
+    return msgspec.structs.replace(scenario, targets=(*scenario.targets, added))

@@ -1,0 +1,181 @@
+"""Where a planner's target is, by whom, since when, and what is odd about those who tell. Pure."""
+
+from __future__ import annotations
+
+import math
+
+from planner_service.actions import Tell
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.runtime.stats import Counters
+from swarm.runtime.tracking import Tracking, Verdict
+from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
+
+COUNTS = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off", "trackers_lost")
+FASTEST_M_PER_S = 100.0
+"""On the terrain. A target that moves faster without a jump was teleported: by a fault of its tracker, or by two
+that share a name."""
+_NOISE_CELLS = 8
+_CLOCK_OFF_NS = 60 * NS_PER_S
+_REFUSED_OFTEN = 3
+"""Poses of a tracker that are refused before it is named: the last of one that was replaced may come late."""
+_MOST_NAMED = 256
+
+
+class TargetWatch:
+    """What a planner knows of where its target is.
+
+    Each oddity of a tracker is counted every time, and told once: one sentence for people.
+
+    time_scale  seconds on the terrain per second
+
+    counts      whether oddities are counted: a standby leaves that to the planner that leads
+    """
+
+    def __init__(self, target: str, grid: GridSpec, counters: Counters, time_scale: float = 1.0) -> None:
+        self.target = target
+        self.counts = True
+        self._grid = grid
+        self._counters = counters
+        self._fastest_m_per_s = FASTEST_M_PER_S * time_scale
+        self._tracking = Tracking(grid)
+        self._lost = False
+        self._lost_since_ns = 0
+        self._handed_over = False
+        self._tracker = ""
+        """The name of the last owner, in words; empty before the first."""
+        self._refused: dict[str | int, int] = {}
+        """Tracker, or incarnation of one without a name -> its poses that were refused."""
+        self._named: set[tuple[str, str | int]] = set()
+        """(kind of oddity, tracker), told before."""
+        self._to_tell: list[Tell] = []
+        for name in COUNTS:
+            counters.count(name, 0)
+
+    @property
+    def pose(self) -> TargetPose | None:
+        """Where the target was last; None before the first pose."""
+        return self._tracking.pose
+
+    def age_s(self, now_ns: int) -> float | None:
+        """Time since that was heard."""
+        age_ns = self._tracking.age_ns(now_ns)
+        return None if age_ns is None else age_ns / NS_PER_S
+
+    def lost(self, now_ns: int) -> bool:
+        """Whether nobody tracks the target now."""
+        return self._tracking.lost(now_ns)
+
+    def hear(self, pose: TargetPose, now_ns: int) -> None:
+        """A tracker tells a pose of the target."""
+        before, heard_ns = self._tracking.pose, self._tracking.heard_ns
+        verdict = self._tracking.hear(pose, now_ns)
+        if verdict is Verdict.COUNTS:
+            self._check_clock(pose, now_ns)
+            self._check_speed(before, heard_ns, pose, now_ns)
+            self._owned_by(pose, now_ns)
+        elif verdict is Verdict.REFUSED:
+            self._refuse(pose)
+        elif verdict is Verdict.OUTSIDE:
+            self._count("poses_outside")
+            shape = f"{self._grid.rows} x {self._grid.cols} cells"
+            cell = f"cell {pose.cell}" if pose.cell != CELL_OF_PLACE else f"{pose.x_m:.0f}, {pose.y_m:.0f} m"
+            said = f"{_name(pose)} puts it into {cell}, outside of the terrain of {shape}: not used"
+            self._name_once("pose-outside", pose, said)
+
+    def see(self, pose: TargetPose, now_ns: int) -> None:
+        """The best sighting of a target that has no tracker."""
+        before = self._tracking.pose
+        self._tracking.place(pose, now_ns)
+        if self._tracking.pose is not before:
+            self._found("a vehicle sees it", now_ns)
+
+    def take_told(self, now_ns: int) -> list[Tell]:
+        """What people should know, since the last call."""
+        if not self._lost and self._tracking.lost(now_ns):
+            self._lose(now_ns)
+        told, self._to_tell = self._to_tell, []
+        return told
+
+    def _owned_by(self, pose: TargetPose, now_ns: int) -> None:
+        tracker, before = _name(pose), self._tracker
+        self._tracker = tracker
+        self._handed_over = pose.lease_s == 0
+        self._found(f"{tracker} tracks it", now_ns)
+        if before not in ("", tracker):
+            self._tell("tracker-changed", f"{tracker} tracks it now, before that {before} did")
+
+    def _found(self, how: str, now_ns: int) -> None:
+        if self._lost:
+            self._lost = False
+            lost_s = (now_ns - self._lost_since_ns) / NS_PER_S
+            self._tell("tracker-back", f"{how} again, after {lost_s:.1f} s in which nobody knew where it was")
+
+    def _lose(self, now_ns: int) -> None:
+        pose = self._tracking.pose
+        assert pose is not None
+        self._lost, self._lost_since_ns = True, self._tracking.heard_ns
+        self._count("trackers_lost")
+        if not self._tracker:
+            why = f"no vehicle has seen it for {(now_ns - self._tracking.heard_ns) / NS_PER_S:.1f} s"
+        elif self._handed_over:
+            why = f"{self._tracker} has handed it over, and nobody else tracks it"
+        else:
+            why = f"{self._tracker} has been silent for longer than its lease of {pose.lease_s:g} s"
+        self._tell("tracker-lost", f"{why}; routes lead to where it was", pose.cell)
+
+    def _refuse(self, pose: TargetPose) -> None:
+        self._count("poses_refused")
+        tracker, owner = _key(pose), self._tracking.pose
+        if tracker not in self._refused and len(self._refused) >= _MOST_NAMED:
+            return
+        self._refused[tracker] = self._refused.get(tracker, 0) + 1
+        if self._refused[tracker] < _REFUSED_OFTEN or owner is None:
+            return
+        if pose.tracker is not None and pose.tracker == owner.tracker:
+            why = f"two trackers call themselves {pose.tracker}; only that of the later incarnation counts"
+        else:
+            why = f"poses of {_name(pose)} are refused, as {_name(owner)} owns it"
+        self._name_once("tracker-refused", pose, why)
+
+    def _check_clock(self, pose: TargetPose, now_ns: int) -> None:
+        off_ns = pose.stamp_ns - now_ns
+        if abs(off_ns) >= _CLOCK_OFF_NS:
+            self._count("tracker_clocks_off")
+            way = "ahead" if off_ns > 0 else "behind"
+            said = f"the clock of {_name(pose)} is {abs(off_ns) / NS_PER_S:.0f} s {way}, by which nothing changes"
+            self._name_once("tracker-clock", pose, said)
+
+    def _check_speed(self, before: TargetPose | None, heard_ns: int, pose: TargetPose, now_ns: int) -> None:
+        if before is None or before.jumps != pose.jumps:
+            return
+        moved_m = math.hypot(pose.x_m - before.x_m, pose.y_m - before.y_m)
+        elapsed_s = max(now_ns - heard_ns, pose.stamp_ns - before.stamp_ns, NS_PER_S // 10) / NS_PER_S
+        free_m = _NOISE_CELLS * self._grid.resolution_m
+        if moved_m > free_m + self._fastest_m_per_s * elapsed_s:
+            self._count("poses_teleported")
+            said = f"{_name(pose)} moved it by {moved_m:.0f} m in {elapsed_s:.1f} s and told no jump"
+            self._name_once("pose-teleported", pose, said, pose.cell)
+
+    def _count(self, name: str) -> None:
+        if self.counts:
+            self._counters.count(name)
+
+    def _name_once(self, kind: str, pose: TargetPose, text: str, cell: int | None = None) -> None:
+        told = (kind, _key(pose))
+        if told not in self._named and len(self._named) < _MOST_NAMED:
+            self._named.add(told)
+            self._tell(kind, text, cell)
+
+    def _tell(self, kind: str, text: str, cell: int | None = None) -> None:
+        self._to_tell.append(Tell(kind, f"target {self.target}: {text}", cell))
+
+
+def _key(pose: TargetPose) -> str | int:
+    return pose.incarnation if pose.tracker is None else pose.tracker
+
+
+def _name(pose: TargetPose) -> str:
+    if pose.tracker is None:
+        return f"a tracker without a name, of incarnation {pose.incarnation},"
+    return f"tracker {pose.tracker}"

@@ -1,0 +1,118 @@
+"""The keeper's book of orders: what it acknowledges is on its disk, and told to all."""
+
+from __future__ import annotations
+
+import msgspec
+
+from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.terrain import Terrain
+from swarm.bus.bus import Asked, Bus, Event, Heard, Post, Replied
+from swarm.clock import NS_PER_S
+from swarm.config.agents import plan_agents
+from swarm.config.scenario import Scenario
+from swarm.errors import StoreError
+from swarm.order_book import OrderBook, judged
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.orders import GiveOrder, Order, Orders
+from swarm.wire.topics import GIVE_ORDER, ORDERS
+
+_TELL_NS = NS_PER_S
+_TAG = "orders"
+
+
+class KeptOrders:
+    """Takes orders of operators in, keeps them, and tells the book to all once a second and when it changes.
+
+    book  the orders; those of the store from the start
+    """
+
+    def __init__(
+        self, id: str, scenario: Scenario, terrain: Terrain, store: KeeperStore, bus: Bus, post: Post
+    ) -> None:
+        self.book = OrderBook()
+        self._id = id
+        self._scenario = scenario
+        self._terrain = terrain
+        self._store = store
+        self._bus = bus
+        self._post = post
+        self._tell_due_ns = 0
+        self._unsaved: list[Order] = []
+        """Orders heard of another keeper that are not on our disk yet."""
+
+    def start(self, now_ns: int) -> None:
+        self.book.merge(self._store.orders(), now_ns)
+        self._bus.serve(GIVE_ORDER, self._post, keeper=self._id)
+        self._bus.serve(ORDERS, self._post, role="keeper", id=self._id)
+        self._bus.subscribe(ORDERS, self._post, role="keeper")
+        # A store may be new while the swarm is old.
+        self._bus.ask(ORDERS, Nothing(), self._post, tag=_TAG)
+
+    def handle(self, event: Event, now_ns: int) -> Order | str | bool:
+        """Whether the event was about orders and is done with; if one was given, the order, or why not."""
+        match event:
+            case Heard(message=Orders() as heard) | Replied(message=Orders() as heard):
+                self._unsaved += self.book.merge(heard.orders, now_ns)
+                return True
+            case Asked(topic=topic) if topic is ORDERS:
+                event.answer(self._orders(), role="keeper", id=self._id)
+                event.end()
+                return True
+            case Asked(request=GiveOrder(subject=None)):
+                event.answer(self._orders(), keeper=self._id)
+                event.end()
+                return True
+            case Asked(request=GiveOrder() as given):
+                order = self._take(given, now_ns)
+                if isinstance(order, str):
+                    event.refuse(order)
+                else:
+                    self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
+                    event.answer(self._orders(order), keeper=self._id)
+                event.end()
+                return order
+            case _:
+                return False
+
+    def tick(self, now_ns: int) -> None:
+        if now_ns < self._tell_due_ns:
+            return
+        self._tell_due_ns = now_ns + _TELL_NS
+        try:
+            self._store.save_orders(self._unsaved)
+            self._unsaved = []
+        except StoreError:
+            return  # it is said of the marks, which fare no better; who asks meanwhile asks others, too
+        self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
+
+    def _take(self, given: GiveOrder, now_ns: int) -> Order | str:
+        given = self._placed(given)
+        vehicles = (id for plan in plan_agents(self._scenario) for id in plan.vehicle_ids)
+        order = judged(given, self.book, self._scenario, vehicles, now_ns)
+        if isinstance(order, str):
+            return order
+        if order.cell is not None:
+            grid = self._terrain.grid
+            if order.cell >= grid.cells:
+                return f"{given.subject} {given.name}: cell {order.cell} is not in {grid.rows} x {grid.cols} cells"
+            if not float(self._terrain.pace_s_per_m.reshape(-1)[order.cell]) < float("inf"):
+                return f"{given.subject} {given.name}: {list(divmod(order.cell, grid.cols))} is lethal"
+        try:
+            self._store.save_orders([order])
+        except StoreError as error:
+            return str(error)
+        self.book.merge([order], now_ns)
+        return order
+
+    def _placed(self, given: GiveOrder) -> GiveOrder:
+        """With a cell instead of row and column; outside the grid it is no cell."""
+        grid = self._terrain.grid
+        if given.row is None or given.col is None:
+            return given
+        inside = grid.inside(given.row, given.col)
+        return msgspec.structs.replace(
+            given, cell=grid.cell(given.row, given.col) if inside else grid.cells, row=None, col=None
+        )
+
+    def _orders(self, given: Order | None = None) -> Orders:
+        return Orders(role="keeper", id=self._id, orders=list(self.book), given=given)

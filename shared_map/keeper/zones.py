@@ -1,0 +1,220 @@
+"""Zones: areas that operators close or slow down. A zone is the marks of an author of its own, written by a keeper.
+
+Nothing else holds a zone: replicas, planners and stores take it in as any marks, it ends as marks do, and which
+zones there are is read off the map. Core: no network, no clock.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.arrays import Bools
+from shared_map.replication.limits import MAX_MARKS
+from shared_map.replication.marks import (
+    NO_STATEMENTS,
+    Statements,
+    is_zone,
+    mark_set,
+    next_seq,
+    standing,
+    zone_author,
+)
+from shared_map.replication.replica import MapReplica
+from shared_map.replication.tiles import tile_cells
+from shared_map.terrain.layers import polygon_mask
+from shared_map.terrain.terrain import Terrain
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.wire.fields import column
+from swarm.wire.messages.marks import DIGEST_ROW, SEQ_STEP, MarkSet
+from swarm.wire.messages.orders import MOST_ZONES, Corners, Zone, ZoneOrder
+from swarm.wire.statements import FOREVER, STAMP_LIMIT_NS, MarkKind
+
+MOST_CELLS = 1 << 17
+"""Of one zone: what every replica takes in at once, within the quota of one author."""
+MOST_IN_ALL = MAX_MARKS // 8
+"""Cells of all zones: half of what a replica holds of one author."""
+
+_Points = NDArray[np.float64]
+_LIMIT = 1 << 62
+"""Numbers of sets are below this."""
+
+
+def zone_sets(
+    order: ZoneOrder,
+    replica: MapReplica,
+    terrain: Terrain,
+    aside: Callable[[int], Mapping[str, MarkSet]],
+    now_ns: int,
+) -> list[MarkSet] | str:
+    """The sets which make, move or end a zone; why that cannot be, in a sentence.
+
+    order  names a zone
+    aside  author -> what compaction set aside of its set of a tile
+    """
+    author = zone_author(order.name)
+    tiles = {tile: each for tile in replica.held.tiles if (each := replica.held.get(tile, author)) is not None}
+    by_tile: dict[int, Statements] = {}
+    if order.action == "add":
+        inside = _mask(order, terrain)
+        if isinstance(inside, str):
+            return inside
+        others = sum(len(each.kinds) for each in _zone_sets(replica) if each.author != author)
+        if others + int(inside.sum()) > MOST_IN_ALL:
+            return f"all zones together would cover {others + int(inside.sum())} cells, at most {MOST_IN_ALL}"
+        by_tile = _by_tile(order, inside, replica, now_ns)
+    elif not any(len(standing(each, now_ns).cells) for each in tiles.values()):
+        return f"there is no zone {order.name!r}; {_names(replica, now_ns)}"
+    sets: list[MarkSet] = []
+    for tile in sorted(tiles.keys() | by_tile.keys()):
+        numbers = [(each.epoch, each.seq) for each in (tiles.get(tile), aside(tile).get(author)) if each]
+        number = _above(max(numbers, default=(1, 0)), now_ns)
+        if number is None:
+            return f"zone {order.name!r}: its number on tile {tile} cannot grow; give the zone another name"
+        stated = by_tile.get(tile, NO_STATEMENTS)
+        sets.append(mark_set(author, author.partition(".")[0], tile, *number, stated))
+    return sets
+
+
+def free_name(replica: MapReplica) -> str:
+    """A name that no zone has or had: z1, z2, ..."""
+    taken = {author for author in replica.held.ledger.authors if is_zone(author)}
+    return next(name for n in itertools.count(1) if zone_author(name := f"z{n}") not in taken)
+
+
+def zones_of(replica: MapReplica, now_ns: int) -> list[Zone]:
+    """The zones that stand, in order of name."""
+    cells: dict[str, list[NDArray[np.int64]]] = {}
+    rules: dict[str, tuple[int, float, int]] = {}
+    for each in _zone_sets(replica):
+        stated = standing(each, now_ns)
+        if not len(stated.cells):
+            continue
+        window = replica.grid.tile_window(each.tile)
+        rows, cols = np.divmod(stated.cells.astype(np.int64), 32)
+        cells.setdefault(each.author, []).append(np.stack((rows + window.row0, cols + window.col0)))
+        until_ns = FOREVER if stated.untils_ns is None else int(stated.untils_ns[0])
+        rules[each.author] = (int(stated.kinds[0]), float(stated.paces[0]), until_ns)
+    found = []
+    for author in sorted(cells)[:MOST_ZONES]:
+        rows, cols = np.concatenate(cells[author], axis=1)
+        kind, pace, until_ns = rules[author]
+        found.append(
+            Zone(
+                name=author.partition(".")[2],
+                kind="lethal" if kind == MarkKind.LETHAL else "pace",
+                pace_s_per_m=None if kind == MarkKind.LETHAL else pace,
+                cells=len(rows),
+                window=[int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1],
+                until_ns=None if until_ns >= _LIMIT else max(until_ns, 0),
+            )
+        )
+    return found
+
+
+def rows_of(sets: Sequence[MarkSet]) -> bytes:
+    """The numbers of sets, as rows of a digest."""
+    rows = np.zeros(len(sets), DIGEST_ROW)
+    rows["tile"] = [each.tile for each in sets]
+    rows["epoch"], rows["seq"] = [each.epoch for each in sets], [each.seq for each in sets]
+    return rows.tobytes()
+
+
+def _zone_sets(replica: MapReplica) -> Iterator[MarkSet]:
+    for tile in replica.held.tiles:
+        yield from (each for each in replica.held.of_tile(tile) if is_zone(each.author))
+
+
+def _names(replica: MapReplica, now_ns: int) -> str:
+    names = [zone.name for zone in zones_of(replica, now_ns)]
+    return f"there are {', '.join(names[:20])}" if names else "there are none"
+
+
+def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
+    """Cells whose middle lies in the zone; why there is no such zone."""
+    grid = terrain.grid
+    corners = order.polygon
+    if order.polygon_m:
+        corners = [_row_col(x_m, y_m, grid) for x_m, y_m in order.polygon_m]
+    if (crossing := _crossing(corners)) is not None:
+        one, other = crossing
+        return f"polygon: the edges from corner {one + 1} and from corner {other + 1} cross or touch each other"
+    side_m = grid.resolution_m
+    inside = polygon_mask([(col * side_m, row * side_m) for row, col in corners], grid)
+    covered = int(inside.sum())
+    if not covered:
+        return f"polygon: it covers no cell of the terrain of {grid.rows} x {grid.cols} cells"
+    if covered > MOST_CELLS:
+        return f"polygon: it covers {covered} cells, at most {MOST_CELLS}: make several zones"
+    if order.kind == "lethal" and not (np.isfinite(terrain.pace_s_per_m) & ~inside).any():
+        return "polygon: a lethal zone that leaves no passable cell; pause the swarm instead"
+    return inside
+
+
+def _row_col(x_m: float, y_m: float, grid: GridSpec) -> tuple[float, float]:
+    return (grid.north_m - y_m) / grid.resolution_m, (x_m - grid.west_m) / grid.resolution_m
+
+
+def _crossing(corners: Corners) -> tuple[int, int] | None:
+    """Two edges of a polygon which have a point in common and are not neighbours; None if there are none."""
+    start = np.array(corners, np.float64)
+    end = np.roll(start, -1, axis=0)
+    number = len(start)
+
+    def side(a: _Points, b: _Points, c: _Points) -> _Points:
+        """On which side of the line from a to b each point c lies: -1, 0 or 1."""
+        along, to = b - a, c - a
+        return np.asarray(np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]))
+
+    def on(a: _Points, b: _Points, c: _Points) -> Bools:
+        """Whether c, which is in line with a and b, lies between them."""
+        return np.asarray(((np.minimum(a, b) <= c) & (c <= np.maximum(a, b))).all(axis=-1))
+
+    a, b = start[:, None], end[:, None]
+    c, d = start[None], end[None]
+    ends = (side(a, b, c), side(a, b, d), side(c, d, a), side(c, d, b))
+    meet = (ends[0] != ends[1]) & (ends[2] != ends[3])
+    for turn, (p, q, r) in zip(ends, ((a, b, c), (a, b, d), (c, d, a), (c, d, b)), strict=True):
+        meet |= (turn == 0) & on(p, q, r)
+    apart = (np.arange(number)[:, None] - np.arange(number)[None]) % number
+    meet &= (apart != 0) & (apart != 1) & (apart != number - 1)
+    first = np.argwhere(meet)
+    return None if not len(first) else (int(first[0, 0]), int(first[0, 1]))
+
+
+def _by_tile(order: ZoneOrder, inside: Bools, replica: MapReplica, now_ns: int) -> dict[int, Statements]:
+    """The statements of a zone, by tile: newer than those of all zones that are there."""
+    tiles, cells = tile_cells(replica.grid, np.flatnonzero(inside))
+    kind, pace = MarkKind.LETHAL, 0.0
+    if order.pace_s_per_m is not None:
+        kind, pace = MarkKind.PACE, order.pace_s_per_m
+    found: dict[int, Statements] = {}
+    for tile in np.unique(tiles).tolist():
+        here = np.sort(cells[tiles == tile])
+        known = [each.stamps_ns for each in replica.held.of_tile(tile) if is_zone(each.author) and each.kinds]
+        newest_ns = max((int(column(stamps, "<i8").max()) for stamps in known), default=0)
+        stamp_ns = min(max(now_ns, newest_ns + 1), STAMP_LIMIT_NS - 1)
+        untils_ns = None
+        if order.lasts_s is not None:
+            untils_ns = np.full(len(here), now_ns + int(order.lasts_s * NS_PER_S), np.int64)
+        found[tile] = Statements(
+            here,
+            np.full(len(here), kind, np.uint8),
+            np.full(len(here), pace, np.float32),
+            np.full(len(here), stamp_ns, np.int64),
+            untils_ns,
+        )
+    return found
+
+
+def _above(number: tuple[int, int], now_ns: int) -> tuple[int, int] | None:
+    """The next number after this one. The clock is in it, as the number of a tombstone may be forgotten."""
+    epoch, seq = number
+    following = max(next_seq(seq), now_ns - now_ns % SEQ_STEP)
+    if following < _LIMIT:
+        return epoch, following
+    return (epoch + 1, 0) if epoch + 1 < _LIMIT else None

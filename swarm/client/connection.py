@@ -1,0 +1,185 @@
+"""`connect`: from an endpoint to a swarm that is ready to be used."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from swarm.client.frame import Frame
+from swarm.client.observer import Observer
+from swarm.client.orders import Orders
+from swarm.client.session import Session, SwarmThread
+from swarm.client.target import Target
+from swarm.client.vehicle import Vehicle
+from swarm.clock import MonotonicClock
+from swarm.errors import BusError, ConfigError, RunMismatchError
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.messages.targets import POSE_LEASE_S
+
+if TYPE_CHECKING:
+    from swarm.bus.bus import Bus
+    from swarm.runtime.inbox import Inbox
+
+_ASK_S = 1.0
+
+
+class Swarm:
+    """A running swarm. Made by `connect`; use it in a `with`, or `close` it at the end.
+
+    It may be used from any thread. Callbacks come on a thread of its own, one after the other.
+
+    A lost link comes back by itself, and everything that vehicles and targets said last is said again at once.
+    Meanwhile nothing raises: what is said is lost, `connected` is false, and leases run out. If another run is in
+    the namespace when the link is back, every call raises RunMismatchError, as cells may mean other places there.
+    """
+
+    def __init__(self, session: Session, stop: Callable[[], None] = lambda: None) -> None:
+        self._session = session
+        self._stop = stop
+
+    def __enter__(self) -> Swarm:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def frame(self) -> Frame:
+        """The terrain: its grid, places and cells."""
+        return self._session.frame
+
+    @property
+    def run_id(self) -> str:
+        return self._session.run.run_id
+
+    @property
+    def scenario(self) -> str:
+        """Name of the scenario that runs."""
+        return self._session.run.scenario
+
+    @property
+    def connected(self) -> bool:
+        """Whether the link to the router is up, as far as is known."""
+        return self._session.connected
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """What was refused, missed and reported since the connection began, and what the bus counts."""
+        return {**self._session.bus.counts, **self._session.counts}
+
+    def vehicle(self, id: str, *, group: str = "all", radius_m: float = 1.0, lease_s: float = 2.0) -> Vehicle:
+        """A vehicle that is not the swarm's own. It exists for others from the first `Vehicle.at` on.
+
+        id        letters, digits, '_' and '.'; not of any other vehicle
+        group     whose it is
+        radius_m  around its place, which others keep clear
+        lease_s   others avoid its last place for so long after they hear nothing more
+        """
+        return Vehicle(self._session, id, group, radius_m, lease_s)
+
+    def target(self, id: str, *, tracker: str | None = None, lease_s: float = POSE_LEASE_S) -> Target:
+        """A target of the scenario that this program tracks: its walk there is `external`.
+
+        id       of the target
+        tracker  name of this tracker, the same after a restart: it goes on at once then
+        lease_s  the target counts as lost, or as the next tracker's, so long after the last word
+        """
+        return Target(self._session, id, tracker, lease_s)
+
+    def orders(self) -> Orders:
+        """Orders to the swarm: pause, close areas, add targets ... With certificates for `operator.NAME` only."""
+        return Orders(self._session)
+
+    def observer(self) -> Observer:
+        """What happens in the swarm, from now on."""
+        return Observer(self._session)
+
+    def on_problem(self, callback: Callable[[str], None]) -> None:
+        """Call with a sentence when something goes wrong that no call can raise: another process uses one of our
+        ids, a planner does not answer. Each is told once a minute, logged, and counted in `counts`."""
+        self._session.on_problem(callback)
+
+    def close(self) -> None:
+        """Take away all vehicles and targets of this program, and leave. May be repeated."""
+        self._stop()
+        self._session.close()
+
+
+def connect(
+    endpoint: str = "tcp/127.0.0.1:7447",
+    *,
+    namespace: str = "swarm",
+    ca: str | None = None,
+    certificate: str | None = None,
+    key: str | None = None,
+    timeout_s: float = 10.0,
+) -> Swarm:
+    """Connect to a running swarm and learn its terrain.
+
+    endpoint   of a router; beyond this machine `tls/HOST:PORT`, with the three files
+    namespace  the scenario's `network.namespace`
+    ca         certificate of the swarm's authority, PEM
+    certificate, key  of this program, whose name says what it may do: rover.GROUP.ID, tracker.TARGET, operator.NAME
+    timeout_s  how long to wait for a router, and for a process that belongs to a run
+
+    Raises ConfigError on an argument that is not what it must be, BusError if nobody answers.
+    """
+    import msgspec
+
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.config.load import check_endpoint
+    from swarm.config.scenario import NetworkConfig, TlsConfig
+    from swarm.runtime.inbox import Inbox
+
+    files = (ca, certificate, key)
+    if any(files) and not all(files):
+        raise ConfigError("give all three of ca, certificate and key, or none")
+    check_endpoint(endpoint, all(files), "endpoint")
+    fields = {"namespace": namespace, "connect": [endpoint], "connect_timeout_s": timeout_s}
+    try:
+        network = msgspec.convert(fields, NetworkConfig)
+    except msgspec.ValidationError as error:
+        raise ConfigError(str(error)) from error
+    if ca and certificate and key:
+        network = msgspec.structs.replace(network, tls=TlsConfig(ca=ca, certificate=certificate, key=key))
+    began_s = time.monotonic()
+    bus, inbox = open_bus(network), Inbox()
+    try:
+        session = Session(
+            bus, _run(bus, inbox, began_s + timeout_s, f"{namespace!r} at {endpoint}"), MonotonicClock(), inbox.post
+        )
+    except BaseException:
+        bus.close()
+        raise
+    thread = SwarmThread(session, inbox.take)
+
+    def stop() -> None:
+        thread.end()
+        inbox.close()
+
+    return Swarm(session, stop)
+
+
+def _run(bus: Bus, inbox: Inbox, until_s: float, where: str) -> RunInfo:
+    """The run of a namespace, as a process with a grid describes it. Raises BusError, RunMismatchError."""
+    from swarm.bus.bus import AskEnded, Replied
+    from swarm.wire.messages.base import Nothing
+    from swarm.wire.topics import RUN
+
+    while True:
+        found: dict[str, RunInfo] = {}
+        bus.ask(RUN, Nothing(), inbox.post, tag="run", timeout_s=_ASK_S)
+        while not isinstance(event := inbox.take(_ASK_S), AskEnded):
+            match event:
+                case Replied(message=RunInfo() as info) if info.run_id and info.rows and info.cols:
+                    found[info.run_id] = info
+                case None if time.monotonic() > until_s:
+                    break
+        if len(found) > 1:
+            raise RunMismatchError(f"two runs, {' and '.join(sorted(found))}, are in namespace {where}: end one")
+        if found:
+            return next(iter(found.values()))
+        if time.monotonic() > until_s:
+            raise BusError(f"no process of a swarm answers in namespace {where}: is one running there?")
+        time.sleep(0.1)

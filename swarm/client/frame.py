@@ -1,0 +1,133 @@
+"""The frame of a swarm's terrain: metres, cells and, where the terrain has coordinates, WGS84."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+
+from swarm.errors import ConfigError
+from swarm.grid import GridSpec
+from swarm.wire.messages.processes import RunInfo
+
+WGS84 = "EPSG:4326"
+Point = tuple[float, float]
+_Transform = Callable[[float, float], Point]
+
+
+class Frame:
+    """Where things are on a swarm's terrain. `x_m` grows to the east and `y_m` to the north, in the coordinate
+    system `crs` ("local" is metres from anywhere). A cell is `row * cols + col`, row 0 in the north.
+
+    grid  shape and place of the terrain
+    """
+
+    def __init__(self, grid: GridSpec) -> None:
+        self.grid = grid
+
+    @classmethod
+    def of(cls, info: RunInfo) -> Frame:
+        """Of what a process of the run answers. Raises ConfigError if it has no grid."""
+        try:
+            return cls(
+                GridSpec(info.rows, info.cols, info.resolution_m, info.west_m, info.north_m, info.crs or "local")
+            )
+        except ValueError as error:
+            raise ConfigError(f"{info.role} {info.id} answers with a grid that is none: {error}") from error
+
+    @property
+    def crs(self) -> str:
+        return self.grid.crs
+
+    def cell(self, x_m: float, y_m: float) -> int:
+        """The cell at a place. Raises ConfigError on a place outside the terrain and on what is no number."""
+        grid = self.grid
+        if not (math.isfinite(x_m) and math.isfinite(y_m)):
+            raise ConfigError(f"x_m {x_m!r}, y_m {y_m!r} is no place: both must be finite numbers of metres")
+        row = math.floor((grid.north_m - y_m) / grid.resolution_m)
+        col = math.floor((x_m - grid.west_m) / grid.resolution_m)
+        if not grid.inside(row, col):
+            east_m, south_m = (
+                grid.west_m + grid.cols * grid.resolution_m,
+                grid.north_m - grid.rows * grid.resolution_m,
+            )
+            raise ConfigError(
+                f"x_m {x_m:.10g}, y_m {y_m:.10g} is outside the terrain, which has x_m {grid.west_m:.10g} ... "
+                f"{east_m:.10g} and y_m {south_m:.10g} ... {grid.north_m:.10g} in {self.crs[:40]}"
+            )
+        return grid.cell(row, col)
+
+    def centre_m(self, cell: int) -> Point:
+        """(x_m, y_m) of the middle of a cell. Raises ConfigError on one outside the terrain."""
+        if not 0 <= cell < self.grid.cells:
+            raise ConfigError(f"cell {cell} is outside the terrain of {self.grid.rows} x {self.grid.cols} cells")
+        return self.grid.centre_m(cell)
+
+    def cells_within(self, x_m: float, y_m: float, radius_m: float) -> list[int]:
+        """The cells whose middle is within a radius of a place inside the terrain, and the cell of the place."""
+        at, step = self.cell(x_m, y_m), self.grid.resolution_m
+        if not 0 <= radius_m < math.inf:
+            raise ConfigError(f"radius_m is {radius_m!r}, expected metres, 0 or more")
+        window = self.grid.around(at, min(math.ceil(radius_m / step), max(self.grid.rows, self.grid.cols)))
+        cells = (
+            row * self.grid.cols + col
+            for row in range(window.row0, window.row1)
+            for col in range(window.col0, window.col1)
+        )
+        return [each for each in cells if each == at or math.dist(self.centre_m(each), (x_m, y_m)) <= radius_m]
+
+    def cells_in(self, polygon_m: Sequence[Point]) -> list[int]:
+        """The cells whose middle is inside a polygon, given by its corners; edges that cross leave holes
+        (even-odd). Raises ConfigError on fewer than three corners and on what is no number."""
+        if len(polygon_m) < 3 or not all(math.isfinite(value) for corner in polygon_m for value in corner):
+            raise ConfigError(f"a polygon of {len(polygon_m)} corners: expected three or more, all finite numbers")
+        grid, cells = self.grid, []
+        edges = list(zip(polygon_m, [*polygon_m[1:], polygon_m[0]], strict=True))
+        for row in range(grid.rows):
+            y_m = grid.north_m - (row + 0.5) * grid.resolution_m
+            crossings = sorted(
+                ax + (y_m - ay) / (by - ay) * (bx - ax)
+                for (ax, ay), (bx, by) in edges
+                if (ay <= y_m) != (by <= y_m)
+            )
+            for left_m, right_m in zip(crossings[::2], crossings[1::2], strict=True):
+                first = math.ceil((left_m - grid.west_m) / grid.resolution_m - 0.5)
+                last = math.ceil((right_m - grid.west_m) / grid.resolution_m - 0.5)
+                cells += [row * grid.cols + col for col in range(max(first, 0), min(last, grid.cols))]
+        return cells
+
+    def from_wgs84(self, lat_deg: float, lon_deg: float) -> Point:
+        """(x_m, y_m) of a latitude and longitude. Raises ConfigError where the terrain has no coordinates, and
+        without pyproj, which `pip install 'terrain-swarm[wgs84]'` brings."""
+        if not (-90 <= lat_deg <= 90 and -360 <= lon_deg <= 360):
+            raise ConfigError(f"lat_deg {lat_deg!r}, lon_deg {lon_deg!r} is no place on Earth")
+        return self._transforms[0](lon_deg, lat_deg)
+
+    def to_wgs84(self, x_m: float, y_m: float) -> Point:
+        """(lat_deg, lon_deg) of a place. Raises as `from_wgs84`."""
+        lon_deg, lat_deg = self._transforms[1](x_m, y_m)
+        return lat_deg, lon_deg
+
+    @cached_property
+    def _transforms(self) -> tuple[_Transform, _Transform]:
+        if self.crs == "local":
+            raise ConfigError('this terrain has no coordinates (its crs is "local"): give x_m and y_m')
+        try:
+            from pyproj import Transformer
+            from pyproj.exceptions import CRSError
+        except ModuleNotFoundError as error:
+            raise ConfigError("latitudes and longitudes need pyproj: pip install 'terrain-swarm[wgs84]'") from error
+        try:
+            there = Transformer.from_crs(WGS84, self.crs, always_xy=True)
+            back = Transformer.from_crs(self.crs, WGS84, always_xy=True)
+        except CRSError as error:
+            raise ConfigError(f"pyproj does not know the terrain's crs {self.crs[:60]!r}") from error
+        return there.transform, back.transform
+
+
+def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
+    """Cells of the terrain, each once. Raises ConfigError on one outside."""
+    once = list(dict.fromkeys(cells))
+    for cell in once:
+        frame.centre_m(cell)
+    return once

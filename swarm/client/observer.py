@@ -1,0 +1,267 @@
+"""What happens in a swarm, for programs that only watch: positions, targets, routes, marks and notes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from swarm.bus.bus import Event, Heard, LinkChanged, Replied
+from swarm.client.stream import Stream
+from swarm.clock import NS_PER_S
+from swarm.grid import TILE_CELLS, GridSpec, walk
+from swarm.runtime.tracking import Trackings, Verdict
+from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.marks import MarkSet, MarksRequest
+from swarm.wire.messages.processes import Note
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, NOTE, POSE
+
+if TYPE_CHECKING:
+    from swarm.client.session import Session
+
+CAPTURE = "capture"
+_SILENCE_NS = 5 * NS_PER_S
+_EVERY_S = 0.2
+_HEARD = (FLEET, BODY, POSE, FOLLOWED, NOTE, MARKS)
+_SAMPLED = (FLEET,)
+"""Of these only the newest is read, five times a second: they come at every tick, of every vehicle."""
+_MARKS_TAG = "observer-marks"
+_MOST_SETS = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class SeenVehicle:
+    """A vehicle, where it was said to be last.
+
+    state   idle, waiting, following, arrived, stranded, lost; "outside" of one that is not the swarm's own
+    target  whom it chases, None for nobody
+    """
+
+    id: str
+    group: str
+    x_m: float
+    y_m: float
+    heading_rad: float | None
+    state: str
+    target: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class SeenTarget:
+    """A target, where its owner among the trackers said last that it is.
+
+    captures  how often it was captured
+    tracker   name of the owner, if it has one
+    lost      nobody tracks it now: it was there, and may be anywhere
+    """
+
+    id: str
+    x_m: float
+    y_m: float
+    captures: int
+    tracker: str | None
+    lost: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """What the map says of a cell since it was marked: nobody may enter it, or how long a metre takes."""
+
+    lethal: bool
+    pace_s_per_m: float | None
+
+
+class Observer:
+    """Positions, targets, routes, marks and notes of a swarm, from its making on. Made by `Swarm.observer`; use it
+    in a `with`, or `leave`. Each property is a copy, made when it is read.
+
+    notes  sentences for people, as they come: `for note in observer.notes`; captures have the kind "capture"
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.notes: Stream[Note] = Stream()
+        self._on_note: list[Callable[[Note], None]] = []
+        self._fleets: dict[tuple[str, int], tuple[Fleet, int]] = {}
+        """(author, region) -> its newest message, and when it came."""
+        self._bodies: dict[str, tuple[Body, int]] = {}
+        self._trackings = Trackings(session.frame.grid.cells)
+        self._targets: dict[str, None] = {}
+        """Ids of targets that were heard of, in order."""
+        self._routes: dict[str, Followed] = {}
+        self._sets: dict[tuple[int, str], MarkSet] = {}
+        """(tile, author) -> its newest set."""
+        session.add(self)
+        bus, post = session.bus, session.post
+        for topic in _HEARD:
+            if topic in _SAMPLED:
+                bus.subscribe(topic, post, every_s=_EVERY_S)
+            else:
+                bus.subscribe(topic, post)
+        self._ask_marks()
+
+    def __enter__(self) -> Observer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.leave()
+
+    @property
+    def vehicles(self) -> Mapping[str, SeenVehicle]:
+        """Those heard of in the last seconds, by id."""
+        with self._session.lock:
+            now_ns = self._session.now_ns()
+            seen: dict[str, SeenVehicle] = {}
+            for fleet, heard_ns in self._fleets.values():
+                if now_ns - heard_ns < _SILENCE_NS:
+                    seen |= {each.id: each for each in _in_fleet(fleet, self._session.frame.grid)}
+            for body, heard_ns in self._bodies.values():
+                if now_ns - heard_ns < body.lease_s * NS_PER_S:
+                    seen[body.id] = SeenVehicle(
+                        body.id, body.group, body.x_m, body.y_m, body.heading_rad, "outside", None
+                    )
+            return seen
+
+    @property
+    def targets(self) -> Mapping[str, SeenTarget]:
+        """All that were heard of, by id."""
+        with self._session.lock:
+            now_ns = self._session.now_ns()
+            tracked = ((id, self._trackings.of(id)) for id in self._targets)
+            return {
+                id: SeenTarget(id, pose.x_m, pose.y_m, pose.captures, pose.tracker, tracking.lost(now_ns))
+                for id, tracking in tracked
+                if tracking is not None and (pose := tracking.pose) is not None
+            }
+
+    @property
+    def routes(self) -> Mapping[str, list[tuple[float, float]]]:
+        """Points in metres of the routes that vehicles of the swarm have begun last, by vehicle."""
+        with self._session.lock:
+            frame = self._session.frame
+            return {
+                id: [frame.centre_m(cell) for cell in walk(frame.grid, each.start, each.directions)]
+                for id, each in self._routes.items()
+            }
+
+    @property
+    def marks(self) -> Mapping[int, Mark]:
+        """What is marked now, by cell: of several statements about a cell the newest."""
+        with self._session.lock:
+            return marked(self._sets.values(), self._session.frame.grid, self._session.now_ns())
+
+    def on_note(self, callback: Callable[[Note], None]) -> None:
+        """Call with every note, on the connection's thread."""
+        self._on_note.append(callback)
+
+    def on_capture(self, callback: Callable[[Note], None]) -> None:
+        """Call with the note of every capture, on the connection's thread."""
+        self.on_note(lambda note: callback(note) if note.kind == CAPTURE else None)
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        match event:
+            case Heard(message=Fleet() as fleet):
+                self._fleets[fleet.author, fleet.region] = fleet, now_ns
+            case Heard(message=Body() as body):
+                self._bodies[body.id] = body, now_ns
+            case Heard(topic=topic, message=TargetPose() as pose) if topic is POSE:
+                if self._trackings.hear(pose, now_ns) is Verdict.COUNTS:
+                    self._targets[pose.target] = None
+            case Heard(message=Followed() as followed):
+                self._hear_followed(followed)
+            case Heard(message=Note() as note):
+                self.notes.put(note)
+                for callback in self._on_note:
+                    self._session.call(lambda callback=callback, note=note: callback(note))  # type: ignore[misc]
+            case Heard(message=MarkSet() as marks):
+                self._hear_marks(marks)
+            case Replied(tag=tag, message=MarkSet() as marks) if tag == _MARKS_TAG:
+                self._hear_marks(marks)
+            case LinkChanged(up=True):
+                self._ask_marks()
+
+    def tick(self, now_ns: int) -> None:
+        pass
+
+    def leave(self) -> None:
+        """Watch no more. May be repeated."""
+        with self._session.lock:
+            self.notes.close()
+            for topic in _HEARD:
+                self._session.bus.unsubscribe(topic)
+            self._session.remove(self)
+
+    def _ask_marks(self) -> None:
+        self._session.bus.ask(MARKS, MarksRequest(), self._session.post, tag=_MARKS_TAG, timeout_s=5.0)
+
+    def _hear_marks(self, marks: MarkSet) -> None:
+        held = self._sets.get((marks.tile, marks.author))
+        newer = held is None or (marks.epoch, marks.seq) > (held.epoch, held.seq)
+        if (
+            newer
+            and marks.tile < self._session.frame.grid.tiles
+            and (held is not None or len(self._sets) < _MOST_SETS)
+        ):
+            self._sets[marks.tile, marks.author] = marks
+
+    def _hear_followed(self, followed: Followed) -> None:
+        try:
+            walk(self._session.frame.grid, followed.start, followed.directions)
+        except ValueError:
+            self._session.problem("routes_refused", f"a route of {followed.vehicle} leaves the terrain")
+        else:
+            self._routes[followed.vehicle] = followed
+
+
+def _in_fleet(fleet: Fleet, grid: GridSpec) -> list[SeenVehicle]:
+    def floats(column: bytes) -> Sequence[float]:
+        return memoryview(column).cast("f").tolist()
+
+    targets = [None if each == NO_TARGET else fleet.target_ids[each] for each in fleet.targets]
+    columns = (
+        fleet.ids,
+        floats(fleet.east_m),
+        floats(fleet.south_m),
+        floats(fleet.heading_rad),
+        fleet.states,
+        targets,
+    )
+    return [
+        SeenVehicle(
+            id, fleet.group, grid.west_m + east_m, grid.north_m - south_m, heading_rad,
+            VehicleState(state).name.lower(), target,
+        )
+        for id, east_m, south_m, heading_rad, state, target in zip(*columns, strict=True)
+    ]  # fmt: skip
+
+
+def marked(sets: Iterable[MarkSet], grid: GridSpec, now_ns: int) -> dict[int, Mark]:
+    """The winning statements of these sets, by cell of the grid: as `shared_map.replication.merge` has it, the
+    newest wins, and of two with one stamp that of the larger author."""
+    won: dict[int, tuple[int, str, int, float]] = {}
+    for each in sets:
+        row, col = divmod(each.tile, grid.tile_cols)
+        corner_row, corner_col = row * TILE_CELLS, col * TILE_CELLS
+        untils_ns = memoryview(each.untils_ns).cast("q") if each.untils_ns else None
+        rows = zip(
+            memoryview(each.cells).cast("H"), each.kinds, memoryview(each.paces).cast("f"),
+            memoryview(each.stamps_ns).cast("q"), strict=True,
+        )  # fmt: skip
+        for number, (cell, kind, pace, stamp_ns) in enumerate(rows):
+            if untils_ns is not None and untils_ns[number] <= now_ns:
+                continue
+            row, col = corner_row + cell // TILE_CELLS, corner_col + cell % TILE_CELLS
+            if not grid.inside(row, col):
+                continue  # in a tile that the border cuts
+            at = grid.cell(row, col)
+            said = (stamp_ns, each.author, kind, pace)
+            if at not in won or said[:2] > won[at][:2]:
+                won[at] = said
+    return {
+        cell: Mark(kind == MarkKind.LETHAL, pace if kind == MarkKind.PACE else None)
+        for cell, (_, _, kind, pace) in sorted(won.items())
+        if kind != MarkKind.CLEAR
+    }

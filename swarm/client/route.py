@@ -1,0 +1,106 @@
+"""A route as a vehicle drives it: points in metres, and where one is on it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+from swarm.client.frame import Frame, Point
+from swarm.grid import walk
+from swarm.wire.messages.planning import PushedRoute, RouteReply
+from swarm.wire.routes import Route as WireRoute
+from swarm.wire.routes import RouteStatus
+
+
+@dataclass(frozen=True)
+class Route:
+    """A planner's route from a vehicle's cell to its target, or the reason why there is none.
+
+    target         id of the target
+    status         "ok", or why there is no way: unreachable, outside, lethal_start, no_target
+    cells          from the vehicle's cell to the target's, or as far as the planner tells
+    cost_s         seconds that it takes
+    lower_bound_s  proven: no route is quicker on the planner's present map
+    remaining_s    cost-to-go from the last cell; 0 if that is the target's
+    pose_age_s     how long ago the target was heard of, when the planner answered; None if it does not say
+    tracker_lost   nobody tracks the target now: it was there, and may be anywhere
+    """
+
+    frame: Frame
+    target: str
+    status: str
+    cells: tuple[int, ...]
+    cost_s: float
+    lower_bound_s: float
+    remaining_s: float
+    pose_age_s: float | None = None
+    tracker_lost: bool = False
+
+    @classmethod
+    def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PushedRoute) -> Route:
+        """A route of an answer, or one that was pushed. Raises ValueError if it leaves the terrain."""
+        ok = route.status is RouteStatus.OK
+        cells = tuple(walk(frame.grid, route.start, route.directions)) if ok else ()
+        age_s, lost = (reply.pose_age_s, reply.tracker_lost) if isinstance(reply, RouteReply) else (None, False)
+        return cls(
+            frame, reply.target, str(route.status), cells, route.cost_s, route.lower_bound_s, route.remaining_s,
+            age_s, lost,
+        )  # fmt: skip
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a way."""
+        return self.status == RouteStatus.OK
+
+    @property
+    def arrived(self) -> bool:
+        """Whether it is at the target already, or no more than one step away."""
+        return self.ok and len(self.cells) <= 2 and self.remaining_s == 0
+
+    @cached_property
+    def points_m(self) -> tuple[Point, ...]:
+        """(x_m, y_m) of the middles of its cells."""
+        return tuple(map(self.frame.centre_m, self.cells))
+
+    @property
+    def length_m(self) -> float:
+        """Of its points."""
+        return sum(math.dist(a, b) for a, b in pairwise(self.points_m))
+
+    def ahead(self, x_m: float, y_m: float, distance_m: float) -> tuple[float, float, float]:
+        """Where one is after driving `distance_m` along the route from the point of it that is nearest to a place:
+        (x_m, y_m, heading_rad), the heading clockwise from north. At its end it stays there; without a way the
+        place itself is returned."""
+        points = self.points_m
+        if not points:
+            return x_m, y_m, 0.0
+        if len(points) == 1:
+            return *points[0], 0.0
+        place, (at, share) = (x_m, y_m), (0, 0.0)
+        nearest = math.inf
+        for number, (a, b) in enumerate(pairwise(points)):
+            along = _share(a, b, place)
+            distance = math.dist(_between(a, b, along), place)
+            if distance < nearest:
+                nearest, at, share = distance, number, along
+        while True:
+            a, b = points[at], points[at + 1]
+            step_m = math.dist(a, b)
+            left_m = step_m * (1 - share)
+            if distance_m < left_m or at + 2 == len(points):
+                share = min(1.0, share + distance_m / step_m)
+                return *_between(a, b, share), math.atan2(b[0] - a[0], b[1] - a[1])
+            distance_m, at, share = distance_m - left_m, at + 1, 0.0
+
+
+def _share(a: Point, b: Point, place: Point) -> float:
+    """How far along a step, 0 ... 1, the point is that is nearest to a place."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    along = ((place[0] - a[0]) * dx + (place[1] - a[1]) * dy) / (dx * dx + dy * dy)
+    return min(1.0, max(0.0, along))
+
+
+def _between(a: Point, b: Point, share: float) -> Point:
+    return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])

@@ -1,0 +1,246 @@
+"""A connection to a running swarm: what vehicles, targets and observers of a program share."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any, Protocol
+
+from swarm.bus.bus import AskEnded, Bus, Event, LinkChanged, Post, Replied
+from swarm.client.frame import Frame
+from swarm.clock import NS_PER_S, Clock
+from swarm.errors import BusError, ConfigError, ProtocolError, RunMismatchError, SwarmError
+from swarm.wire.codec import M, decode, encode
+from swarm.wire.messages.base import Message, Nothing
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.topics import RUN, Topic
+
+log = logging.getLogger(__name__)
+
+TICK_S = 0.05
+_RUN_TIMEOUT_S = 2.0
+_SAY_AGAIN_NS = 60 * NS_PER_S
+_MOST_SAID = 1024
+
+
+class Part(Protocol):
+    """A vehicle, a target or an observer, on its swarm's thread and under its lock."""
+
+    def handle(self, event: Event, now_ns: int) -> None: ...
+    def tick(self, now_ns: int) -> None: ...
+    def leave(self) -> None: ...
+
+
+class Session:
+    """The state behind `Swarm`: calls from any thread on one side, events of the bus on the other.
+
+    `handle` and `tick` are called by one thread, which also calls the callbacks, outside of the lock.
+
+    frame   the terrain
+    run     what a process of the run said of it
+    counts  what was refused, lost and reported since the connection began
+    """
+
+    def __init__(self, bus: Bus, run: RunInfo, clock: Clock, post: Post | None = None) -> None:
+        self.bus = bus
+        self.run = run
+        self.frame = Frame.of(run)
+        self.counts: Counter[str] = Counter()
+        self.lock = threading.RLock()
+        """Held while anything below, or a part, is read or changed."""
+        self.post: Post = post if post is not None else self.handle
+        self.connected = True
+        """Whether the link to the router is up, as far as is known."""
+        self.ended: SwarmError | None = None
+        """Why nothing can be said any more: closed, or the run is another one."""
+        self._clock = clock
+        self._parts: list[Part] = []
+        self._asked: dict[str, tuple[Future[list[Any]], list[Any]]] = {}
+        """Tag -> who waits for the answers, and those that came."""
+        self._tags = itertools.count(1)
+        self._later: list[Callable[[], None]] = []
+        """Callbacks to call once the lock is free."""
+        self._said_ns: dict[str, int] = {}
+        """Problem -> when it was told last."""
+        self._on_problem: list[Callable[[str], None]] = []
+        self._owner: int | None = None
+        """The thread that calls `handle` and `tick`."""
+        bus.watch_links(self.post)
+
+    def now_ns(self) -> int:
+        return self._clock.now_ns()
+
+    # --- for parts ----------------------------------------------------------------------------------------------
+
+    def add(self, part: Part) -> None:
+        with self.lock:
+            self.check_open()
+            self._parts.append(part)
+
+    def remove(self, part: Part) -> None:
+        with self.lock:
+            self._parts = [each for each in self._parts if each is not part]
+
+    def check_open(self) -> None:
+        """Raise why nothing can be said any more."""
+        if self.ended is not None:
+            raise self.ended
+
+    def publish(self, topic: Topic, message: M, **fields: str | int) -> M:
+        """Put a message that follows the rules of its type. Raises ConfigError, and counts it, if it does not."""
+        self.check_open()
+        try:
+            checked = decode(encode(message), type(message))
+        except ProtocolError as error:
+            raise self.refused(str(error)) from error
+        self.bus.publish(topic, checked, **fields)
+        return checked
+
+    def refused(self, sentence: str) -> ConfigError:
+        """The error of a value that was not sent, counted."""
+        self.counts["refused"] += 1
+        return ConfigError(sentence)
+
+    def ask(self, topic: Topic, request: Message, timeout_s: float, **fields: str) -> Future[list[Any]]:
+        """All answers to a question. Its failure is a BusError."""
+        self.check_open()
+        waiting: Future[list[Any]] = Future()
+        with self.lock:
+            tag = f"client-{next(self._tags)}"
+            self._asked[tag] = (waiting, [])
+        self.bus.ask(topic, request, self.post, tag=tag, timeout_s=timeout_s, **fields)
+        return waiting
+
+    def answers(self, waiting: Future[Any], timeout_s: float) -> Any:
+        """Wait for what was asked. Raises BusError; ConfigError on the thread that would have to bring it."""
+        if threading.get_ident() == self._owner:
+            raise ConfigError("a callback must not wait for an answer: ask from another thread, or follow a target")
+        try:
+            return waiting.result(timeout_s + 2.0)
+        except TimeoutError as error:
+            raise BusError(f"no answer within {timeout_s:g} s") from error
+
+    def call(self, callback: Callable[[], None]) -> None:
+        """Call something of the program's once the lock is free."""
+        self._later.append(callback)
+
+    def on_problem(self, callback: Callable[[str], None]) -> None:
+        self._on_problem.append(callback)
+
+    def problem(self, kind: str, sentence: str) -> None:
+        """Count a problem, and tell it in the log and to callbacks, once a minute."""
+        self.counts[kind] += 1
+        now_ns = self.now_ns()
+        if now_ns - self._said_ns.get(sentence, -_SAY_AGAIN_NS) < _SAY_AGAIN_NS:
+            return
+        if len(self._said_ns) >= _MOST_SAID:
+            self._said_ns.clear()
+        self._said_ns[sentence] = now_ns
+        log.warning("%s", sentence)
+        for callback in self._on_problem:
+            self.call(lambda callback=callback: callback(sentence))  # type: ignore[misc]
+
+    # --- events -------------------------------------------------------------------------------------------------
+
+    def handle(self, event: Event) -> None:
+        now_ns = self.now_ns()
+        with self.lock:
+            self._owner = threading.get_ident()
+            match event:
+                case Replied(tag=tag, message=message) if tag in self._asked:
+                    self._asked[tag][1].append(message)
+                case AskEnded(tag=tag, replies=replies, failure=failure) if tag in self._asked:
+                    waiting, found = self._asked.pop(tag)
+                    if replies:
+                        self.call(lambda: waiting.set_result(found))
+                    else:
+                        what = f"no answer: {failure}" if failure and failure != "timeout" else "nobody answers"
+                        self.call(lambda: waiting.set_exception(BusError(what)))
+                case LinkChanged(up=up):
+                    self.connected = up
+                    if up:
+                        self._compare_run()
+                    for part in self._parts:
+                        part.handle(event, now_ns)
+                case _:
+                    for part in self._parts:
+                        part.handle(event, now_ns)
+        self._call_later()
+
+    def tick(self) -> None:
+        now_ns = self.now_ns()
+        with self.lock:
+            self._owner = threading.get_ident()
+            if self.ended is None:
+                for part in self._parts:
+                    part.tick(now_ns)
+        self._call_later()
+
+    def close(self) -> None:
+        """Take away what was reported, and leave the network."""
+        with self.lock:
+            for part in list(self._parts):
+                part.leave()
+            self.ended = self.ended or BusError("the connection to the swarm is closed")
+            waiting, self._asked = list(self._asked.values()), {}
+        for future, _ in waiting:
+            future.set_exception(self.ended)
+        self.bus.close()
+
+    def _compare_run(self) -> None:
+        """After a cut the namespace may hold another run, in which our cells mean other places."""
+        asked = self.ask(RUN, Nothing(), _RUN_TIMEOUT_S)
+
+        def compare(done: Future[list[Any]]) -> None:
+            runs = [] if done.exception() else [each for each in done.result() if each.run_id]
+            if not runs or any(each.run_id == self.run.run_id for each in runs):
+                return
+            with self.lock:
+                self.ended = RunMismatchError(
+                    f"run {self.run.run_id} is over, and run {runs[0].run_id} is in its namespace: connect again"
+                )
+                log.warning("%s", self.ended)
+
+        asked.add_done_callback(compare)
+
+    def _call_later(self) -> None:
+        while self._later:
+            with self.lock:
+                callbacks, self._later = self._later, []
+            for callback in callbacks:
+                try:
+                    callback()
+                except Exception:
+                    self.counts["callbacks_failed"] += 1
+                    log.exception("a callback failed; the connection goes on")
+
+
+class SwarmThread:
+    """The one thread on which a live session's events and ticks are handled."""
+
+    def __init__(self, session: Session, take: Callable[[float], Event | None]) -> None:
+        self._session = session
+        self._take = take
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="swarm-client", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        due_s = 0.0
+        while not self._ended.is_set():
+            event = self._take(max(0.0, due_s - time.monotonic()))
+            if event is not None:
+                self._session.handle(event)
+            if time.monotonic() >= due_s:
+                due_s = time.monotonic() + TICK_S
+                self._session.tick()
+
+    def end(self) -> None:
+        self._ended.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(2.0)

@@ -1,0 +1,362 @@
+"""A vehicle that is not the swarm's own: says where it is, follows a target's routes, marks the map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from typing import Any
+
+import msgspec
+
+from swarm.bus.bus import Asked, Event, Heard, LinkChanged
+from swarm.client.frame import checked_cells
+from swarm.client.own_marks import OwnMarks
+from swarm.client.route import Route
+from swarm.client.session import Session
+from swarm.client.stream import Stream
+from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
+from swarm.errors import BusError, ConfigError
+from swarm.wire.fields import check_id
+from swarm.wire.messages.bodies import LONGEST_LEASE_S, Body
+from swarm.wire.messages.marks import MarkSet, MarksRequest
+from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
+from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
+from swarm.wire.topics import BODY, DIGEST, MARKS, PUSHED_ROUTE, ROUTE
+
+_ASK_AGAIN_NS = NS_PER_S
+"""A follower asks again so often, from where it is: planners forget vehicles that were silent for five seconds."""
+_DIGEST_NS = NS_PER_S
+_TIMEOUT_S = 5.0
+_NEAR_END_CELLS = 16
+
+
+class Vehicle:
+    """One vehicle. Made by `Swarm.vehicle`; use it in a `with`, or `leave` at the end.
+
+    id           of the vehicle; no other process may report one of the same id
+    group        whose it is: who reads its marks
+    radius_m     around its place, which others keep clear
+    lease_s      others avoid its last place for so long after they hear nothing more
+    incarnation  when it joined, in ns: tells it from an earlier life under the same id
+    """
+
+    def __init__(self, session: Session, id: str, group: str, radius_m: float, lease_s: float) -> None:
+        for name, value in (("id", id), ("group", group)):
+            try:
+                check_id(name, value)
+            except ValueError as error:
+                raise session.refused(str(error)) from error
+        if agent_of(id) != id:
+            raise session.refused(f"id {id!r} has a '-', by which the swarm names vehicles of its own agents")
+        if not 0 < lease_s <= LONGEST_LEASE_S:
+            raise session.refused(f"lease_s is {lease_s!r}, expected more than 0 and at most {LONGEST_LEASE_S:g}")
+        if not 0 <= radius_m < math.inf:
+            raise session.refused(f"radius_m is {radius_m!r}, expected metres, 0 or more")
+        self.id = id
+        self.group = group
+        self.radius_m = radius_m
+        self.lease_s = lease_s
+        self.incarnation = session.now_ns()
+        self._session = session
+        self._body: Body | None = None
+        """What was said last; None before the first `at`."""
+        self._seq = 0
+        self._repeat_due_ns = 0
+        self._target: str | None = None
+        self._route: Route | None = None
+        self._ask_due_ns = 0
+        self._asking = False
+        self._streams: list[Stream[Route]] = []
+        self._on_route: list[Callable[[Route], None]] = []
+        self._marks = OwnMarks(f"{group}.{id}.{self.incarnation:x}", group, session.frame.grid)
+        self._digest_due_ns = 0
+        session.add(self)
+        session.bus.subscribe(BODY, session.post, id=id)
+
+    def __enter__(self) -> Vehicle:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.leave()
+
+    # --- place --------------------------------------------------------------------------------------------------
+
+    def at(self, x_m: float, y_m: float, *, heading_rad: float | None = None, speed_m_per_s: float = 0.0) -> None:
+        """Say where the vehicle is. All vehicles of the swarm avoid this place from their next tick on, and where
+        it will be soon. It is repeated until the next call or `leave`: who says nothing more, stands.
+
+        x_m, y_m       in the terrain's frame; of a latitude and longitude: `at(*swarm.frame.from_wgs84(lat, lon))`
+        heading_rad    clockwise from north; None if it may go any way
+        speed_m_per_s  by the wall clock
+
+        Raises ConfigError on a place outside the terrain and on what is no number; what was said before stands.
+        """
+        session = self._session
+        with session.lock:
+            try:
+                session.frame.cell(x_m, y_m)
+            except ConfigError as error:
+                raise session.refused(f"vehicle {self.id}: {error}") from None
+            body = Body(
+                id=self.id,
+                group=self.group,
+                incarnation=self.incarnation,
+                seq=self._seq + 1,
+                stamp_ns=session.now_ns(),
+                x_m=float(x_m),
+                y_m=float(y_m),
+                heading_rad=None if heading_rad is None else float(heading_rad),
+                speed_m_per_s=float(speed_m_per_s),
+                radius_m=float(self.radius_m),
+                lease_s=float(self.lease_s),
+            )
+            self._body = session.publish(BODY, body, id=self.id)
+            self._seq += 1
+            self._repeat_due_ns = body.stamp_ns + self._repeat_ns
+
+    @property
+    def cell(self) -> int:
+        """The cell that it said it is in. Raises ConfigError before the first `at`."""
+        body = self._body
+        if body is None:
+            raise ConfigError(f"vehicle {self.id} has not said where it is: call at() first")
+        return self._session.frame.cell(body.x_m, body.y_m)
+
+    @property
+    def _repeat_ns(self) -> int:
+        return int(self.lease_s * NS_PER_S / 4)
+
+    # --- routes -------------------------------------------------------------------------------------------------
+
+    def route(self, target: str, timeout_s: float = _TIMEOUT_S) -> Route:
+        """The best route to a target from where the vehicle is. Raises BusError if its planner does not answer."""
+        found: Route = self._session.answers(self.route_soon(target, timeout_s), timeout_s)
+        return found
+
+    def route_soon(self, target: str, timeout_s: float = _TIMEOUT_S) -> Future[Route]:
+        """As `route`, without waiting: `await asyncio.wrap_future(vehicle.route_soon(target))`."""
+        session = self._session
+        _check_target(session, target)
+        asked = session.ask(ROUTE, RouteRequest(cells=[self.cell]), timeout_s, target=target)
+        found: Future[Route] = Future()
+
+        def finish(done: Future[list[Any]]) -> None:
+            error = done.exception()
+            if error is not None:
+                found.set_exception(BusError(f"no route to {target!r}: {error}"))
+                return
+            reply: RouteReply = done.result()[0]
+            try:
+                found.set_result(Route.of(session.frame, reply.routes[0], reply))
+            except (ValueError, IndexError) as error:
+                found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
+
+        asked.add_done_callback(finish)
+        return found
+
+    def follow(self, target: str) -> Stream[Route]:
+        """Routes to a target from now on: the first one, and a newer one whenever the target moves, the map changes
+        or the route runs out. Ends what was followed before. `newest` of the stream is the route to drive."""
+        session = self._session
+        with session.lock:
+            session.check_open()
+            _check_target(session, target)
+            _ = self.cell
+            self.unfollow()
+            self._target, self._ask_due_ns = target, 0
+            stream: Stream[Route] = Stream(16)
+            self._streams.append(stream)
+            session.bus.subscribe(PUSHED_ROUTE, session.post, agent=self.id, vehicle=self.id)
+        return stream
+
+    def on_route(self, callback: Callable[[Route], None]) -> None:
+        """Call with every route of the target that is followed. It is called on the connection's thread, so it must
+        not wait for answers."""
+        self._on_route.append(callback)
+
+    def unfollow(self) -> None:
+        """Follow nothing any more; streams of routes end."""
+        with self._session.lock:
+            if self._target is not None:
+                self._session.bus.unsubscribe(PUSHED_ROUTE, agent=self.id, vehicle=self.id)
+            self._target, self._route = None, None
+            for stream in self._streams:
+                stream.close()
+            self._streams.clear()
+
+    def _ask(self, now_ns: int) -> None:
+        """For the route from where we are now, which keeps us registered with the planner."""
+        target, before = self._target, self._route
+        assert target is not None
+        self._ask_due_ns = now_ns + _ASK_AGAIN_NS
+        if self._asking:
+            return
+        ran_out = before is not None and (not before.ok or (before.remaining_s > 0 and self._near_end(before)))
+        request = RouteRequest(cells=[self.cell], vehicles=[self.id], force=ran_out)
+        asked = self._session.ask(ROUTE, request, _TIMEOUT_S, target=target)
+        self._asking = True
+
+        def finish(done: Future[list[Any]]) -> None:
+            with self._session.lock:
+                self._asking = False
+                if self._target != target:
+                    return
+                if (error := done.exception()) is not None:
+                    self._session.problem("routes_missed", f"vehicle {self.id} gets no route to {target}: {error}")
+                else:
+                    self._take(done.result()[0])
+
+        asked.add_done_callback(finish)
+
+    def _near_end(self, route: Route) -> bool:
+        return self.cell in route.cells[-_NEAR_END_CELLS:]
+
+    def _take(self, reply: RouteReply | PushedRoute) -> None:
+        """A route that was given: told if it says anything new."""
+        try:
+            given = reply.route if isinstance(reply, PushedRoute) else reply.routes[0]
+            route = Route.of(self._session.frame, given, reply)
+        except (ValueError, IndexError) as error:
+            self._session.problem("routes_refused", f"the planner of {reply.target} answers nonsense: {error}")
+            return
+        if self._route is not None and _is_rest(route, self._route):
+            return
+        self._route = route
+        for stream in self._streams:
+            stream.put(route)
+        for callback in self._on_route:
+            self._session.call(lambda callback=callback: callback(route))  # type: ignore[misc]
+
+    # --- map ----------------------------------------------------------------------------------------------------
+
+    def mark(
+        self,
+        cells: Iterable[int],
+        *,
+        lethal: bool = False,
+        pace_s_per_m: float | None = None,
+        clear: bool = False,
+        for_s: float | None = None,
+    ) -> int:
+        """State something about cells, for all vehicles and planners. Returns how many cells were stated.
+
+        cells         such as `swarm.frame.cells_within(x_m, y_m, radius_m)` or `swarm.frame.cells_in(polygon_m)`
+        lethal        nobody may enter them
+        pace_s_per_m  they take so long to drive
+        clear         they are as the map had them before
+        for_s         the statement ends by itself; None: it stands until somebody states otherwise
+
+        Raises ConfigError on a cell outside, on a pace beyond its bounds, and unless exactly one thing is stated.
+        """
+        session = self._session
+        if (lethal, pace_s_per_m is not None, clear).count(True) != 1:
+            raise session.refused("mark states one thing: lethal=True, pace_s_per_m=... or clear=True")
+        if pace_s_per_m is not None and not PACE_LEAST <= pace_s_per_m <= PACE_MOST:
+            raise session.refused(f"pace_s_per_m is {pace_s_per_m!r}, expected {PACE_LEAST:.4g} ... {PACE_MOST:g}")
+        if for_s is not None and not 0 < for_s < 1e9:
+            raise session.refused(f"for_s is {for_s!r}, expected seconds, more than 0")
+        kind = MarkKind.LETHAL if lethal else MarkKind.CLEAR if clear else MarkKind.PACE
+        with session.lock:
+            session.check_open()
+            try:
+                once = checked_cells(session.frame, cells)
+            except ConfigError as error:
+                raise session.refused(str(error)) from None
+            now_ns = session.now_ns()
+            until_ns = FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
+            if not self._marks.any:
+                session.bus.serve(MARKS, session.post, author=self._marks.author)
+                session.bus.subscribe(MARKS, session.post, author=self._marks.author)
+            self._put_marks(self._marks.state(once, kind, pace_s_per_m or 0.0, now_ns, until_ns))
+            self._digest_due_ns = now_ns
+        return len(once)
+
+    def _put_marks(self, sets: Iterable[MarkSet]) -> None:
+        for each in sets:
+            region = self._marks.region_of(each)
+            self._session.bus.publish(MARKS, each, region=region, tile=each.tile, author=each.author)
+
+    def _answer_marks(self, asked: Asked, request: MarksRequest) -> None:
+        for each in self._marks.answer(request):
+            asked.answer(each, region=self._marks.region_of(each), tile=each.tile, author=each.author)
+        asked.end()
+
+    # --- a part of its session ----------------------------------------------------------------------------------
+
+    def handle(self, event: Event, now_ns: int) -> None:
+        match event:
+            case Heard(message=Body() as body) if body.id == self.id and body.incarnation != self.incarnation:
+                self._hear_double(body)
+            case Heard(message=PushedRoute() as pushed) if (
+                pushed.vehicle == self.id and pushed.target == self._target
+            ):
+                self._take(pushed)
+            case Heard(message=MarkSet() as marks) if marks.author == self._marks.author:
+                self._put_marks(self._marks.heard(marks, now_ns))
+            case Asked(topic=topic, request=MarksRequest() as request, fields=fields) if topic is MARKS and fields[
+                "author"
+            ] in ("*", self._marks.author):
+                self._answer_marks(event, request)
+            case LinkChanged(up=True):
+                self._repeat_due_ns = self._ask_due_ns = self._digest_due_ns = 0
+
+    def _hear_double(self, other: Body) -> None:
+        if other.lease_s == 0:
+            return
+        who = (
+            "which started later, so vehicles avoid its place and not ours"
+            if (other.incarnation > self.incarnation)
+            else "which started earlier, so vehicles avoid our place and not its"
+        )
+        self._session.problem("doubles_heard", f"another process reports vehicle {self.id}, {who}")
+
+    def tick(self, now_ns: int) -> None:
+        session = self._session
+        if self._body is not None and now_ns >= self._repeat_due_ns:
+            self._repeat_due_ns = now_ns + self._repeat_ns
+            self._seq += 1
+            self._body = msgspec.structs.replace(self._body, seq=self._seq, stamp_ns=now_ns)
+            session.bus.publish(BODY, self._body, id=self.id)
+        if self._target is not None and now_ns >= self._ask_due_ns:
+            self._ask(now_ns)
+        if self._marks.any and now_ns >= self._digest_due_ns:
+            self._digest_due_ns = now_ns + _DIGEST_NS
+            session.bus.publish(DIGEST, self._marks.digest(), author=self._marks.author)
+
+    def leave(self) -> None:
+        """Take the vehicle away: its place is free at once. What it marked stays. May be repeated."""
+        session = self._session
+        with session.lock:
+            self.unfollow()
+            if self._body is not None and session.ended is None:
+                gone = msgspec.structs.replace(
+                    self._body, seq=self._seq + 1, stamp_ns=session.now_ns(), lease_s=0.0
+                )
+                session.bus.publish(BODY, gone, id=self.id)
+            self._body = None
+            session.bus.unsubscribe(BODY, id=self.id)
+            if self._marks.any:
+                session.bus.unserve(MARKS, author=self._marks.author)
+                session.bus.unsubscribe(MARKS, author=self._marks.author)
+            session.remove(self)
+
+
+def _check_target(session: Session, target: str) -> None:
+    try:
+        check_id("target", target)
+    except ValueError as error:
+        raise session.refused(str(error)) from error
+
+
+def _is_rest(new: Route, old: Route) -> bool:
+    """Whether a route says no more than the rest of the one before, of which the vehicle has driven a part."""
+    if (new.status, new.arrived, new.tracker_lost) != (old.status, old.arrived, old.tracker_lost):
+        return False
+    if not new.ok or new.cells == old.cells:
+        return True
+    if new.cells[0] not in old.cells:
+        return False
+    rest = old.cells[old.cells.index(new.cells[0]) :]
+    return rest == new.cells and (new.remaining_s == 0) == (old.remaining_s == 0)

@@ -1,0 +1,141 @@
+"""The kinds of plug-ins, and the names under which a scenario may call one.
+
+A name is one of the kind's own table, the name of an entry point that an installed package offers in the kind's
+group, or `module:Name`. Only a scenario names a plug-in: it is the user's own file, and what it names is run.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from swarm.config.explain import nearest
+from swarm.config.input_files import shown
+from swarm.config.scenario import Assigner, Dynamics, Scenario, Sensor, Strategy, TargetConfig, Walk
+from swarm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+
+@dataclass(frozen=True, slots=True)
+class PluginKind:
+    """What a kind of plug-in is called, and what becomes of a process whose plug-in fails.
+
+    name      as in the group of its entry points
+    role      the role that calls it; every role builds the map, if it is not prepared
+    built_in  names of the kind's own table
+    method    what a plug-in is asked for, as its `Protocol` names it
+    call_s    a call that takes longer hangs, and is broken off
+    failing   what the process does without it, as the end of a sentence
+    """
+
+    name: str
+    role: str
+    built_in: tuple[str, ...]
+    method: str
+    call_s: float
+    failing: str
+
+    @property
+    def group(self) -> str:
+        """Group of the entry points that offer such plug-ins."""
+        return f"terrain_swarm.{self.name}"
+
+
+_KINDS = (
+    PluginKind(
+        "sensor",
+        "agent",
+        typing.get_args(Sensor),
+        "look",
+        2.0,
+        "this agent's vehicles see only the cells next to them now",
+    ),
+    PluginKind("walk", "targets", typing.get_args(Walk), "choose", 2.0, "the target stands still now"),
+    PluginKind("cost_layer", "any", (), "cost", 300.0, "there is no map without it"),
+    PluginKind(
+        "assignment",
+        "agent",
+        typing.get_args(Assigner),
+        "assign",
+        2.0,
+        "this agent spreads its vehicles evenly now",
+    ),
+    PluginKind("strategy", "planner", typing.get_args(Strategy), "row", 2.0, "this planner grows whole trees now"),
+    PluginKind(
+        "dynamics",
+        "agent",
+        typing.get_args(Dynamics),
+        "speed",
+        2.0,
+        "this agent's vehicles drive as the ground allows now",
+    ),
+)
+PLUGIN_KINDS: Mapping[str, PluginKind] = {kind.name: kind for kind in _KINDS}
+"""Every kind of plug-in, by its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedPlugin:
+    """One place of a scenario that names a plug-in: the key, what it names, and the options that it gives."""
+
+    kind: PluginKind
+    key: str
+    name: str
+    options: Mapping[str, object]
+
+
+def plugins_of(scenario: Scenario) -> list[NamedPlugin]:
+    """Every place of a scenario that may name a plug-in, those that name a built-in one included."""
+    vehicles, planner = scenario.vehicles, scenario.planner
+    sensor, assignment = PLUGIN_KINDS["sensor"], PLUGIN_KINDS["assignment"]
+    dynamics, strategy = PLUGIN_KINDS["dynamics"], PLUGIN_KINDS["strategy"]
+    return [
+        NamedPlugin(sensor, "vehicles.sensor", vehicles.sensor, vehicles.sensor_options),
+        NamedPlugin(assignment, "vehicles.assignment", vehicles.assignment, vehicles.assignment_options),
+        NamedPlugin(dynamics, "vehicles.dynamics", vehicles.dynamics, vehicles.dynamics_options),
+        NamedPlugin(strategy, "planner.strategy", planner.strategy, planner.strategy_options),
+        *(walk_named_by(target, f"targets[{n}].walk") for n, target in enumerate(scenario.targets)),
+        *cost_layers_of(scenario),
+    ]
+
+
+def walk_named_by(target: TargetConfig, key: str) -> NamedPlugin:
+    """The walk of a target, which stands under `key`."""
+    return NamedPlugin(PLUGIN_KINDS["walk"], key, target.walk, target.walk_options)
+
+
+def cost_layers_of(scenario: Scenario) -> list[NamedPlugin]:
+    """The plug-ins that have a part in the map, in the order in which they are applied."""
+    kind = PLUGIN_KINDS["cost_layer"]
+    return [
+        NamedPlugin(kind, f"cost.layers[{n}].layer", each.layer, each.options)
+        for n, each in enumerate(scenario.cost.layers)
+    ]
+
+
+def installed(kind: PluginKind) -> dict[str, list[EntryPoint]]:
+    """The plug-ins that installed packages offer, by name: more than one where two packages use the same."""
+    # Imported here: it takes a while, and few scenarios name what is not built in.
+    from importlib.metadata import entry_points
+
+    found: dict[str, list[EntryPoint]] = {}
+    for point in entry_points(group=kind.group):
+        found.setdefault(point.name, []).append(point)
+    return found
+
+
+def check_name(plugin: NamedPlugin, source: str) -> None:
+    """Raise ConfigError where a name is neither built in, nor installed, nor `module:Name`. Imports nothing."""
+    kind, name = plugin.kind, plugin.name
+    if name in kind.built_in or ":" in name:
+        return
+    known = installed(kind)
+    if name in known:
+        return
+    allowed = [*kind.built_in, *known]
+    choices = ", ".join([*map(repr, allowed), "or a plug-in as 'module:Name'"])
+    raise ConfigError(f"{source}: {plugin.key}: found {shown(name)}{nearest(name, allowed)}; allowed: {choices}")

@@ -1,0 +1,146 @@
+"""An operator's orders to a running swarm: each returns when those concerned have answered, and names who has not.
+
+A keeper takes an order in, puts it on its disk and tells everybody; then every process that the order concerns is
+asked to answer as soon as it obeys.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from swarm.bus.bus import AskEnded, Bus, Replied
+from swarm.errors import BusError, ConfigError
+from swarm.ranks import job_of
+from swarm.runtime.inbox import Inbox
+from swarm.wire.messages.base import Message, Nothing
+from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, ZoneOrder, Zones
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, ZONES, Topic
+
+_OBEY_ZONES = frozenset({"agent", "planner"})
+_OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
+_FIND_S = 1.0
+_ORDER_S = 5.0
+_OBEY_S = 3.0
+
+
+@dataclass(frozen=True)
+class Acknowledged:
+    """What became of an order.
+
+    obeyed  processes that obey, as role-id, and how many seconds after the order each said so
+    silent  those which it concerns and that have not said so in time: they will obey once they hear a keeper
+    """
+
+    obeyed: dict[str, float] = field(default_factory=dict)
+    silent: list[str] = field(default_factory=list)
+
+
+class Operator:
+    """Gives orders over a bus. Every method waits for answers; none may be called on the bus's own threads.
+
+    patience_s  how long to wait for processes to obey
+    """
+
+    def __init__(self, bus: Bus, patience_s: float = _OBEY_S) -> None:
+        self._bus = bus
+        self._patience_s = patience_s
+
+    def zones(self) -> Zones:
+        """The zones that stand. Raises BusError without a keeper."""
+        return self._order_zone(ZoneOrder(action="list"), self._keeper())
+
+    def zone(self, order: ZoneOrder) -> tuple[Zones, Acknowledged]:
+        """Add or remove a zone, and wait until it is in the maps of all agents and the trees of all planners.
+
+        Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
+        """
+        members = self._members()
+        keeper, began_s = self._keeper(members), time.monotonic()
+        zones = self._order_zone(order, keeper)
+        author = f"operator.{zones.changed}"
+        return zones, self._obeyed(Obey(author=author, sets=zones.sets), members, began_s)
+
+    def orders(self) -> Orders:
+        """What is ordered. Raises BusError without a keeper."""
+        reply = self._order(GIVE_ORDER, GiveOrder(), self._keeper())
+        assert isinstance(reply, Orders)
+        return reply
+
+    def give(self, order: GiveOrder) -> tuple[Order, Acknowledged]:
+        """Pause, stop, say whom to chase, add targets, change settings, or take that back; wait until all obey.
+
+        Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
+        """
+        members = self._members()
+        keeper, began_s = self._keeper(members), time.monotonic()
+        reply = self._order(GIVE_ORDER, order, keeper)
+        assert isinstance(reply, Orders)
+        given = reply.given
+        assert given is not None
+        obey = Obey(subject=given.subject, name=given.name, stamp_ns=given.stamp_ns)
+        if given.subject == "target" and given.off:  # its planner ends, and may not answer any more
+            members = [each for each in members if (each.role, job_of(each.id)) != ("planner", given.name)]
+        return given, self._obeyed(obey, members, began_s)
+
+    # --- asking ---------------------------------------------------------------------------------------------
+
+    def _members(self) -> list[RunInfo]:
+        found = self._ask(RUN, Nothing(), _FIND_S)[0]
+        return [each for each in found if isinstance(each, RunInfo) and each.run_id]
+
+    def _keeper(self, members: list[RunInfo] | None = None) -> str:
+        if members is None:
+            found = self._ask(RUN, Nothing(), _FIND_S, role="keeper")[0]
+            members = [each for each in found if isinstance(each, RunInfo)]
+        keepers = sorted(each.id for each in members if each.role == "keeper")
+        if not keepers:
+            raise BusError(f"no keeper answers in namespace {self._bus.namespace!r}, and orders need one")
+        return keepers[0]
+
+    def _order_zone(self, order: ZoneOrder, keeper: str) -> Zones:
+        reply = self._order(ZONES, order, keeper)
+        assert isinstance(reply, Zones)
+        return reply
+
+    def _order(self, topic: Topic, order: Message, keeper: str) -> Message:
+        replies, failure = self._ask(topic, order, _ORDER_S, keeper=keeper)
+        if replies:
+            return replies[0]
+        if failure is not None and failure != "timeout":
+            raise ConfigError(failure)
+        raise BusError(f"keeper {keeper} does not answer: it is not known whether the order counts; give it again")
+
+    def _obeyed(self, order: Obey, members: list[RunInfo], began_s: float) -> Acknowledged:
+        roles = _OBEY_ZONES if order.subject is None else _OBEY_ORDERS
+        concerned = {f"{each.role}-{each.id}" for each in members if each.role in roles}
+        inbox = Inbox()
+        deadline_s = time.monotonic() + self._patience_s + 1.0
+        obeyed: dict[str, float] = {}
+        self._bus.ask(OBEYED, order, inbox.post, tag="obey", timeout_s=self._patience_s)
+        while time.monotonic() < deadline_s:
+            match inbox.take(0.5):
+                case Replied(message=Obeyed() as who):
+                    obeyed.setdefault(f"{who.role}-{who.id}", time.monotonic() - began_s)
+                case AskEnded():
+                    break
+            if concerned <= obeyed.keys():
+                break
+        return Acknowledged(obeyed, sorted(concerned - obeyed.keys()))
+
+    def _ask(
+        self, topic: Topic, request: Message, timeout_s: float, **fields: str | int
+    ) -> tuple[list[Message], str | None]:
+        """(replies, why there are no more); ends with the last answer."""
+        inbox = Inbox()
+        found: list[Message] = []
+        self._bus.ask(topic, request, inbox.post, tag="order", timeout_s=timeout_s, **fields)
+        deadline_s = time.monotonic() + timeout_s + 1.0
+        while time.monotonic() < deadline_s:
+            match inbox.take(0.1):
+                case Replied(message=message):
+                    found.append(message)
+                case AskEnded(failure=failure):
+                    return found, failure
+        return found, "timeout"

@@ -1,0 +1,180 @@
+"""From a name in the scenario to the code that it names, with its options checked.
+
+A plug-in is called with its world and its options, and returns what has the method of its kind's `Protocol`: mostly
+it is a class. What has that method already is taken as it is. If the plug-in has an attribute `Options`, a msgspec
+Struct or a dataclass, the table of the scenario becomes one of these, and a key, type or value that does not fit is
+refused; else it gets the table as it stands.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from swarm.config.explain import explain, nearest
+from swarm.config.input_files import shown
+from swarm.config.plugin_names import NamedPlugin, check_name, installed, plugins_of
+from swarm.config.scenario import Scenario
+from swarm.errors import ConfigError
+from swarm.plugins.deadline import Hangs, call_within
+
+Factory = Callable[[Any, Any], Any]
+"""(world, options) -> what does the work."""
+START_S = 60.0
+"""Importing a plug-in and making one takes longer if it hangs."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Plugin:
+    """A plug-in that was found, and its options.
+
+    factory  None if the name is one of the kind's own table, which its owner keeps
+    """
+
+    named: NamedPlugin
+    factory: Factory | None
+    options: Any
+
+    def __str__(self) -> str:
+        return f"{self.named.kind.name} plug-in {self.named.name!r}"
+
+    def make(self, world: object) -> Any:
+        """What does the work, for a plug-in from outside. Raises ConfigError if that raises, hangs or lacks the
+        method of its kind."""
+        assert self.factory is not None
+        factory = self.factory
+        made = _started(self.named, "could not be made", lambda: factory(world, self.options))
+        if not callable(getattr(made, self.named.kind.method, None)):
+            found = type(made).__name__
+            raise ConfigError(f"{self.named.key}: {self} has no method {self.named.kind.method}, found {found}")
+        return made
+
+
+def find_plugin(named: NamedPlugin, folder: str) -> Plugin:
+    """Import what a scenario names, and check its options. Raises ConfigError with the key, what was found and what
+    is expected.
+
+    folder  where modules lie that are not installed
+    """
+    kind, name = named.kind, named.name
+    if name in kind.built_in:
+        if named.options:
+            raise ConfigError(f"{named.key}: {name!r} takes no options, found {shown(dict(named.options))}")
+        return Plugin(named, None, None)
+    found = _imported(named, folder)
+    return Plugin(named, found, _options(named, getattr(found, "Options", None)))
+
+
+def check_plugins(scenario: Scenario, roles: Collection[str]) -> None:
+    """Find every plug-in that these roles call, so that a fault is said once, before processes start."""
+    for named in plugins_of(scenario):
+        if named.kind.role in roles:
+            find_plugin(named, scenario.plugin_folder)
+
+
+def source_of(named: NamedPlugin, folder: str) -> bytes:
+    """The text of the module that a name stands for, without running it; empty where there is none to be found."""
+    name = named.name
+    if ":" not in name:
+        points = installed(named.kind).get(name)
+        name = points[0].value if points else name
+    try:
+        _reach(folder)
+        spec = importlib.util.find_spec(name.partition(":")[0])
+        return Path(spec.origin).read_bytes() if spec is not None and spec.origin is not None else b""
+    except (ImportError, ValueError, AttributeError, OSError):
+        return b""
+
+
+def _reach(folder: str) -> None:
+    """Let modules of this folder be imported."""
+    if folder not in sys.path:
+        sys.path.append(folder)  # last: it hides nothing that is installed
+        importlib.invalidate_caches()
+
+
+def _imported(named: NamedPlugin, folder: str) -> Factory:
+    kind, name = named.kind, named.name
+    check_name(named, "scenario")
+    found: object
+    if ":" in name:
+        module, _, attribute = name.partition(":")
+        _reach(folder)
+        found = _started(named, "could not be imported", lambda: importlib.import_module(module))
+        for part in attribute.split("."):
+            if not hasattr(found, part):
+                known = [each for each in vars(found) if not each.startswith("_")]
+                where = getattr(found, "__file__", None) or module
+                raise ConfigError(f"{named.key}: {name!r}: no {part!r} in {where}{nearest(part, known)}")
+            found = getattr(found, part)
+    else:
+        points = installed(kind)[name]
+        if len(points) > 1:
+            packages = ", ".join(sorted(point.dist.name if point.dist else "?" for point in points))
+            raise ConfigError(
+                f"{named.key}: {name!r} is offered by several packages, {packages}; use 'module:Name'"
+            )
+        found = _started(named, "could not be imported", points[0].load)
+    if not isinstance(found, type) and callable(getattr(found, kind.method, None)):
+        return lambda world, options: found  # it is made already
+    if not callable(found):
+        raise ConfigError(f"{named.key}: {name!r} is {shown(found)}; expected a class or a function")
+    return found
+
+
+def _options(named: NamedPlugin, wanted: Any) -> Any:
+    if wanted is None:
+        return dict(named.options)
+    key = f"{named.key.rpartition('.')[0]}.options" if named.kind.name == "cost_layer" else f"{named.key}_options"
+    is_struct = isinstance(wanted, type) and issubclass(wanted, msgspec.Struct)
+    if not is_struct and not (isinstance(wanted, type) and dataclasses.is_dataclass(wanted)):
+        raise ConfigError(f"{named.key}: Options of {named.name!r} is neither a Struct nor a dataclass")
+    try:
+        options = msgspec.convert(dict(named.options), wanted)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{key} of {named.name}: {explain(str(error), dict(named.options), wanted)}") from error
+    if dataclasses.is_dataclass(wanted):
+        allowed = [field.name for field in dataclasses.fields(wanted)]
+    else:
+        allowed = [field.encode_name for field in msgspec.structs.fields(wanted)]
+    for unknown in named.options.keys() - set(allowed):  # a struct that does not forbid them
+        hint = nearest(unknown, allowed)
+        raise ConfigError(f"{key} of {named.name}: unknown key {unknown}{hint}; allowed here: {', '.join(allowed)}")
+    return options
+
+
+def _started(named: NamedPlugin, what: str, call: Callable[[], Any]) -> Any:
+    """What a call returns that imports or makes a plug-in. Raises ConfigError where it fails."""
+    try:
+        return call_within(START_S, call)
+    except ConfigError:
+        raise
+    except Hangs:
+        raise ConfigError(f"{named.key}: {named.name!r} {what} within {START_S:g} s") from None
+    except (Exception, SystemExit) as error:
+        raise ConfigError(f"{named.key}: {named.name!r} {what}: {told(error)}") from error
+
+
+def told(error: BaseException) -> str:
+    """An error of a plug-in in words, with the line that raised it."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    where = ""
+    if trace is not None:
+        where = f" ({Path(trace.tb_frame.f_code.co_filename).name}:{trace.tb_lineno})"
+    said = " ".join(str(error).split())
+    return f"{type(error).__name__}{f': {said}' if said else ''}"[:200] + where
+
+
+def named_plugin(scenario: Scenario, key: str) -> Plugin:
+    """The plug-in that a key of a scenario names, such as ``vehicles.sensor``."""
+    named = next(each for each in plugins_of(scenario) if each.key == key)
+    return find_plugin(named, scenario.plugin_folder)

@@ -1,0 +1,216 @@
+"""Which tracker owns a target. Pure: time is an argument.
+
+Every receiver of poses decides by this rule alone, from the poses that it has heard:
+
+1. A tracker lives from the arrival of a pose until the lease in it has passed. A pose with a lease of 0 hands the
+   target over: its tracker lives no longer.
+2. Of the lives of one tracker, which have one name, the latest incarnation that lives speaks for it.
+3. Of the trackers that live, the one which has tracked the target for the longest time owns it. Trackers which
+   began within `SAME_NS` of each other are ordered by name.
+
+The owner's poses count; those of others are refused. Leases are counted from the arrival, by the receiver's
+clock, and how long a tracker has tracked is the difference of two times of its own clock: no clock is compared with
+another.
+
+The rule looks at those only who live. So receivers which have heard different things, or the same in another
+order, agree again as soon as each has heard a pose of every tracker that lives: seniority as in the oldest member
+of a process group (Birman, Joseph 1987), not the first that each happened to hear. What it costs: a tracker that
+was silent for longer than its lease gets its target back when it returns with the same incarnation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+from enum import Enum
+
+import msgspec
+
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.liveness import POSE_SILENCE_NS
+from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
+
+SAME_NS = 3 * NS_PER_S // 4
+"""Receivers measure when a tracker began as exactly as they look, which is at their ticks."""
+LONGEST_AGE_NS = 366 * 86_400 * NS_PER_S
+"""A tracker that has tracked for longer has no clock, or gives no time as its incarnation: others come first."""
+MOST_LIVES = 16
+"""Of trackers of one target, remembered. Of more that live the youngest are refused."""
+_MOST_TARGETS = 4096
+
+
+class Verdict(Enum):
+    """What a receiver makes of a pose."""
+
+    COUNTS = "counts"
+    """It is the owner's, and news."""
+    LATE = "late"
+    """Its tracker has told a newer one before."""
+    REFUSED = "refused"
+    """Another tracker owns the target."""
+    OUTSIDE = "outside"
+    """Its cell is not on the map. The lease of its tracker is not renewed by it."""
+
+
+@dataclass(slots=True, eq=False)
+class _Life:
+    """One incarnation of a tracker, as of its newest pose.
+
+    began_ns  when it began to track, by the receiver's clock; None if it does not tell
+    """
+
+    name: str | None
+    incarnation: int
+    seq: int
+    heard_ns: int
+    until_ns: int
+    began_ns: int | None
+
+    @property
+    def order(self) -> tuple[bool, str, int]:
+        """The nameless come last."""
+        return self.name is None, self.name or "", self.incarnation
+
+
+class Tracking:
+    """What one receiver knows about the trackers of one target."""
+
+    def __init__(self, grid: GridSpec) -> None:
+        self.pose: TargetPose | None = None
+        """The newest that counts, with its cell: where the target was last."""
+        self.heard_ns = 0
+        """When that arrived."""
+        self._grid = grid
+        self._until_ns = 0
+        """When the last lease ends."""
+        self._lives: dict[tuple[str | None, int], _Life] = {}
+        """Also those which have ended, so that what comes late is known."""
+
+    def lost(self, now_ns: int) -> bool:
+        """Whether no tracker lives: the target was where `pose` says, and may be anywhere."""
+        return self.pose is not None and now_ns >= self._until_ns
+
+    def age_ns(self, now_ns: int) -> int | None:
+        """Time since the newest pose that counts arrived; None before the first."""
+        return None if self.pose is None else max(now_ns - self.heard_ns, 0)
+
+    def hear(self, pose: TargetPose, now_ns: int) -> Verdict:
+        """Take in a pose of this target. Only if it counts has `pose` changed."""
+        if pose.cell == CELL_OF_PLACE:
+            pose = msgspec.structs.replace(pose, cell=self._grid.cell_at(pose.x_m, pose.y_m))
+        if not 0 <= pose.cell < self._grid.cells:
+            return Verdict.OUTSIDE
+        key = (pose.tracker, pose.incarnation)
+        life = self._lives.get(key)
+        if life is not None and _is_late(pose.seq, life, now_ns):
+            return Verdict.LATE
+        began_ns = _began_ns(pose, now_ns)
+        if life is not None and life.began_ns is not None and began_ns is not None and now_ns < life.until_ns:
+            began_ns = min(began_ns, life.began_ns)  # the one that came quickest tells best
+        hands_over = pose.lease_s == 0
+        until_ns = now_ns + (1 if hands_over else int(pose.lease_s * NS_PER_S))
+        self._lives[key] = _Life(pose.tracker, pose.incarnation, pose.seq, now_ns, until_ns, began_ns)
+        if len(self._lives) > MOST_LIVES:
+            self._forget_one(now_ns)
+        owner = self._owner(now_ns)
+        counts = owner is not None and owner is self._lives.get(key)
+        if hands_over and key in self._lives:
+            self._lives[key].until_ns = now_ns
+        self._until_ns = max(life.until_ns for life in self._lives.values())
+        if not counts:
+            return Verdict.REFUSED
+        self.pose, self.heard_ns = pose, now_ns
+        return Verdict.COUNTS
+
+    def place(self, pose: TargetPose, now_ns: int) -> None:
+        """Take a pose for where a target without a tracker is, for as long as its lease says. The same once more
+        changes nothing."""
+        if pose != self.pose and 0 <= pose.cell < self._grid.cells:
+            self.pose, self.heard_ns = pose, now_ns
+            self._until_ns = now_ns + int(pose.lease_s * NS_PER_S)
+
+    def _owner(self, now_ns: int) -> _Life | None:
+        return _oldest([life for life in self._lives.values() if now_ns < life.until_ns])
+
+    def _forget_one(self, now_ns: int) -> None:
+        """The one that ended first, else the youngest."""
+        ended = [(life.until_ns, key) for key, life in self._lives.items() if now_ns >= life.until_ns]
+        if ended:
+            del self._lives[min(ended, key=lambda each: each[0])[1]]
+            return
+        youngest = max(self._lives, key=lambda key: _age_order(self._lives[key]))
+        del self._lives[youngest]
+
+
+class Trackings:
+    """The trackers of many targets. Of targets beyond 4096 nothing is known, and all is refused."""
+
+    def __init__(self, grid: GridSpec) -> None:
+        self._grid = grid
+        self._of: dict[str, Tracking] = {}
+
+    def hear(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
+        """Take in a pose of any target; returns it, with its cell, if it counts."""
+        tracking = self._of.get(pose.target)
+        if tracking is None:
+            if len(self._of) >= _MOST_TARGETS:
+                return None
+            tracking = Tracking(self._grid)
+        verdict = tracking.hear(pose, now_ns)
+        if tracking.pose is not None:
+            self._of[pose.target] = tracking
+        return tracking.pose if verdict is Verdict.COUNTS else None
+
+    def place(self, pose: TargetPose, now_ns: int) -> None:
+        """As `Tracking.place`, of any target."""
+        if pose.target not in self._of and len(self._of) < _MOST_TARGETS and 0 <= pose.cell < self._grid.cells:
+            self._of[pose.target] = Tracking(self._grid)
+        if (tracking := self._of.get(pose.target)) is not None:
+            tracking.place(pose, now_ns)
+
+    def of(self, target: str) -> Tracking | None:
+        """What is known of a target's trackers; None before its first pose."""
+        return self._of.get(target)
+
+    def lost(self, now_ns: int) -> set[str]:
+        """The targets whose trackers are lost."""
+        return {id for id, tracking in self._of.items() if tracking.lost(now_ns)}
+
+
+def _is_late(seq: int, life: _Life, now_ns: int) -> bool:
+    """As `swarm.liveness.Newest`: after a silence any other number is news, so that no pose outweighs all that
+    follow it."""
+    return seq == life.seq or (seq < life.seq and now_ns - life.heard_ns < POSE_SILENCE_NS)
+
+
+def _began_ns(pose: TargetPose, now_ns: int) -> int | None:
+    age_ns = pose.stamp_ns - pose.incarnation
+    return now_ns - age_ns if 0 <= age_ns <= LONGEST_AGE_NS else None
+
+
+def _oldest(living: list[_Life]) -> _Life | None:
+    """The owner among those who live."""
+    speakers: dict[Hashable, _Life] = {}
+    for life in living:
+        name = life.incarnation if life.name is None else life.name
+        known = speakers.get(name)
+        if known is None or life.incarnation > known.incarnation:
+            speakers[name] = life
+    if len(speakers) < 2:
+        return next(iter(speakers.values()), None)
+    told = [life.began_ns for life in speakers.values() if life.began_ns is not None]
+    first_ns = min(told, default=None)
+    elders = [life for life in speakers.values() if _is_elder(life, first_ns)]
+    return min(elders, key=lambda life: life.order)
+
+
+def _is_elder(life: _Life, first_ns: int | None) -> bool:
+    """Whether nobody began clearly before it."""
+    if first_ns is None:
+        return True  # of none is it known when it began
+    return life.began_ns is not None and life.began_ns - first_ns < SAME_NS
+
+
+def _age_order(life: _Life) -> tuple[bool, int, tuple[bool, str, int]]:
+    return life.began_ns is None, life.began_ns or 0, life.order

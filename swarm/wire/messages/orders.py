@@ -1,0 +1,208 @@
+"""Messages of operators: orders to keepers, what is ordered, and who obeys."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from swarm.wire.fields import (
+    IDS,
+    Bounded,
+    Cell,
+    CellIndex,
+    Count,
+    Gauge,
+    Id,
+    Incarnation,
+    Metres,
+    StampNs,
+    Word,
+    check_id,
+)
+from swarm.wire.messages.base import Message, schema_of
+from swarm.wire.messages.marks import DigestRows
+from swarm.wire.statements import PACE_LEAST, PACE_MOST
+
+MOST_CORNERS = 256
+"""Of a zone's polygon."""
+MOST_ZONES = 1000
+ZoneName = Annotated[str, Meta(max_length=40)]
+"""Empty where none is given."""
+_ZONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
+Corners = Annotated[list[tuple[Metres, Metres]], Meta(max_length=MOST_CORNERS)]
+_Pace = Annotated[float, Meta(ge=PACE_LEAST, le=PACE_MOST)]
+_Seconds = Annotated[float, Meta(gt=0, le=1e9)]
+
+
+class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order")):
+    """Asks a keeper to close an area, to open it again, or which zones there are.
+
+    name          of the zone; one that exists is replaced. Without a name the keeper finds one
+    kind          lethal: no vehicle enters; pace: it is driven at `pace_s_per_m`, whatever is found there
+    polygon       corners [row, col]; (0, 0) is the north-west corner of the terrain, (1, 1) of the cell one further
+    polygon_m     corners [x_m, y_m] instead, as poses have them
+    lasts_s       after so long the zone ends by itself; without it never
+    """
+
+    action: Literal["add", "remove", "list"] = "list"
+    name: ZoneName = ""
+    kind: Literal["lethal", "pace"] = "lethal"
+    pace_s_per_m: _Pace | None = None
+    polygon: Corners = []
+    polygon_m: Corners = []
+    lasts_s: _Seconds | None = None
+
+    def relate(self) -> None:
+        if self.name and _ZONE_NAME.fullmatch(self.name) is None:
+            raise ValueError(f"name {self.name!r} is not 1 to 40 of letters, digits, '_', '-'")
+        if self.action == "remove" and not self.name:
+            raise ValueError("name is missing: which zone is to be removed?")
+        if self.action != "add":
+            return
+        if bool(self.polygon) == bool(self.polygon_m):
+            raise ValueError("give either polygon or polygon_m")
+        corners = len(self.polygon or self.polygon_m)
+        if corners < 3:
+            raise ValueError(f"polygon has {corners} corners, expected 3 ... {MOST_CORNERS}")
+        if (self.kind == "pace") != (self.pace_s_per_m is not None):
+            raise ValueError("pace_s_per_m goes with kind pace, and only with it")
+
+
+class Zone(Bounded, frozen=True, kw_only=True):
+    """A zone that stands.
+
+    pace_s_per_m  None of a lethal zone
+    cells         how many cells it covers
+    window        [row0, col0, row1, col1] around them
+    until_ns      when it ends by itself, by the keeper's clock; None if it does not
+    """
+
+    name: Id
+    kind: Literal["lethal", "pace"]
+    pace_s_per_m: _Pace | None
+    cells: Count
+    window: Annotated[list[CellIndex], Meta(min_length=4, max_length=4)]
+    until_ns: StampNs | None
+
+
+class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):
+    """The zones that stand, and on the disk of this keeper.
+
+    changed  the name of the zone that was added or removed, and `sets` its sets of marks, as rows of a digest: who
+             holds these obeys
+    """
+
+    keeper: Id
+    zones: Annotated[list[Zone], Meta(max_length=MOST_ZONES)]
+    changed: ZoneName = ""
+    sets: DigestRows = b""
+
+
+Subject = Literal["pause", "vehicle", "group", "target", "set"]
+SimulatedWalk = Literal["still", "random", "waypoints", "evade"]
+_Name = Annotated[str, Meta(max_length=64)]
+"""Empty of a pause, else an id or the key of a setting."""
+_Speed = Annotated[float, Meta(ge=0, le=1e4)]
+_Targets = Annotated[list[Id], IDS]
+_WALK: SimulatedWalk = "waypoints"
+_SPEED_M_PER_S = 4.0
+
+
+class Order(Bounded, frozen=True, kw_only=True):
+    """What was ordered last about one subject.
+
+    name      of the vehicle, group, target or setting
+    stamp_ns  of two orders about one subject the later counts
+    off       taken back: a pause ended, a vehicle goes, a group chases what the scenario says, a target is removed,
+              a setting is the scenario's
+    targets   whom a group chases; all if empty
+    value     of a setting
+    cell      where a target was put
+    added     the target walks as this says, not as the scenario does
+    """
+
+    subject: Subject
+    name: _Name
+    stamp_ns: StampNs
+    off: bool = False
+    targets: _Targets = []
+    value: Gauge | None = None
+    cell: CellIndex | None = None
+    walk: SimulatedWalk = _WALK
+    speed_m_per_s: _Speed = _SPEED_M_PER_S
+    added: bool = False
+
+    def relate(self) -> None:
+        if self.name:
+            check_id("name", self.name)
+
+
+class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order")):
+    """Asks a keeper to enter an order into its book. Fields as in `Order`.
+
+    subject   None only asks what is ordered
+    row, col  instead of a cell
+    new       the target must not be there yet; otherwise it must
+    """
+
+    subject: Subject | None = None
+    name: _Name = ""
+    off: bool = False
+    targets: _Targets = []
+    value: Gauge | None = None
+    cell: CellIndex | None = None
+    row: Cell | None = None
+    col: Cell | None = None
+    walk: SimulatedWalk = _WALK
+    speed_m_per_s: _Speed = _SPEED_M_PER_S
+    new: bool = False
+
+    def relate(self) -> None:
+        if self.name:
+            check_id("name", self.name)
+        elif self.subject not in (None, "pause"):
+            raise ValueError(f"name is missing: which {self.subject} is it about?")
+        if (self.row is None) != (self.col is None) or (self.row is not None and self.cell is not None):
+            raise ValueError("give either cell, or row and col")
+        if self.subject == "target" and not self.off and self.cell is None and self.row is None:
+            raise ValueError("give the target's place: cell, or row and col")
+
+
+class Orders(Message, frozen=True, kw_only=True, tag=schema_of("orders")):
+    """All orders that a process knows: of a keeper, those on its disk.
+
+    given  the order that this answers, if it answers one
+    """
+
+    role: Id
+    id: Id
+    orders: Annotated[list[Order], Meta(max_length=2000)]
+    given: Order | None = None
+
+
+class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
+    """Asks a process to answer as soon as it obeys: what it does and plans from then on goes by the order.
+
+    author, sets             a zone: its author, and its sets as rows of a digest
+    subject, name, stamp_ns  any other order
+    """
+
+    author: Word = ""
+    sets: DigestRows = b""
+    subject: Subject | None = None
+    name: _Name = ""
+    stamp_ns: StampNs = 0
+
+    def relate(self) -> None:
+        if self.author or self.sets:
+            check_id("author", self.author)
+
+
+class Obeyed(Message, frozen=True, kw_only=True, tag=schema_of("obeyed")):
+    """This process obeys."""
+
+    role: Id
+    id: Id
+    incarnation: Incarnation

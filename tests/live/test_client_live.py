@@ -1,0 +1,138 @@
+"""The scripts of the pages about vehicles and trackers of one's own, run as they stand there against real
+processes. Only the endpoint is another, and the rover ten times as quick, as time in this swarm is."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.live_swarm import LiveSwarm
+from support.processes import eventually
+
+from swarm.client import BusError, ConfigError, Route, Swarm, connect
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs" / "tutorial"
+EXTERNAL = '\n[[targets]]\nname = "fox"\nwalk = "external"\n'
+RUST = os.environ.get("RUST_VEHICLE", "")
+
+
+def script(page: str, language: str = "python") -> str:
+    """The one script of a page."""
+    (found,) = re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+    return str(found)
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
+    live = LiveSwarm(tmp_path_factory.mktemp("client"), also=EXTERNAL)
+    try:
+        live.wait_until_up()
+        yield live
+    finally:
+        live.kill()
+
+
+@pytest.fixture
+def swarm(live: LiveSwarm) -> Iterator[Swarm]:
+    with connect(live.endpoint) as swarm:
+        yield swarm
+
+
+class Run:
+    """A script under way."""
+
+    def __init__(self, text: str, endpoint: str) -> None:
+        text = text.replace("tcp/127.0.0.1:7447", endpoint)
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+
+    def end(self, within_s: float) -> str:
+        try:
+            return self.process.communicate(timeout=within_s)[0]
+        finally:
+            self.process.kill()
+
+
+@pytest.mark.parametrize("page", ["vehicle.md", "tracker.md"])
+def test_a_complete_program_has_twenty_lines_at_most(page: str) -> None:
+    assert len([line for line in script(page).splitlines() if line.strip()]) <= 20
+
+
+def test_the_rover_of_the_page_joins_drives_to_its_target_marks_and_leaves(live: LiveSwarm, swarm: Swarm) -> None:
+    with swarm.observer() as watching:
+        quick = script("vehicle.md").replace("distance_m=5.0", "distance_m=50.0").replace("=50.0)", "=500.0)", 1)
+        run = Run(quick, live.endpoint)
+        eventually(lambda: "rover" in watching.vehicles, 20, "the rover's first word")
+        first = watching.vehicles["rover"]
+        assert run.end(within_s=60) == ""
+        assert run.process.returncode == 0
+        eventually(lambda: "rover" not in watching.vehicles, 3, "the rover's leaving")
+        eventually(lambda: watching.marks, 3, "its marks")
+        assert (first.state, first.group) == ("outside", "all")
+        assert any(mark.pace_s_per_m == 0.5 for mark in watching.marks.values())
+
+
+def test_the_tracker_of_the_page_moves_its_target_and_the_planner_follows(live: LiveSwarm, swarm: Swarm) -> None:
+    with swarm.observer() as watching, swarm.vehicle("asker") as asker:
+        asker.at(*swarm.frame.centre_m(swarm.frame.grid.cell(40, 60)))
+        assert asker.route("fox").status == "no_target"
+        run = Run(script("tracker.md"), live.endpoint)
+        eventually(lambda: asker.route("fox").ok, 20, "a route to the fox")
+        place = watching.targets["fox"]
+        eventually(lambda: watching.targets["fox"].x_m != place.x_m, 10, "its moving")
+        assert run.end(within_s=40) == ""
+
+
+def test_a_live_vehicle_hears_routes_by_callbacks_and_streams_and_what_is_wrong_in_sentences(swarm: Swarm) -> None:
+    told: list[Route] = []
+    with swarm.vehicle("caller", radius_m=3.0) as caller:
+        with pytest.raises(ConfigError, match="outside the terrain"):
+            caller.at(-1e6, 0.0)
+        caller.at(*swarm.frame.centre_m(swarm.frame.grid.cell(40, 60)))
+        caller.on_route(told.append)
+        routes = caller.follow("t1")
+        eventually(lambda: len(told) >= 3, 20, "routes to a target that moves")
+        assert routes.next(1.0) is told[0]
+        with pytest.raises(BusError, match="no route to 'nobody'"):
+            caller.route("nobody", timeout_s=0.5)
+        assert swarm.counts["refused"] == 1
+        ended = threading.Event()
+        reader = threading.Thread(target=lambda: ([None for _ in routes], ended.set()), daemon=True)
+        reader.start()
+    assert ended.wait(2.0), "leaving ends the stream"
+
+
+def test_nobody_in_the_namespace_and_no_router_are_bus_errors(live: LiveSwarm) -> None:
+    with pytest.raises(BusError, match="no process of a swarm answers in namespace 'nobody' at tcp/"):
+        connect(live.endpoint, namespace="nobody", timeout_s=1.0)
+    with pytest.raises(BusError, match=r"cannot reach a router at tcp/127\.0\.0\.1:1:"):
+        connect("tcp/127.0.0.1:1", timeout_s=1.0)
+    with pytest.raises(ConfigError, match="leaves this machine in the clear"):
+        connect("tcp/10.0.0.1:7447")
+
+
+def test_the_page_shows_the_rust_program_that_is_built() -> None:
+    assert script("vehicle.md", "rust") == (ROOT / "docs/examples/rust_vehicle/src/main.rs").read_text()
+
+
+@pytest.mark.skipif(
+    not RUST, reason="RUST_VEHICLE names no built docs/examples/rust_vehicle; a build takes minutes"
+)
+def test_a_vehicle_in_rust_asks_and_puts_json(live: LiveSwarm, swarm: Swarm) -> None:
+    with swarm.observer() as watching:
+        run = subprocess.Popen([RUST, live.endpoint], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        eventually(lambda: "rusty" in watching.vehicles, 20, "the vehicle in Rust")
+        assert watching.vehicles["rusty"].x_m == 1805.0
+        said, _ = run.communicate(timeout=30)
+        assert re.fullmatch(r"[0-9.]+ s to t0\n", said), said

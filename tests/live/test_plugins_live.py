@@ -1,0 +1,123 @@
+"""Plug-ins in real processes: refused at the start, or named and gone on without."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from support.live_swarm import swarm, write_scenario
+from support.plugin_pages import write_all_examples
+
+from launch_scripts.launcher.options import free_ports
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+FAILING = """
+import itertools, math, numpy as np
+from vehicle_agent.sensing.sensor import Sight
+class Plugin:
+    def __init__(self, world, options): self.world, self.calls = world, itertools.count()
+class Hangs(Plugin):
+    def look(self, cells):
+        while next(self.calls) >= 20: pass
+        return Sight(np.empty(0, int), np.empty(0))
+class Raises(Plugin):
+    def choose(self, cell, vehicles): raise OSError("no map of the way")
+class Unspeakable(Plugin):
+    def speed(self, stretch): return math.nan if next(self.calls) > 99 else 1e9
+class Silent(Plugin):
+    def assign(self, table): return None
+    def row(self, growths): return None
+"""
+
+
+def scenario(folder: Path, **changes: str) -> Path:
+    path = write_scenario(folder, changes.pop("also", ""))
+    text = path.read_text()
+    for old, new in (('walk = "waypoints"', changes.get("targets")), ("per_agent = 6", changes.get("vehicles"))):
+        assert old in text
+        text = text.replace(old, f"{old}\n{new}" if new and old.startswith("per") else new or old)
+    path.write_text(text)
+    (folder / "failing.py").write_text(FAILING)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "sentence"),
+    [
+        ({"vehicles": "sensor = 'failing:Hang'"}, 2, "vehicles.sensor: 'failing:Hang': no 'Hang' in "),
+        (
+            {"targets": "walk = 'failing:Hangs'"},
+            2,
+            "targets[0].walk: walk plug-in 'failing:Hangs' has no method choose",
+        ),
+        ({"also": "[[cost.layers]]\nlayer = 'failing:Silent'"}, 2, "has no method cost, found Silent"),
+        ({"also": "[planner]\nstrategy = 'exacter'"}, 2, "planner.strategy: found 'exacter'"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_in_one_sentence(
+    tmp_path: Path, changes: dict[str, str], code: int, sentence: str
+) -> None:
+    told = swarm("up", scenario(tmp_path, **changes), "--runs", tmp_path / "runs", "--plain", timeout_s=100)
+    assert told.returncode == code, told.stdout + told.stderr
+    assert sentence in told.stderr
+    assert told.stderr.count("\n") == 1
+    assert "Traceback" not in told.stdout + told.stderr
+
+
+def test_a_swarm_all_whose_plugins_fail_names_each_and_goes_on(tmp_path: Path) -> None:
+    path = scenario(
+        tmp_path,
+        targets="walk = 'failing:Raises'",
+        vehicles="sensor = 'failing:Hangs'\nassignment = 'failing:Silent'\ndynamics = 'failing:Unspeakable'",
+        also="[planner]\nstrategy = 'failing:Silent'\n",
+    )
+    told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 25, "--plain", timeout_s=110)
+    said = told.stdout + told.stderr
+    assert told.returncode == 0, said
+    for sentence in (
+        "sensor plug-in 'failing:Hangs' of vehicles.sensor: look took more than 2 s; this agent",
+        "walk plug-in 'failing:Raises' of targets[0].walk: choose raised OSError: no map of the way (failing.py:",
+        "dynamics plug-in 'failing:Unspeakable' of vehicles.dynamics: speed returned nan m/s",
+        "assignment plug-in 'failing:Silent' of vehicles.assignment: assign returned object (), expected",
+        "strategy plug-in 'failing:Silent' of planner.strategy: row returned NoneType, expected a StrategyRow",
+    ):
+        assert sentence in " ".join(said.split()), said
+    (report,) = (tmp_path / "runs").glob("*/report.json")
+    numbers = json.loads(report.read_text())
+    assert (numbers["vehicles_routed"], numbers["collisions"], numbers["lethal_entries"]) == (12, 0, 0)
+    assert numbers["restarts"] == 0
+
+
+ALL = """
+time_scale = 10
+[terrain]
+source = "synthetic"
+rows = 96
+cols = 128
+[terrain.hidden]
+rubble_fields = 5
+[[groups]]
+vehicles = 12
+[network]
+listen = ["tcp/127.0.0.1:{port}"]
+connect = ["tcp/127.0.0.1:{port}"]
+[monitor]
+grpc_port = 0
+web_port = 0
+"""
+
+
+def test_the_examples_of_all_pages_run_together(tmp_path: Path) -> None:
+    path = write_all_examples(tmp_path, ALL.format(port=free_ports(1)[0]))
+    assert sum(line.count(":") for line in path.read_text().splitlines() if '"tcp' not in line) == 6
+    told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 20, "--plain", timeout_s=110)
+    said = told.stdout + told.stderr
+    assert told.returncode == 0, said
+    assert "plug-in" not in said
+    (report,) = (tmp_path / "runs").glob("*/report.json")
+    numbers = json.loads(report.read_text())
+    assert (numbers["vehicles_routed"], numbers["collisions"], numbers["lethal_entries"]) == (12, 0, 0)
+    assert numbers["marks"] > 0
+    assert all("plugin_failed" not in log.read_text() for log in (tmp_path / "runs").glob("*/*.log"))

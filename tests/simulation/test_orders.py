@@ -1,0 +1,215 @@
+"""Orders: what a keeper has acknowledged is obeyed by every process that starts later, until it is taken back."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+
+from launch_scripts.simulation.faults import Crash, FaultPlan, random_plan
+from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trial import Trial, nodes_of
+from launch_scripts.simulation.worlds import SMALL, seeded
+from launch_scripts.world.service import TargetsService
+from shared_map.terrain.terrain import Terrain, build_terrain
+from swarm.wire.messages.orders import GiveOrder, ZoneOrder
+from swarm.wire.messages.vehicles import VehicleState
+from vehicle_agent.service import AgentService
+
+PAUSE, RESUME = GiveOrder(subject="pause"), GiveOrder(subject="pause", off=True)
+
+
+@pytest.fixture(scope="module")
+def terrain() -> Terrain:
+    return build_terrain(SMALL)
+
+
+def simulated(terrain: Terrain, faults: FaultPlan | None = None, seed: int = 1) -> Simulation:
+    return Simulation(seeded(seed), faults=faults, terrain=terrain)
+
+
+def agents(simulation: Simulation) -> list[AgentService]:
+    found = [node.service for node in simulation.nodes.values()]
+    return [service for service in found if isinstance(service, AgentService)]
+
+
+def vehicles(simulation: Simulation) -> dict[str, Any]:
+    return {id: vehicle for each in agents(simulation) for id, vehicle in each.agent.vehicles.items()}
+
+
+def cells(simulation: Simulation) -> dict[str, int]:
+    return {id: vehicle.cell for id, vehicle in vehicles(simulation).items()}
+
+
+def target_cells(simulation: Simulation) -> dict[str, int]:
+    (service,) = [n.service for n in simulation.nodes.values() if isinstance(n.service, TargetsService)]
+    return {id: target.walker.cell for id, target in service._world._targets.items()}
+
+
+def test_a_pause_stops_everything_and_a_resume_lets_it_go_on(terrain: Terrain) -> None:
+    simulation = simulated(terrain)
+    simulation.order(6.0, PAUSE)
+    simulation.order(12.0, RESUME)
+    simulation.run_until(9.0)  # a step over slow ground, once begun, takes two seconds
+    stood, targets = cells(simulation), target_cells(simulation)
+    simulation.run_until(11.9)
+    assert cells(simulation) == stood
+    assert target_cells(simulation) == targets
+    assert len(stood) == 10
+    simulation.run_until(18.0)
+    assert cells(simulation) != stood
+    assert target_cells(simulation) != targets
+    assert simulation.refused == []
+
+
+def test_a_stopped_vehicle_stands_and_the_others_drive_on(terrain: Terrain) -> None:
+    simulation = simulated(terrain)
+    laws = Laws(simulation)
+    simulation.order(4.0, GiveOrder(subject="vehicle", name="a0-01"))
+    simulation.run_until(7.0)
+    before = cells(simulation)
+    simulation.run_until(12.0)
+    assert cells(simulation)["a0-01"] == before["a0-01"]
+    assert sum(cells(simulation)[id] != cell for id, cell in before.items()) >= 5
+    simulation.order(12.0, GiveOrder(subject="vehicle", name="a0-01", off=True))
+    simulation.run_until(20.0)
+    assert cells(simulation)["a0-01"] != before["a0-01"]
+    assert laws.collisions == []
+
+
+def test_a_group_chases_what_it_is_told_and_then_again_all(terrain: Terrain) -> None:
+    simulation = simulated(terrain)
+    simulation.order(4.0, GiveOrder(subject="group", name="all", targets=["t1"]))
+    simulation.run_until(8.0)
+    assert {vehicle.target for vehicle in vehicles(simulation).values()} == {"t1"}
+    simulation.order(8.0, GiveOrder(subject="group", name="all", off=True))
+    simulation.run_until(16.0)
+    assert {vehicle.target for vehicle in vehicles(simulation).values()} == {"t0", "t1"}
+
+
+def test_an_added_target_is_chased_and_a_removed_one_leaves_nobody_lost(terrain: Terrain) -> None:
+    simulation = simulated(terrain)
+    laws = Laws(simulation)
+    (row, col) = divmod(
+        terrain.random_place() if hasattr(terrain, "random_place") else _open(terrain), terrain.grid.cols
+    )
+    simulation.order(4.0, GiveOrder(subject="target", name="x", row=row, col=col, walk="still", new=True))
+    simulation.run_until(12.0)
+    assert simulation.refused == []
+    assert "x" in {vehicle.target for vehicle in vehicles(simulation).values()}
+    simulation.order(12.0, GiveOrder(subject="target", name="t0", off=True))
+    simulation.run_until(20.0)
+    assert {vehicle.target for vehicle in vehicles(simulation).values()} <= {"x", "t1"}
+    states = {vehicle.state for vehicle in vehicles(simulation).values()}
+    assert VehicleState.LOST not in states
+    assert set(target_cells(simulation)) == {"x", "t1"}
+    assert laws.collisions == []
+
+
+def test_a_target_is_put_somewhere_else_and_stays_there_when_its_process_starts_again(terrain: Terrain) -> None:
+    simulation = simulated(terrain)
+    cell = _open(terrain)
+    simulation.order(4.0, PAUSE)
+    simulation.order(5.0, GiveOrder(subject="target", name="t1", cell=cell))
+    simulation.run_until(8.0)
+    assert target_cells(simulation)["t1"] == cell
+    simulation.crash("targets-0")
+    simulation.run_until(16.0)
+    assert target_cells(simulation)["t1"] == cell
+
+
+def test_settings_change_while_the_swarm_runs(terrain: Terrain) -> None:
+    simulation = simulated(terrain)
+    simulation.order(4.0, GiveOrder(subject="set", name="time_scale", value=0.001))
+    simulation.run_until(6.0)
+    before = cells(simulation)
+    simulation.run_until(9.0)
+    assert cells(simulation) == before
+    simulation.order(9.0, GiveOrder(subject="set", name="time_scale", off=True))
+    simulation.run_until(13.0)
+    assert cells(simulation) != before
+
+
+def _open(terrain: Terrain) -> int:
+    """A passable cell in the middle of the terrain."""
+    import numpy as np
+
+    passable = np.flatnonzero(np.isfinite(terrain.pace_s_per_m))
+    return int(passable[len(passable) // 2])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_process_that_starts_after_an_acknowledged_pause_obeys_it(seed: int, terrain: Terrain) -> None:
+    chance = random.Random(seed)
+    # Where a target is, only its planner knows when the process that moves it dies: not both are killed at once.
+    names = [name for name in nodes_of(SMALL) if not name.startswith("planner-")]
+    crashes = [Crash(8.0 + 4.0 * chance.random(), chance.choice(names)) for _ in range(10)]
+    simulation = simulated(terrain, FaultPlan(crashes=tuple(crashes)), seed)
+    simulation.order(5.0, PAUSE)
+    simulation.run_until(8.0)
+    assert simulation.book.paused
+    stood = cells(simulation)
+    moved: list[str] = []
+
+    def look(node: Node) -> None:
+        if isinstance(node.service, AgentService):
+            for id, vehicle in node.service.agent.vehicles.items():
+                if stood.setdefault(id, vehicle.cell) != vehicle.cell:
+                    moved.append(f"{id} at {simulation.now_s:.2f}")
+
+    targets = target_cells(simulation)
+    simulation.after_tick.append(look)
+    simulation.run_until(20.0)
+    assert moved == []
+    assert len(cells(simulation)) == 10, "every vehicle has found its place again"
+    assert target_cells(simulation) == targets
+    simulation.after_tick.remove(look)
+    simulation.order(20.0, RESUME)
+    simulation.run_until(26.0)
+    assert cells(simulation) != stood
+
+
+def random_orders(seed: int, terrain: Terrain, until_s: float) -> list[tuple[float, GiveOrder | ZoneOrder]]:
+    """Orders of every kind at random times; at the end all that stops vehicles is taken back."""
+    chance = random.Random(f"orders/{seed}")
+    orders: list[tuple[float, GiveOrder | ZoneOrder]] = []
+    for _ in range(12):
+        row, col = chance.randrange(40), chance.randrange(50)
+        corners: Any = [(row, col), (row, col + 6), (row + 5, col + 6), (row + 5, col)]
+        order: GiveOrder | ZoneOrder = chance.choice([
+            PAUSE,
+            RESUME,
+            GiveOrder(subject="vehicle", name=f"a{chance.randrange(3)}-00", off=chance.random() < 0.5),
+            GiveOrder(subject="group", name="all", targets=[chance.choice(["t0", "t1"])]),
+            GiveOrder(subject="target", name="x", cell=_open(terrain), new=True),
+            GiveOrder(subject="target", name=chance.choice(["t0", "x"]), off=True),
+            GiveOrder(subject="target", name="t1", cell=_open(terrain)),
+            GiveOrder(subject="set", name="time_scale", value=chance.choice([1.0, 5.0, 20.0])),
+            ZoneOrder(action="add", name=chance.choice("ab"), polygon=corners),
+            ZoneOrder(action="remove", name=chance.choice("ab")),
+        ])  # fmt: skip
+        orders.append((2.0 + (until_s - 3.0) * chance.random(), order))
+    ends: list[GiveOrder | ZoneOrder] = [
+        RESUME,
+        *(GiveOrder(subject="vehicle", name=f"a{n}-00", off=True) for n in range(3)),
+        GiveOrder(subject="group", name="all", off=True),
+        GiveOrder(subject="set", name="time_scale", off=True),
+        *(ZoneOrder(action="remove", name=name) for name in "ab"),
+    ]
+    return orders + [(until_s, order) for order in ends]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_law_breaks_whatever_is_ordered_and_whatever_goes_wrong(seed: int, terrain: Terrain) -> None:
+    plan = random_plan(seed, nodes_of(SMALL), 30.0)
+    simulation = simulated(terrain, plan, seed)
+    quiet_s = plan.quiet_s or 18.0
+    for at_s, order in random_orders(seed, terrain, quiet_s + 1.5):
+        simulation.order(at_s, order)
+    trial = Trial(simulation)
+    assert trial.run(34.0) == []
+    books = {tuple(service._obedience.book) for service in agents(simulation)}
+    assert len(books) <= 1

@@ -1,0 +1,170 @@
+"""Plug-ins in a whole swarm: the examples of the pages, and what becomes of a swarm whose plug-ins fail."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.plugin_modules import forgotten_afterwards
+from support.plugin_pages import write_example
+
+from launch_scripts.simulation.simulate import Simulation
+from swarm.config.load import load_scenario
+from swarm.config.plugin_names import PLUGIN_KINDS
+from swarm.wire.messages.processes import Note
+
+SMALL = """
+seed = 3
+[terrain]
+source = "synthetic"
+rows = 48
+cols = 48
+[terrain.hidden]
+rubble_fields = 3
+[[groups]]
+vehicles = 4
+"""
+
+
+@pytest.fixture(autouse=True)
+def _own_modules(tmp_path: Path) -> Iterator[None]:
+    with forgotten_afterwards(tmp_path):
+        yield
+
+
+def run(scenario: Path, seconds: float = 20.0) -> tuple[Simulation, list[str]]:
+    simulation = Simulation(load_scenario(scenario))
+    notes: list[str] = []
+    heard = simulation.recorder.heard
+
+    def listen(message: object, *rest: object) -> None:
+        if isinstance(message, Note) and message.kind == "plugin_failed":
+            notes.append(f"{message.role} {message.id}: {message.text}")
+        heard(message, *rest)  # type: ignore[arg-type]
+
+    simulation.recorder.heard = listen  # type: ignore[method-assign, assignment]
+    simulation.run_until(seconds)
+    return simulation, notes
+
+
+@pytest.mark.parametrize("page", PLUGIN_KINDS)
+def test_the_example_of_a_page_runs_as_it_stands(page: str, tmp_path: Path) -> None:
+    simulation, notes = run(write_example(page, tmp_path, SMALL))
+    assert not notes
+    report = simulation.report(20.0)
+    assert report["vehicles_routed"] == 4
+    assert report["collisions"] == report["lethal_entries"] == 0
+
+
+SENSOR = """
+[vehicles]
+sensor = "failing:Sensor"
+"""
+WALK = """
+[[targets]]
+name = "a"
+walk = "failing:Walk"
+[[targets]]
+name = "b"
+walk = "waypoints"
+"""
+FAILING = """
+import math, sys, numpy as np
+from vehicle_agent.sensing.sensor import Sight
+class Plugin:
+    def __init__(self, world, options): self.world, self.calls = world, 0
+    def look(self, cells):
+        self.calls += 1
+        return Sight(np.empty(0, int), np.empty(0)) if self.calls < 5 else {sensor}
+    def choose(self, cell, vehicles):
+        self.calls += 1
+        return self.world.terrain.steps(cell)[0][1] if self.calls < 2 else {walk}
+    def assign(self, table):
+        self.calls += 1
+        return np.argmin(table.costs_s, axis=0) if self.calls < 2 else {assigned}
+    def speed(self, stretch):
+        self.calls += 1
+        return 1.0 if self.calls < 9 else {speed}
+Sensor = Walk = Assigner = Dynamics = Plugin
+"""
+
+
+def failed(tmp_path: Path, scenario: str, **bodies: str) -> tuple[list[str], dict[str, Any]]:
+    """What is told, and the report, of a run whose plug-in does this after a while."""
+    text = FAILING
+    for name in ("sensor", "walk", "assigned", "speed"):
+        text = text.replace(f"{{{name}}}", bodies.get(name, "None"))
+    (tmp_path / "failing.py").write_text(text)
+    (tmp_path / "scenario.toml").write_text(f"time_scale = 5.0{SMALL}{scenario}")
+    simulation, notes = run(tmp_path / "scenario.toml")
+    return notes, simulation.report(20.0)
+
+
+@pytest.mark.parametrize(
+    "sight",
+    [
+        "1 / 0",
+        "sys.exit(1)",
+        "None",
+        "Sight(np.array([-1]), np.array([1.0]))",
+        "Sight(np.array([10**9]), np.array([1.0]))",
+        "Sight(np.array([1.5]), np.array([1.0]))",
+        "Sight(np.array([5]), np.array([math.nan]))",
+        "Sight(np.array([5]), np.array([-1.0]))",
+        "Sight(np.array([5, 6]), np.array([1.0]))",
+        "Sight(np.array([5]), np.array(['x']))",
+    ],
+)
+def test_a_sensor_that_fails_is_named_once_and_its_vehicles_go_on(sight: str, tmp_path: Path) -> None:
+    notes, report = failed(tmp_path, SENSOR, sensor=sight)
+    (note,) = notes
+    assert note.startswith("agent a0: sensor plug-in 'failing:Sensor' of vehicles.sensor: look r")
+    assert report["vehicles_routed"] == 4
+    assert report["collisions"] == report["lethal_entries"] == 0
+
+
+@pytest.mark.parametrize("step", ["1 / 0", "cell + 2", "-1", "10**30", "cell + 0.5", "math.nan", "'x'", "True"])
+def test_a_target_whose_walk_fails_stands_still_and_others_go_on(step: str, tmp_path: Path) -> None:
+    notes, report = failed(tmp_path, WALK, walk=step)
+    (note,) = notes
+    assert note.startswith("targets 0: target a: walk plug-in 'failing:Walk' of targets[0].walk: choose r")
+    assert report["vehicles_routed"] == 4
+
+
+@pytest.mark.parametrize("assigned", ["1 / 0", "None", "[-2]", "np.full(len(table.vehicles), 0.5)", "'t0'"])
+def test_an_agent_whose_assigner_fails_spreads_its_vehicles(assigned: str, tmp_path: Path) -> None:
+    notes, report = failed(
+        tmp_path, "[vehicles]\nreassign_s = 1.0\nassignment = 'failing:Assigner'", assigned=assigned
+    )
+    (note,) = notes
+    assert note.startswith("agent a0: assignment plug-in 'failing:Assigner' of vehicles.assignment: assign r")
+    assert report["vehicles_routed"] == 4
+
+
+@pytest.mark.parametrize("speed", ["1 / 0", "None", "-0.1", "math.inf", "math.nan", "True", "'fast'"])
+def test_vehicles_whose_dynamics_fail_drive_as_the_ground_allows(speed: str, tmp_path: Path) -> None:
+    notes, report = failed(tmp_path, "[vehicles]\ndynamics = 'failing:Dynamics'", speed=speed)
+    (note,) = notes
+    assert note.startswith("agent a0: dynamics plug-in 'failing:Dynamics' of vehicles.dynamics: speed r")
+    assert report["collisions"] == report["lethal_entries"] == 0
+
+
+WILD = """
+import numpy as np
+class Wild:
+    def __init__(self, world, options): self.chance = np.random.default_rng(world.seed)
+    def speed(self, stretch): return float(self.chance.choice([0.0, 0.01, 3.0, 1e300]))
+"""
+
+
+def test_however_vehicles_are_driven_none_collides(tmp_path: Path) -> None:
+    (tmp_path / "wild.py").write_text(WILD)
+    crowd = "time_scale = 8.0" + SMALL.replace("vehicles = 4", "vehicles = 30\nstart = 'cluster'")
+    (tmp_path / "scenario.toml").write_text(crowd + "[vehicles]\nper_agent = 10\ndynamics = 'wild:Wild'")
+    simulation, notes = run(tmp_path / "scenario.toml")
+    assert not notes
+    report = simulation.report(20.0)
+    assert report["collisions"] == report["lethal_entries"] == 0
+    assert report["vehicles_routed"] == 30

@@ -1,0 +1,250 @@
+"""Targets that the run does not move: trackers from outside come, die, meet a second one, and hand over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import pytest
+
+from launch_scripts.simulation.faults import Crash, FaultPlan
+from launch_scripts.simulation.laws import Laws
+from launch_scripts.simulation.node import EPOCH_NS
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.worlds import SMALL, seeded
+from launch_scripts.world.service import TargetsService
+from planner_service.service import PlannerService
+from swarm.bus.bus import Event, Heard, Replied
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import TargetConfig
+from swarm.runtime.tracking import Tracking
+from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus, RouteReply, RouteRequest
+from swarm.wire.messages.processes import Note
+from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.topics import COST, POSE, ROUTE, STATUS
+from vehicle_agent.service import AgentService
+
+EXTERNAL = msgspec.structs.replace(
+    SMALL, targets=(TargetConfig(name="x", walk="external", caught="stay"), TargetConfig(name="t", walk="still"))
+)
+LOSSY = FaultPlan(drop=0.1, duplicate=0.05, reorder=0.05, jitter_ms=30)
+HOUR_S = 3600.0
+
+
+@dataclass(eq=False)
+class OutsideTracker:
+    """A process that is not ours: tells five times a second where target x is, by a clock that may be wrong."""
+
+    simulation: Simulation
+    name: str
+    rows: int
+    from_s: float
+    until_s: float
+    clock_off_s: float = 0.0
+    hands_over: bool = False
+    seq: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self.bus = self.simulation.network.bus(f"{self.name}-{self.from_s}", EXTERNAL.network.namespace)
+        times = [self.from_s + n / 5 for n in range(int(5 * (self.until_s - self.from_s)))]
+        for at_s in times:
+            self.simulation._at(at_s, lambda last=at_s == times[-1]: self.tell(last and self.hands_over))  # type: ignore[misc]
+
+    def tell(self, over: bool) -> None:
+        grid = self.simulation.terrain.grid
+        cell = grid.cell(self.rows, grid.cols // 2)
+        self.seq += 1
+        x_m, y_m = grid.centre_m(cell)
+        pose = TargetPose(
+            target="x",
+            tracker=self.name,
+            incarnation=self.stamp_ns(self.from_s),
+            seq=self.seq,
+            stamp_ns=self.stamp_ns(self.simulation.now_s),
+            lease_s=0.0 if over else 2.0,
+            cell=cell,
+            x_m=x_m,
+            y_m=y_m,
+        )
+        self.bus.publish(POSE, pose, target="x")
+
+    def stamp_ns(self, at_s: float) -> int:
+        return EPOCH_NS + int((at_s + self.clock_off_s) * NS_PER_S)
+
+
+class Ear:
+    """Somebody who hears the planner of x, and asks it."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.bus = simulation.network.bus("ear-0", EXTERNAL.network.namespace)
+        self.status: PlannerStatus | None = None
+        self.route: RouteReply | None = None
+        self.cost: CostReply | None = None
+        self.bus.subscribe(STATUS, self.take, target="x")
+
+    def take(self, event: Event) -> None:
+        match event:
+            case Heard(message=PlannerStatus() as status):
+                self.status = status
+            case Replied(message=RouteReply() as reply):
+                self.route = reply
+            case Replied(message=CostReply() as reply):
+                self.cost = reply
+
+    def ask(self) -> RouteReply:
+        """The planner's answer to a route and to a cost, which tell the same age."""
+        self.route = self.cost = None
+        while self.route is None or self.cost is None:  # a query may be lost
+            self.route = self.cost = None
+            self.bus.ask(ROUTE, RouteRequest(row=20, col=20), self.take, tag="route", timeout_s=1.0, target="x")
+            self.bus.ask(COST, CostRequest(row=20, col=20), self.take, tag="cost", timeout_s=1.0, target="x")
+            self.simulation.run_until(self.simulation.now_s + 0.2)
+        assert self.route.tracker_lost == self.cost.tracker_lost
+        assert self.route.pose_age_s == pytest.approx(self.cost.pose_age_s, abs=0.2)
+        return self.route
+
+
+def notes(simulation: Simulation) -> list[Note]:
+    """What planners have told people."""
+    return [note for _, note in simulation.recorder.notes if note.role == "planner"]
+
+
+def kinds(simulation: Simulation) -> list[str]:
+    return [note.kind for note in notes(simulation)]
+
+
+def receivers(simulation: Simulation) -> dict[str, Tracking | None]:
+    """What everybody who hears poses knows of the trackers of x."""
+    found: dict[str, Tracking | None] = {"recorder": simulation.recorder.trackings.of("x")}
+    for node in simulation.nodes.values():
+        service: Any = node.service
+        match service:
+            case PlannerService() if service._target == "x":
+                found[node.name] = service._planner._watch._tracking
+            case AgentService():
+                found[node.name] = service.agent._trackings.of("x")
+            case TargetsService():
+                found[node.name] = service._world._trackings.of("x")
+    return found
+
+
+def owners(simulation: Simulation) -> set[str | None]:
+    now_ns = EPOCH_NS + int(simulation.now_s * NS_PER_S)
+    everybody = receivers(simulation)
+    assert len(everybody) == 6  # the recorder, a planner, three agents, the referee
+    return {None if each is None or each.lost(now_ns) else each.pose.tracker for each in everybody.values()}  # type: ignore[union-attr]
+
+
+def captures_of_x(simulation: Simulation) -> int:
+    return sum(note.text.endswith("captured x") for _, note in simulation.recorder.notes)
+
+
+def states(simulation: Simulation) -> set[VehicleState]:
+    """Of the vehicles that chase x."""
+    found = set()
+    for node in simulation.nodes.values():
+        if isinstance(node.service, AgentService):
+            found |= {each.state for each in node.service.agent.vehicles.values() if each.target == "x"}
+    return found
+
+
+@pytest.mark.parametrize("clock_off_s", [0.0, HOUR_S, -HOUR_S])
+def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clock_off_s: float) -> None:
+    simulation = Simulation(seeded(1, EXTERNAL), faults=LOSSY)
+    laws, ear = Laws(simulation), Ear(simulation)
+    OutsideTracker(simulation, "radar", 20, 3, 12, clock_off_s)
+    simulation.run_until(2.5)
+    assert ear.status is not None
+    assert (ear.status.target_cell, ear.status.pose_age_s, ear.status.tracker_lost) == (None, None, False)
+    simulation.run_until(11)
+    reply = ear.ask()
+    assert not reply.tracker_lost
+    assert reply.pose_age_s is not None
+    assert reply.pose_age_s < 1
+    assert owners(simulation) == {"radar"}
+    assert VehicleState.OUTDATED not in states(simulation)
+    simulation.run_until(16)
+    assert owners(simulation) == {None}
+    reply = ear.ask()
+    assert reply.tracker_lost
+    assert reply.pose_age_s == pytest.approx(simulation.now_s - 12, abs=0.8)
+    assert reply.target_cell == simulation.terrain.grid.cell(20, simulation.terrain.grid.cols // 2)
+    assert states(simulation) == {VehicleState.OUTDATED}
+    assert ear.status.tracker_lost
+    line = next(each for each in simulation.recorder.summary(_now_ns(simulation)).targets if each.id == "x")
+    assert line.lost
+    assert line.title == f"x (lost {simulation.now_s - 12:.0f} s)"
+    before = captures_of_x(simulation)
+    simulation.run_until(25)
+    assert captures_of_x(simulation) == before, "nobody captures a target that is lost"
+    OutsideTracker(simulation, "radar", 22, 25, 32, clock_off_s)
+    simulation.run_until(30)
+    assert owners(simulation) == {"radar"}
+    assert not ear.ask().tracker_lost
+    assert VehicleState.OUTDATED not in states(simulation)
+    odd = ["tracker-clock"] if clock_off_s else []
+    assert kinds(simulation) == [*odd, "tracker-lost", "tracker-back"]
+    simulation.finish()
+    tracking = simulation.report(30)["tracking"]
+    assert tracking["lost"] == 1
+    assert tracking["lost_at_end"] == []
+    assert laws.collisions == laws.lethal == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("clock_off_s", [0.0, -HOUR_S])
+def test_a_second_tracker_is_refused_by_everybody_until_the_first_is_dead(seed: int, clock_off_s: float) -> None:
+    simulation = Simulation(seeded(seed, EXTERNAL), faults=LOSSY)
+    OutsideTracker(simulation, "m", 20, 3, 15)
+    OutsideTracker(simulation, "a", 30, 6, 30, clock_off_s)
+    simulation.run_until(14)
+    assert owners(simulation) == {"m"}
+    assert kinds(simulation) == ["tracker-refused"]
+    assert notes(simulation)[0].text == "target x: poses of tracker a are refused, as tracker m owns it"
+    simulation.run_until(19)
+    assert owners(simulation) == {"a"}
+    assert {"tracker-changed", "tracker-lost"} & set(kinds(simulation))
+    report = simulation.report(19)["tracking"]
+    assert report["poses_refused"] > 30
+
+
+def test_a_handover_is_at_once_and_nobody_is_lost() -> None:
+    simulation = Simulation(seeded(2, EXTERNAL))
+    OutsideTracker(simulation, "m", 20, 3, 10, hands_over=True)
+    OutsideTracker(simulation, "a", 22, 6, 20)
+    simulation.run_until(9.5)
+    assert owners(simulation) == {"m"}
+    simulation.run_until(10.3)
+    assert owners(simulation) == {"a"}
+    simulation.run_until(12)
+    assert kinds(simulation) == ["tracker-refused", "tracker-changed"]
+
+
+def test_a_receiver_that_starts_while_two_trackers_tell_follows_the_same_as_all_others() -> None:
+    crashes = tuple(Crash(8 + n, node) for n, node in enumerate(("planner-x", "agent-a0", "targets-0")))
+    simulation = Simulation(seeded(4, EXTERNAL), faults=lossy_with(crashes))
+    OutsideTracker(simulation, "m", 20, 3, 20)
+    OutsideTracker(simulation, "a", 30, 5, 20)
+    simulation.run_until(14)
+    assert owners(simulation) == {"m"}
+
+
+def lossy_with(crashes: tuple[Crash, ...]) -> FaultPlan:
+    return FaultPlan(drop=0.1, jitter_ms=30, crashes=crashes)
+
+
+def test_the_poses_of_simulated_targets_age_the_same_way_when_their_process_is_killed() -> None:
+    simulation = Simulation(seeded(1), faults=FaultPlan(crashes=(Crash(10, "targets-0", for_good=True),)))
+    simulation.run_until(15)
+    summary = simulation.recorder.summary(_now_ns(simulation))
+    assert [line.lost for line in summary.targets] == [True, True]
+    assert summary.states["outdated"] == 10
+    simulation.finish()
+    assert simulation.report(15)["tracking"]["lost_at_end"] == ["t0", "t1"]
+
+
+def _now_ns(simulation: Simulation) -> int:
+    return EPOCH_NS + int(simulation.now_s * NS_PER_S)

@@ -1,0 +1,42 @@
+"""A program of the client library on a simulated network: the session that a live one has, without its thread."""
+
+from __future__ import annotations
+
+from support.swarm_model import SwarmModel
+
+from swarm.bus.bus import Event
+from swarm.client.connection import Swarm
+from swarm.client.session import TICK_S, Session
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.wire.messages.processes import RunInfo
+
+
+def run_info(grid: GridSpec, run_id: str = "run") -> RunInfo:
+    return RunInfo(
+        run_id=run_id, role="keeper", id="0", incarnation=1, scenario="s", terrain="0", rows=grid.rows,
+        cols=grid.cols, resolution_m=grid.resolution_m, started_ns=0, west_m=grid.west_m, north_m=grid.north_m,
+        crs=grid.crs,
+    )  # fmt: skip
+
+
+class Program:
+    """What a program sees (`swarm`), and the session behind it."""
+
+    def __init__(self, world: SwarmModel, node: str = "program") -> None:
+        self.world = world
+        self.bus = world.bus(node)
+        self.session = Session(self.bus, run_info(world.terrain.grid), world.scheduler.clock, self._post)
+        self.swarm = Swarm(self.session)
+        self.problems: list[str] = []
+        self.swarm.on_problem(self.problems.append)
+        self._tick()
+
+    def _post(self, event: Event) -> None:
+        if not self.bus.closed:
+            self.session.handle(event)
+
+    def _tick(self) -> None:
+        if not self.bus.closed:
+            self.session.tick()
+            self.world.scheduler.after(int(TICK_S * NS_PER_S), self._tick)

@@ -1,0 +1,59 @@
+"""Commands that give orders: what cannot be one is refused before anything is asked, in a sentence."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from launch_scripts.cli import main
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("zone add --polygon 5", "--polygon: '5' is no corner"),
+        ("zone add --polygon 5,x", "--polygon: '5,x' is no corner"),
+        ("zone add --polygon 1,1;2,2", "is no corner"),
+        ("zone add", "give either polygon or polygon_m"),
+        ("zone add --polygon 1,1|2,2", "is no corner"),
+        ("zone add --polygon 1,1_2,2", "is no corner"),
+        ("zone add --polygon 1,1 --kind deadly", "--kind: 'deadly' is neither lethal nor pace:X"),
+        ("zone add --polygon 1,1 --kind pace:nan", "--kind: 'pace:nan' is neither"),
+        ("zone add --polygon 1,1 --until tomorrow", "--until: 'tomorrow' is no time such as 90s"),
+        ("zone add --polygon 1,1 --until 0s", "--until: '0s' is no time"),
+        ("zone remove a/b", "the order is not possible: name 'a/b' is not"),
+        ("target add x --at 5", "--at: '5' is no cell"),
+        ("target add x --at 5,5 --walk away", "the order is not possible: Invalid enum value 'away'"),
+        ("target add x/y --at 5,5", "name 'x/y' is not"),
+        ("vehicle stop a*", "name 'a*' is not"),
+        ("group red", "group: give either targets or --as-scenario"),
+        ("group red targets t0 --as-scenario", "group: give either targets or --as-scenario"),
+        ("set time_scale", "set: give either a value or --as-scenario"),
+        ("set time_scale 5 --as-scenario", "set: give either a value or --as-scenario"),
+    ],
+)
+def test_what_is_no_order_is_refused_with_the_option(
+    words: str, says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["swarm", *words.split()])
+    assert main() == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert says in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "command", ["zone", "target", "vehicle", "zone add", "target move", "pause", "group", "set"]
+)
+def test_every_command_explains_itself(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["swarm", *command.split(), "--help"])
+    try:
+        code = main()
+    except SystemExit as end:
+        code = int(end.code or 0)
+    assert code == 0
+    assert f"Usage: swarm {command}" in capsys.readouterr().out

@@ -1,0 +1,210 @@
+"""What a planner tells people about trackers: one sentence for each oddity, all counted, nothing lost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from planner_service.actions import Tell
+from planner_service.target_watch import TargetWatch
+from swarm.clock import NS_PER_S
+from swarm.errors import ProtocolError
+from swarm.grid import GridSpec
+from swarm.runtime.stats import Counters
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
+
+GRID = GridSpec(20, 30, 10.0)
+START_NS = 1_800_000_000 * NS_PER_S
+TICK_NS = NS_PER_S // 10
+
+
+class Watch:
+    """A planner's watch over target t0, ten ticks a second."""
+
+    def __init__(self, time_scale: float = 1.0) -> None:
+        self.counters = Counters()
+        self.watch = TargetWatch("t0", GRID, self.counters, time_scale)
+        self.now_ns = START_NS
+        self.seq = 0
+        self.told: list[Tell] = []
+
+    def hear(self, tracker: str | None = "radar", row: int = 10, col: int = 20, **changes: Any) -> None:
+        self.seq += 1
+        cell = GRID.cell(row, col)
+        x_m, y_m = GRID.centre_m(cell)
+        pose = TargetPose(
+            target="t0", tracker=tracker, incarnation=START_NS, seq=self.seq, stamp_ns=self.now_ns, cell=cell,
+            x_m=x_m, y_m=y_m,
+        )  # fmt: skip
+        self.watch.hear(msgspec.structs.replace(pose, **changes), self.now_ns)
+
+    def tick(self, times: int = 1) -> None:
+        for _ in range(times):
+            self.now_ns += TICK_NS
+            self.told += self.watch.take_told(self.now_ns)
+
+    def counted(self) -> dict[str, int]:
+        return {name: count for name, count in self.counters.counts.items() if count}
+
+    def sentences(self) -> list[str]:
+        return [told.text for told in self.told]
+
+
+def test_a_pose_outside_is_counted_said_once_and_not_used() -> None:
+    here = Watch()
+    here.hear()
+    for _ in range(5):
+        here.hear(cell=GRID.cells)
+        here.tick()
+    assert here.sentences() == [
+        "target t0: tracker radar puts it into cell 600, outside of the terrain of 20 x 30 cells: not used"
+    ]
+    assert here.counted() == {"poses_outside": 5}
+    assert here.watch.pose is not None
+    assert here.watch.pose.cell == GRID.cell(10, 20)
+
+
+def test_a_place_outside_without_a_cell_is_named_by_its_metres() -> None:
+    here = Watch()
+    here.hear(cell=CELL_OF_PLACE, x_m=1234.5, y_m=0.0)
+    here.tick()
+    assert here.sentences() == [
+        "target t0: tracker radar puts it into 1234, 0 m, outside of the terrain of 20 x 30 cells: not used"
+    ]
+
+
+def test_a_target_that_moves_faster_than_anything_is_followed_counted_and_said_once() -> None:
+    here = Watch()
+    for n in range(6):
+        here.hear(row=0 if n % 2 else 19, col=0 if n % 2 else 29)
+        here.tick()
+    assert here.watch.pose is not None
+    assert here.watch.pose.cell == 0
+    assert here.sentences() == ["target t0: tracker radar moved it by 347 m in 0.1 s and told no jump"]
+    assert here.counted() == {"poses_teleported": 5}
+
+
+@pytest.mark.parametrize("how", ["with a jump", "in time", "in scaled time", "a little"])
+def test_a_target_that_moves_as_targets_may_is_no_oddity(how: str) -> None:
+    here = Watch(time_scale=100.0 if how == "in scaled time" else 1.0)
+    here.hear(row=0, col=0)
+    here.tick(40 if how == "in time" else 1)
+    here.told.clear()
+    far = {"row": 4, "col": 4} if how == "a little" else {"row": 19, "col": 29}
+    here.hear(**far, jumps=1 if how == "with a jump" else 0)
+    assert "poses_teleported" not in here.counted()
+
+
+@pytest.mark.parametrize(("off_s", "way"), [(3600, "3600 s ahead"), (-3600, "3600 s behind")])
+def test_a_clock_that_is_an_hour_off_changes_nothing_and_is_said_once(off_s: int, way: str) -> None:
+    here = Watch()
+    for _ in range(5):
+        here.hear(stamp_ns=here.now_ns + off_s * NS_PER_S, incarnation=START_NS + off_s * NS_PER_S)
+        here.tick()
+    assert here.sentences() == [f"target t0: the clock of tracker radar is {way}, by which nothing changes"]
+    assert here.counted() == {"tracker_clocks_off": 5}
+    assert here.watch.age_s(here.now_ns) == pytest.approx(0.1)
+    assert not here.watch.lost(here.now_ns)
+
+
+def test_two_trackers_with_one_name_are_said_once_and_the_later_counts() -> None:
+    here = Watch()
+    for _ in range(10):
+        here.hear(incarnation=START_NS + NS_PER_S, row=5)
+        here.hear(row=12)
+        here.tick()
+    assert here.sentences() == [
+        "target t0: two trackers call themselves radar; only that of the later incarnation counts"
+    ]
+    assert here.counted() == {"poses_refused": 10}
+    assert here.watch.pose is not None
+    assert here.watch.pose.cell // GRID.cols == 5
+
+
+def test_a_second_tracker_is_said_once_and_one_without_a_name_too() -> None:
+    nameless = f"a tracker without a name, of incarnation {START_NS + 2 * NS_PER_S},"
+    here = Watch()
+    here.tick(30)
+    for _ in range(5):
+        here.hear()
+        here.hear("other", incarnation=here.now_ns)
+        here.hear(None, incarnation=START_NS + 2 * NS_PER_S)
+        here.tick()
+    assert here.sentences() == [
+        "target t0: poses of tracker other are refused, as tracker radar owns it",
+        f"target t0: poses of {nameless} are refused, as tracker radar owns it",
+    ]
+    assert here.counted() == {"poses_refused": 10}
+
+
+def test_losing_and_regaining_are_said_each_time_with_the_reason() -> None:
+    here = Watch()
+    here.hear()
+    here.tick(25)
+    here.hear()
+    here.tick(2)
+    here.hear(lease_s=0.0)
+    here.tick(3)
+    here.hear("camera", incarnation=here.now_ns)
+    here.tick()
+    assert [told.kind for told in here.told] == [
+        "tracker-lost", "tracker-back", "tracker-lost", "tracker-back", "tracker-changed"
+    ]  # fmt: skip
+    assert here.sentences() == [
+        "target t0: tracker radar has been silent for longer than its lease of 2 s; routes lead to where it was",
+        "target t0: tracker radar tracks it again, after 2.5 s in which nobody knew where it was",
+        "target t0: tracker radar has handed it over, and nobody else tracks it; routes lead to where it was",
+        "target t0: tracker camera tracks it again, after 0.3 s in which nobody knew where it was",
+        "target t0: tracker camera tracks it now, before that tracker radar did",
+    ]
+    assert here.counted() == {"trackers_lost": 2}
+
+
+def test_a_target_that_only_vehicles_see_is_lost_when_the_sighting_expires() -> None:
+    here = Watch()
+    seen = TargetPose(target="t0", incarnation=0, seq=1, stamp_ns=START_NS, lease_s=30.0, cell=5, x_m=0.0, y_m=0.0)
+    here.watch.see(seen, here.now_ns)
+    here.tick(299)
+    here.watch.see(seen, here.now_ns)  # the same once more: it is as old as it is
+    assert here.told == []
+    here.tick()
+    assert here.sentences() == ["target t0: no vehicle has seen it for 30.0 s; routes lead to where it was"]
+    here.watch.see(msgspec.structs.replace(seen, seq=2), here.now_ns)
+    here.tick()
+    assert here.told[-1].kind == "tracker-back"
+
+
+def test_a_standby_counts_nothing() -> None:
+    here = Watch()
+    here.watch.counts = False
+    here.hear(cell=GRID.cells)
+    assert here.counted() == {}
+
+
+def test_however_many_trackers_a_liar_makes_up_few_are_named() -> None:
+    here = Watch()
+    here.tick(30)
+    here.hear()
+    for n in range(3000):
+        here.hear(None, incarnation=START_NS + 2 * NS_PER_S + n)
+        here.hear(None, incarnation=START_NS + n % 300, cell=GRID.cells)
+    here.tick()
+    assert len(here.told) <= 256
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("x_m", float("nan")), ("lease_s", float("inf")), ("lease_s", -1.0), ("lease_s", 61.0), ("tracker", "a/b")],
+)
+def test_what_no_pose_may_say_is_refused_at_the_door(field: str, value: Any) -> None:
+    here = Watch()
+    here.hear()
+    pose = here.watch.pose
+    assert pose is not None
+    fields = msgspec.to_builtins(pose) | {field: value}
+    with pytest.raises(ProtocolError, match=field):
+        decode(msgspec.msgpack.encode(fields), TargetPose)
+    assert decode(encode(pose), TargetPose) == pose

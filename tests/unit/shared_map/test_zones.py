@@ -1,0 +1,316 @@
+"""Zones: an operator's word is in every map, above what vehicles find, until it is taken back."""
+
+from __future__ import annotations
+
+import itertools
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.map_strategies import held_winners
+from support.swarm_model import SwarmModel
+
+from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.zones import _crossing, rows_of
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.config.load import parse_scenario
+from swarm.wire.messages.orders import Zone, ZoneOrder, Zones
+from swarm.wire.statements import MarkKind
+from swarm.wire.topics import ZONES
+
+ROWS, COLS = 40, 70
+SQUARE = [(2.0, 3.0), (2.0, 8.0), (6.0, 8.0), (6.0, 3.0)]
+SQUARE_CELLS = {row * COLS + col for row in range(2, 6) for col in range(3, 8)}
+
+
+class ZoneWorld(SwarmModel):
+    """A keeper, somebody who finds things, and a listener."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(terrain=terrain_of_pace(np.ones((ROWS, COLS), np.float32)), **options)
+        self.store = KeeperStore(":memory:")
+        self.lives = 1
+        self.keeper_service = self.keeper("k", self.store)
+        self.finder = self.writer("a1.1")
+        self.planner = self.listener("p")
+        self.person = self.bus("person")
+        self.run(0.3)
+
+    def restart_keeper(self) -> None:
+        self.kill(f"k.{self.lives}")
+        self.lives += 1
+        self.keeper_service = self.keeper("k", self.store, self.lives)
+        self.run(0.3)
+
+    def order(self, **fields: Any) -> Zones | str | None:
+        """What the keeper answers: zones, or its refusal."""
+        heard: list[Event] = []
+        self.person.ask(ZONES, ZoneOrder(**fields), heard.append, tag="z", keeper="k")
+        self.run(0.3)
+        for event in heard:
+            if isinstance(event, Replied):
+                assert isinstance(event.message, Zones)
+                return event.message
+        (ended,) = (event for event in heard if isinstance(event, AskEnded))
+        return ended.failure
+
+    def add(self, name: str = "z", polygon: list[tuple[float, float]] | None = None, **fields: Any) -> Zones:
+        zones = self.order(action="add", name=name, polygon=polygon or SQUARE, **fields)
+        assert isinstance(zones, Zones), zones
+        return zones
+
+    def lethal(self) -> set[int]:
+        """The cells that are lethal in the listener's map."""
+        composite: Any = self.planner.replica._cost_map
+        return set(np.flatnonzero(composite.kinds == MarkKind.LETHAL).tolist())
+
+    def find(self, *cells: int, kind: MarkKind = MarkKind.CLEAR, pace: float = 0.0) -> None:
+        sync = self.finder.sync
+        sync.publish(sync.replica.write(list(cells), kind, pace, self.now_ns))
+        self.run(0.3)
+
+
+def test_a_zone_is_in_every_map_and_gone_once_it_is_removed() -> None:
+    world = ZoneWorld()
+    zones = world.add("bridge")
+    assert zones.zones == [
+        Zone(name="bridge", kind="lethal", pace_s_per_m=None, cells=20, window=[2, 3, 6, 8], until_ns=None)
+    ]
+    assert world.lethal() == SQUARE_CELLS
+    assert world.planner.replica.lacking("operator.bridge", zones.sets) == []
+    assert isinstance(world.order(action="remove", name="bridge"), Zones)
+    assert world.lethal() == set()
+    listed = world.order(action="list")
+    assert isinstance(listed, Zones)
+    assert listed.zones == []
+
+
+def test_what_a_vehicle_finds_in_a_zone_does_not_open_it_and_counts_once_it_is_removed() -> None:
+    world = ZoneWorld()
+    world.add()
+    inside = min(SQUARE_CELLS)
+    world.find(inside, kind=MarkKind.PACE, pace=3.0)
+    assert world.lethal() == SQUARE_CELLS
+    world.order(action="remove", name="z")
+    composite: Any = world.planner.replica._cost_map
+    assert (composite.kinds[inside], composite.paces[inside]) == (MarkKind.PACE, 3.0)
+
+
+def test_a_zone_of_a_pace_wins_too_and_the_newer_of_two_zones_counts() -> None:
+    world = ZoneWorld()
+    world.add("one")
+    zones = world.add("two", kind="pace", pace_s_per_m=0.5)
+    assert [(zone.name, zone.kind, zone.pace_s_per_m) for zone in zones.zones] == [
+        ("one", "lethal", None),
+        ("two", "pace", 0.5),
+    ]
+    assert world.lethal() == set()
+    world.order(action="remove", name="two")
+    assert world.lethal() == SQUARE_CELLS, "what lies under a zone is not lost"
+
+
+def test_a_zone_outlives_the_keeper_that_took_it_and_a_late_planner_hears_it() -> None:
+    world = ZoneWorld()
+    world.add()
+    world.restart_keeper()
+    assert isinstance(world.order(action="list"), Zones)
+    late = world.listener("late")
+    world.run(1.0)
+    assert held_winners(late.replica) == held_winners(world.planner.replica) != {}
+    world.order(action="remove", name="z")
+    assert world.lethal() == set()
+
+
+def test_a_zone_ends_by_itself_and_leaves_nothing() -> None:
+    scenario = parse_scenario("[map]\ncompact_after_s = 3")
+    world = ZoneWorld(scenario=scenario)
+    (zone,) = world.add(lasts_s=5.0).zones
+    assert zone.until_ns is not None
+    world.run(4.0)
+    assert world.lethal() == SQUARE_CELLS, "no zone is taken for what a dead author left"
+    world.run(1.5)
+    assert world.lethal() == set()
+    listed = world.order(action="list")
+    assert isinstance(listed, Zones)
+    assert listed.zones == []
+    world.run(12.0)
+    assert "operator.z" not in world.planner.replica.held.ledger.authors, "it became a tombstone"
+
+
+def test_a_zone_that_was_removed_and_forgotten_can_be_made_again() -> None:
+    world = ZoneWorld(scenario=parse_scenario("[map]\ncompact_after_s = 2"))
+    world.add()
+    world.order(action="remove", name="z")
+    world.run(8.0)
+    assert "operator.z" not in world.planner.replica.held.ledger.authors
+    zones = world.add()
+    assert world.lethal() == SQUARE_CELLS
+    assert world.planner.replica.lacking("operator.z", zones.sets) == []
+
+
+def test_a_removal_counts_as_obeyed_when_its_tombstone_has_come() -> None:
+    world = ZoneWorld(scenario=parse_scenario("[map]\ncompact_after_s = 2"))
+    world.add()
+    removed = world.order(action="remove", name="z")
+    assert isinstance(removed, Zones)
+    world.run(8.0)
+    assert world.planner.replica.lacking("operator.z", removed.sets) == []
+
+
+def test_a_zone_replaces_the_one_of_its_name() -> None:
+    world = ZoneWorld()
+    world.add()
+    world.add(polygon=[(30, 50), (30, 60), (39, 60), (39, 50)])
+    assert world.lethal() == {row * COLS + col for row in range(30, 39) for col in range(50, 60)}
+
+
+def test_a_zone_without_a_name_gets_one_that_was_never_used() -> None:
+    world = ZoneWorld()
+    assert [world.add("").changed, world.add("", polygon=[(10, 0), (10, 5), (15, 5)]).changed] == ["z1", "z2"]
+
+
+def test_metres_are_those_of_poses() -> None:
+    world = ZoneWorld()
+    grid = world.terrain.grid
+    corners = [
+        (grid.west_m + col * grid.resolution_m, grid.north_m - row * grid.resolution_m) for row, col in SQUARE
+    ]
+    assert isinstance(world.order(action="add", name="z", polygon_m=corners), Zones)
+    assert world.lethal() == SQUARE_CELLS
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"action": "remove", "name": "nowhere"}, "there is no zone 'nowhere'; there are none"),
+        ({"polygon": [(0, 0), (5, 5), (0, 5), (5, 0)]}, "the edges from corner 1 and from corner 3 cross"),
+        ({"polygon": [(0, 0), (0, 9), (5, 9), (0, 4), (5, 0)]}, "cross or touch"),
+        ({"polygon": [(-20, -20), (-20, -5), (-5, -5)]}, "covers no cell of the terrain of 40 x 70 cells"),
+        ({"polygon": [(0, 0), (1, 1), (0, 0)]}, "covers no cell"),
+        ({"polygon": [(-9, -9), (-9, 900), (900, 900), (900, -9)]}, "leaves no passable cell"),
+    ],
+)
+def test_a_zone_that_cannot_be_is_refused_in_a_sentence(fields: dict[str, Any], says: str) -> None:
+    world = ZoneWorld()
+    answer = world.order(**{"action": "add", "name": "z", **fields})
+    assert isinstance(answer, str)
+    assert says in answer
+    assert "\n" not in answer
+    assert world.lethal() == set()
+    assert world.keeper_service.counters.counts["orders_refused"] == 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"polygon": SQUARE[:2]}, "polygon has 2 corners, expected 3"),
+        ({"polygon": SQUARE, "name": "a b"}, "name 'a b' is not"),
+        ({"polygon": SQUARE, "name": "a.b"}, "name 'a.b' is not"),
+        ({}, "give either polygon or polygon_m"),
+        ({"polygon": SQUARE, "polygon_m": SQUARE}, "give either polygon or polygon_m"),
+        ({"polygon": SQUARE, "kind": "pace"}, "pace_s_per_m goes with kind pace"),
+        ({"polygon": SQUARE, "pace_s_per_m": 1.0}, "pace_s_per_m goes with kind pace"),
+        ({"action": "remove"}, "which zone is to be removed"),
+    ],
+)
+def test_an_order_that_contradicts_itself_is_no_message(fields: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        ZoneOrder(**{"action": "add", **fields})
+
+
+def test_no_group_is_called_as_zones_are() -> None:
+    from swarm.errors import ConfigError
+
+    for name in ("operator", "operator.x"):
+        with pytest.raises(ConfigError, match="is not free"):
+            parse_scenario(f'[[groups]]\nname = "{name}"')
+
+
+# --- laws ---------------------------------------------------------------------------------------------------------
+
+corners = st.lists(st.tuples(st.integers(-3, 12), st.integers(-3, 12)), min_size=3, max_size=7)
+
+
+def _on(p: Any, q: Any, r: Any) -> bool:
+    """Whether r lies on the segment from p to q."""
+    if (q[0] - p[0]) * (r[1] - p[1]) != (q[1] - p[1]) * (r[0] - p[0]):
+        return False
+    return all(min(a, b) <= c <= max(a, b) for a, b, c in zip(p, q, r, strict=True))
+
+
+def _meet(p: Any, q: Any, r: Any, s: Any) -> bool:
+    """Whether two segments have a point in common, by solving for it in fractions."""
+    if any((_on(p, q, r), _on(p, q, s), _on(r, s, p), _on(r, s, q))):
+        return True
+    det = (q[0] - p[0]) * (s[1] - r[1]) - (q[1] - p[1]) * (s[0] - r[0])
+    if det == 0:
+        return False
+    t = Fraction((r[0] - p[0]) * (s[1] - r[1]) - (r[1] - p[1]) * (s[0] - r[0]), det)
+    u = Fraction((r[0] - p[0]) * (q[1] - p[1]) - (r[1] - p[1]) * (q[0] - p[0]), det)
+    return 0 <= t <= 1 and 0 <= u <= 1
+
+
+@settings(max_examples=200)
+@given(corners)
+def test_edges_that_meet_are_found_as_fractions_find_them(polygon: list[tuple[int, int]]) -> None:
+    number = len(polygon)
+    edges = [(polygon[n], polygon[(n + 1) % number]) for n in range(number)]
+    expected = any(
+        _meet(*edges[one], *edges[other])
+        for one, other in itertools.combinations(range(number), 2)
+        if (other - one) % number not in (1, number - 1)
+    )
+    assert (_crossing([(float(a), float(b)) for a, b in polygon]) is not None) == expected
+
+
+actions = st.lists(
+    st.one_of(
+        st.tuples(
+            st.just("add"),
+            st.sampled_from(["x", "y", "z"]),
+            st.tuples(st.integers(0, 30), st.integers(0, 60), st.integers(1, 12), st.integers(1, 12)),
+        ),
+        st.tuples(st.just("remove"), st.sampled_from(["x", "y", "z"])),
+        st.tuples(st.just("restart")),
+        st.tuples(st.just("find"), st.integers(0, ROWS * COLS - 1)),
+        st.tuples(st.just("wait"), st.sampled_from([1.0, 4.0])),
+    ),
+    min_size=1,
+    max_size=8,
+)
+
+
+@settings(max_examples=12)
+@given(actions)
+def test_the_map_has_exactly_the_zones_that_were_ordered_and_not_taken_back(script: list[tuple[Any, ...]]) -> None:
+    world = ZoneWorld(scenario=parse_scenario("[map]\ncompact_after_s = 2"))
+    stands: dict[str, set[int]] = {}
+    for what, *rest in script:
+        if what == "add":
+            name, (row, col, height, width) = rest
+            south, east = min(row + height, ROWS), min(col + width, COLS)
+            world.add(name, [(row, col), (row, east), (south, east), (south, col)])
+            stands[name] = {r * COLS + c for r in range(row, south) for c in range(col, east)}
+        elif what == "remove":
+            assert isinstance(world.order(action="remove", name=rest[0]), Zones) == (rest[0] in stands)
+            stands.pop(rest[0], None)
+        elif what == "restart":
+            world.restart_keeper()
+        elif what == "find":
+            world.find(rest[0])
+        else:
+            world.run(rest[0])
+        world.run(0.2)
+        assert world.lethal() == set().union(*stands.values())
+    late = world.listener("late")
+    world.run(1.5)
+    composite: Any = late.replica._cost_map
+    assert set(np.flatnonzero(composite.kinds == MarkKind.LETHAL).tolist()) == set().union(*stands.values())
+
+
+def test_rows_of_no_sets_are_none() -> None:
+    assert rows_of([]) == b""

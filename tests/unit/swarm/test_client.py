@@ -1,0 +1,573 @@
+"""The client library, on a simulated network with real planners, keepers and replicas."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import threading
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.client_rig import Program, run_info
+from support.map_strategies import GRID as MAP_GRID
+from support.map_strategies import Composite
+from support.planner_swarm import GRID, Swarm, driven_s, rough
+from support.swarm_model import LossyLinks, SwarmModel
+
+from shared_map.keeper.store import KeeperStore
+from shared_map.replication.replica import MapReplica
+from swarm.bus.bus import Heard
+from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream
+from swarm.client.observer import marked
+from swarm.client.own_marks import OwnMarks
+from swarm.grid import GridSpec
+from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.processes import Note
+from swarm.wire.routes import Route as WireRoute
+from swarm.wire.routes import RouteStatus
+from swarm.wire.statements import FOREVER, MarkKind
+from swarm.wire.topics import BODY, NOTE, POSE, RUN
+
+LETHAL, CLEAR, PACE = MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE
+NOWHERE = [(math.nan, 5.0), (5.0, math.inf), (-0.1, -5.0), (5.0, 0.1), (1e12, -5.0), (500.1, -5.0), (5.0, -400.1)]
+
+
+class Bodies(list[Body]):
+    """All that is put on BODY."""
+
+    def __init__(self, world: SwarmModel) -> None:
+        world.bus("ear-of-bodies").subscribe(BODY, self._hear)
+
+    def _hear(self, event: Any) -> None:
+        assert isinstance(event, Heard)
+        assert isinstance(event.message, Body)
+        self.append(event.message)
+
+
+@pytest.fixture
+def world() -> Swarm:
+    swarm = Swarm(rough(3, lethal=0.0))
+    swarm.cells["t"] = GRID.cell(5, 40)
+    swarm.run(1.0)
+    return swarm
+
+
+# --- where a vehicle is -------------------------------------------------------------------------------------------
+
+
+def test_a_vehicle_is_heard_at_once_repeated_while_it_stands_and_gone_when_it_leaves(world: Swarm) -> None:
+    bodies, program = Bodies(world), Program(world)
+    with program.swarm.vehicle("rover", radius_m=2.0, lease_s=1.0) as rover:
+        rover.at(105.0, -55.0, heading_rad=1.0, speed_m_per_s=3.0)
+        world.run(0.01)
+        assert [(b.x_m, b.y_m, b.heading_rad, b.speed_m_per_s, b.radius_m) for b in bodies] == [(105, -55, 1, 3, 2)]
+        world.run(3.0)
+        stamps = [body.stamp_ns for body in bodies]
+        assert max(b - a for a, b in pairwise(stamps)) < 0.35e9, "well within the lease"
+        assert [body.seq for body in bodies] == list(range(1, len(bodies) + 1))
+    world.run(0.01)
+    assert bodies[-1].lease_s == 0
+    many = len(bodies)
+    world.run(2.0)
+    assert len(bodies) == many
+    rover.leave()
+
+
+@pytest.mark.parametrize(("x_m", "y_m"), NOWHERE)
+def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(
+    world: Swarm, x_m: float, y_m: float
+) -> None:
+    bodies, program = Bodies(world), Program(world)
+    with program.swarm as swarm:
+        rover, target = swarm.vehicle("rover"), swarm.target("t9")
+        rover.at(5.0, -5.0)
+        for thing in (rover, target):
+            with pytest.raises(
+                ConfigError, match=f"{thing.id}: x_m .* is (no place|outside the terrain)"
+            ) as caught:
+                thing.at(x_m, y_m)
+            assert "\n" not in str(caught.value)
+        assert swarm.counts["refused"] == 2
+        world.run(1.2)
+        assert {(body.x_m, body.y_m) for body in bodies} == {(5.0, -5.0)}
+        assert len(bodies) >= 2
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"id": "a b"}, {"id": "a0-01"}, {"group": "x/y"}, {"radius_m": -1.0}, {"radius_m": math.nan}, {"lease_s": 0.0},
+     {"lease_s": 1e9}],
+)  # fmt: skip
+def test_a_vehicle_that_cannot_be_is_refused_in_a_sentence(world: Swarm, wrong: dict[str, Any]) -> None:
+    program = Program(world)
+    (name,) = wrong
+    with pytest.raises(ConfigError, match=name):
+        program.swarm.vehicle(**({"id": "rover"} | wrong))
+    assert program.swarm.counts["refused"] == 1
+
+
+def test_wrong_headings_and_speeds_are_refused_by_the_rules_of_the_wire(world: Swarm) -> None:
+    rover = Program(world).swarm.vehicle("rover")
+    for wrong in ({"heading_rad": 99.0}, {"speed_m_per_s": -1.0}, {"speed_m_per_s": math.nan}):
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            rover.at(5.0, -5.0, **wrong)
+
+
+def test_two_programs_with_one_id_are_both_told_whose_word_counts(world: Swarm) -> None:
+    early, late = Program(world, "early"), Program(world, "late")
+    early.swarm.vehicle("rover").at(5.0, -5.0)
+    world.run(0.1)
+    late.swarm.vehicle("rover").at(95.0, -95.0)
+    world.run(3.0)
+    [told], [told_late] = early.problems, late.problems
+    assert told == (
+        "another process reports vehicle rover, which started later, so vehicles avoid its place and not ours"
+    )
+    assert "started earlier" in told_late
+    assert early.swarm.counts["doubles_heard"] > 3, "told once, counted always"
+
+
+# --- routes -------------------------------------------------------------------------------------------------------
+
+
+def test_a_route_is_the_planners_and_costs_what_it_says(world: Swarm) -> None:
+    rover = Program(world).swarm.vehicle("rover")
+    rover.at(*GRID.centre_m(GRID.cell(30, 3)))
+    asked = rover.route_soon("t")
+    world.run(0.1)
+    route = asked.result(0)
+    assert route.ok
+    assert (route.cells[0], route.cells[-1]) == (GRID.cell(30, 3), GRID.cell(5, 40))
+    assert route.points_m[0] == GRID.centre_m(GRID.cell(30, 3))
+    directions = world.ear.routes(GRID.cell(30, 3)).routes[0].directions
+    wire = WireRoute(status=RouteStatus.OK, start=route.cells[0], directions=directions, cost_s=1.0)
+    assert driven_s(world.pace, wire) == pytest.approx(route.cost_s, rel=1e-4)
+    assert 0 < route.lower_bound_s <= route.cost_s * 1.0001
+
+
+def test_no_planner_is_a_bus_error_and_a_place_comes_first(world: Swarm) -> None:
+    rover = Program(world).swarm.vehicle("rover")
+    with pytest.raises(ConfigError, match="call at\\(\\) first"):
+        rover.route("t")
+    rover.at(5.0, -5.0)
+    asked = rover.route_soon("t7", timeout_s=0.5)
+    world.run(1.0)
+    with pytest.raises(BusError, match="no route to 't7': nobody answers"):
+        asked.result(0)
+    with pytest.raises(ConfigError, match="target 'a/b'"):
+        rover.route("a/b")
+
+
+def test_who_follows_a_target_gets_a_new_route_when_it_moves_and_none_while_nothing_changes(world: Swarm) -> None:
+    rover = Program(world).swarm.vehicle("rover")
+    rover.at(*GRID.centre_m(GRID.cell(30, 3)))
+    told: list[Route] = []
+    rover.on_route(told.append)
+    routes = rover.follow("t")
+    world.run(4.0)
+    assert len(told) == 1
+    world.cells["t"] = GRID.cell(20, 45)
+    world.until(lambda: told[-1].cells[-1] == GRID.cell(20, 45), within_s=2.0)
+    assert routes.newest is told[-1]
+    assert [routes.next(0) for _ in told] == told
+    rover.unfollow()
+    assert routes.closed
+
+
+def test_driving_along_the_newest_route_arrives_where_the_target_is(world: Swarm) -> None:
+    """The loop of the documentation, at ten times its steps."""
+    rover = Program(world).swarm.vehicle("rover")
+    x_m, y_m = GRID.centre_m(GRID.cell(30, 3))
+    rover.at(x_m, y_m)
+    routes = rover.follow("t")
+    world.run(0.5)
+    for step in range(400):
+        route = routes.newest
+        assert route is not None
+        if route.arrived:
+            break
+        if step == 20:
+            world.cells["t"] = GRID.cell(20, 45)
+        x_m, y_m, heading_rad = route.ahead(x_m, y_m, distance_m=3.0)
+        rover.at(x_m, y_m, heading_rad=heading_rad, speed_m_per_s=30.0)
+        world.run(0.1)
+    assert GRID.distance_cells(rover.cell, GRID.cell(20, 45)) <= 1
+
+
+def test_a_planner_that_goes_is_told_once_and_its_successor_followed_without_a_word(world: Swarm) -> None:
+    program = Program(world)
+    rover = program.swarm.vehicle("rover")
+    rover.at(*GRID.centre_m(GRID.cell(30, 3)))
+    routes = rover.follow("t")
+    world.run(1.0)
+    world.kill("planner-t-1")
+    world.run(20.0)
+    assert program.problems == ["vehicle rover gets no route to t: nobody answers"]
+    world.planner("t", 2)
+    world.cells["t"] = GRID.cell(33, 33)
+    world.run(8.0)
+    assert routes.newest is not None
+    assert routes.newest.cells[-1] == GRID.cell(33, 33)
+
+
+# --- marks --------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_marked_reaches_every_replica_and_the_keeper_and_ends_when_it_should() -> None:
+    world = SwarmModel()
+    keeper, ear = world.keeper("0", KeeperStore(":memory:")), world.listener("ear")
+    program = Program(world)
+    rover = program.swarm.vehicle("rover")
+    cells = [0, 5, MAP_GRID.cells - 1]
+    assert rover.mark(cells, lethal=True) == 3
+    assert rover.mark([7], pace_s_per_m=0.5, for_s=5.0) == 1
+    world.run(1.0)
+    kinds = ear.replica._cost_map.kinds
+    assert [kinds[cell] for cell in (*cells, 7, 8)] == [LETHAL, LETHAL, LETHAL, PACE, CLEAR]
+    world.run(6.0)
+    assert kinds[7] == CLEAR
+    rover.mark([5], clear=True)
+    world.run(1.0)
+    assert (kinds[5], kinds[0]) == (CLEAR, LETHAL)
+    rover.leave()
+    world.run(1.0)
+    late = world.listener("late")
+    world.run(2.0)
+    assert late.replica._cost_map.kinds.tolist() == kinds.tolist(), "the keeper has it, though its author is gone"
+    assert keeper is not None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_marks_reach_every_replica_though_messages_are_lost_and_repeated(seed: int) -> None:
+    world = SwarmModel(LossyLinks(seed, dropped=0.4, repeated=0.3, jitter_ms=50))
+    ears = [world.keeper("0", KeeperStore(":memory:")), world.listener("ear")]
+    rover = Program(world).swarm.vehicle("rover")
+    rng = np.random.default_rng(seed)
+    for _ in range(6):
+        how = [{"lethal": True}, {"clear": True}, {"pace_s_per_m": 0.5}][rng.integers(3)]
+        rover.mark(rng.integers(0, MAP_GRID.cells, 20).tolist(), **how)
+        world.run(0.3)
+    world.run(20.0)
+    expected = rover._marks
+    for ear in ears[1:]:
+        held = {tile: ear.replica.held.of_tile(tile) for tile in expected._sets}
+        assert held == {tile: [each] for tile, each in expected._sets.items()}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        ({}, "states one thing"),
+        ({"lethal": True, "clear": True}, "states one thing"),
+        ({"pace_s_per_m": 0.0}, "pace_s_per_m is 0.0"),
+        ({"pace_s_per_m": math.nan}, "pace_s_per_m is nan"),
+        ({"lethal": True, "for_s": -1.0}, "for_s is -1.0"),
+        ({"lethal": True, "cells": [3, 10**9]}, "cell 1000000000 is outside"),
+        ({"lethal": True, "cells": [-1]}, "cell -1 is outside"),
+    ],
+)
+def test_a_wrong_mark_is_refused_whole(world: Swarm, wrong: dict[str, Any], complaint: str) -> None:
+    program = Program(world)
+    rover = program.swarm.vehicle("rover")
+    with pytest.raises(ConfigError, match=complaint):
+        rover.mark(**({"cells": [3]} | wrong))
+    world.run(0.5)
+    assert not rover._marks.any
+    assert program.swarm.counts["refused"] == 1
+
+
+def test_a_keeper_that_took_us_for_dead_is_told_again_under_a_higher_epoch() -> None:
+    marks = OwnMarks("all.r.1", "all", MAP_GRID)
+    [mine] = marks.state([3], LETHAL, 0.0, 100)
+    shortened = MarkSet(
+        author="all.r.1", group="all", tile=0, epoch=1, seq=mine.seq + 1, cells=b"", kinds=b"", paces=b"",
+        stamps_ns=b"",
+    )  # fmt: skip
+    [again] = marks.heard(shortened, 200)
+    assert (again.epoch, again.cells) == (2, mine.cells)
+    assert marks.heard(mine, 300) == marks.heard(again, 300) == []
+
+
+stated = st.tuples(
+    st.sampled_from(["all.a.1", "all.b.2", "all.c.3"]),
+    st.lists(st.integers(0, MAP_GRID.cells - 1), min_size=1, max_size=6),
+    st.sampled_from(list(MarkKind)),
+    st.integers(0, 40),
+    st.sampled_from([10, 30, FOREVER]),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(stated, max_size=12), st.integers(0, 50))
+def test_what_an_observer_shows_as_marked_is_what_a_replica_holds(words: Any, now_ns: int) -> None:
+    authors = {name: OwnMarks(name, "all", MAP_GRID) for name in ("all.a.1", "all.b.2", "all.c.3")}
+    replica = MapReplica(MAP_GRID, Composite())
+    sets: dict[tuple[int, str], MarkSet] = {}
+    for name, cells, kind, at_ns, until_ns in words:
+        for each in authors[name].state(cells, kind, 0.5, at_ns, until_ns):
+            sets[each.tile, each.author] = each
+    replica.tick(now_ns)
+    replica.merge(list(sets.values()))
+    shown = marked(sets.values(), MAP_GRID, now_ns)
+    kinds, paces = np.full(MAP_GRID.cells, CLEAR), np.zeros(MAP_GRID.cells, np.float32)
+    for cell, mark in shown.items():
+        kinds[cell] = LETHAL if mark.lethal else PACE
+        paces[cell] = mark.pace_s_per_m or 0.0
+    assert replica._cost_map.kinds.tolist() == kinds.tolist()
+    assert replica._cost_map.paces.tolist() == paces.tolist()
+
+
+# --- targets, observers, the session ------------------------------------------------------------------------------
+
+
+def test_a_target_that_a_program_tracks_is_followed_by_its_planner() -> None:
+    world = Swarm(rough(3, lethal=0.0))
+    program = Program(world)
+    with program.swarm.target("t") as target:
+        target.at(*GRID.centre_m(GRID.cell(9, 9)))
+        world.run(5.0)
+        assert world.ear.routes(GRID.cell(30, 30)).target_cell == GRID.cell(9, 9)
+        target.at(*GRID.centre_m(GRID.cell(9, 10)))
+        world.run(1.0)
+        assert world.ear.routes(GRID.cell(30, 30)).target_cell == GRID.cell(9, 10)
+
+
+def test_of_two_trackers_both_are_told_whose_poses_count_and_the_second_takes_over_when_the_first_leaves(
+    world: Swarm,
+) -> None:
+    one, other, watcher = Program(world, "one"), Program(world, "other"), Program(world, "watcher")
+    watching = watcher.swarm.observer()
+    first = one.swarm.target("x", tracker="radar")
+    first.at(5.0, -5.0)
+    world.run(2.0)
+    second = other.swarm.target("x")
+    second.at(95.0, -5.0)
+    world.run(2.0)
+    assert (first.owned, second.owned) == (True, False)
+    assert one.problems == ["another tracker reports target x too: our poses count"]
+    assert other.problems == ["tracker radar owns target x: its poses count, not ours"]
+    seen = watching.targets["x"]
+    assert (seen.x_m, seen.tracker, seen.lost) == (5.0, "radar", False)
+    first.leave()
+    world.run(1.0)
+    assert second.owned
+    assert watching.targets["x"].x_m == 95.0
+    other.bus.close()
+    world.run(3.0)
+    assert watching.targets["x"].lost
+
+
+@pytest.mark.parametrize("wrong", [{"id": "a b"}, {"tracker": "a/b"}, {"lease_s": 0.0}, {"lease_s": math.nan}])
+def test_a_target_that_cannot_be_is_refused_in_a_sentence(world: Swarm, wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=r"target|tracker|lease_s"):
+        Program(world).swarm.target(**({"id": "x"} | wrong))
+
+
+def test_a_follower_is_told_when_its_targets_tracker_is_lost() -> None:
+    world = Swarm(rough(3, lethal=0.0))
+    program = Program(world)
+    target = program.swarm.target("t", lease_s=1.0)
+    target.at(*GRID.centre_m(GRID.cell(9, 9)))
+    world.run(1.0)
+    follower = Program(world, "follower").swarm.vehicle("rover")
+    follower.at(*GRID.centre_m(GRID.cell(30, 3)))
+    routes = follower.follow("t")
+    world.run(1.5)
+    assert routes.newest is not None
+    assert (routes.newest.tracker_lost, routes.newest.pose_age_s is not None) == (False, True)
+    program.bus.close()
+    world.run(4.0)
+    assert routes.newest.tracker_lost
+
+
+def test_an_observer_sees_vehicles_targets_marks_and_captures(world: Swarm) -> None:
+    program, watcher = Program(world), Program(world, "watcher")
+    watching = watcher.swarm.observer()
+    captures: list[Note] = []
+    watching.on_capture(captures.append)
+    rover = program.swarm.vehicle("rover")
+    rover.at(5.0, -5.0)
+    rover.mark([77], lethal=True)
+    for kind in ("capture", "other"):
+        note = Note(role="targets", id="0", stamp_ns=1, kind=kind, text=f"a {kind}")
+        world.ear.bus.publish(NOTE, note, role="targets", id="0")
+    world.run(1.0)
+    assert watching.vehicles["rover"].state == "outside"
+    assert (watching.targets["t"].id, list(watching.marks)) == ("t", [77])
+    assert [each.text for each in captures] == ["a capture"]
+    assert [watching.notes.next(0).kind for _ in range(2)] == ["capture", "other"]
+    rover.leave()
+    world.run(3.0)
+    assert "rover" not in watching.vehicles
+    late = Program(world, "late").swarm.observer()
+    world.run(1.0)
+    assert list(late.marks) == [] or list(late.marks) == [77]
+    watching.leave()
+    assert list(watching.notes) == []
+
+
+def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> None:
+    bodies, program = Bodies(world), Program(world)
+    rover = program.swarm.vehicle("rover", lease_s=40.0)
+    rover.at(5.0, -5.0)
+    world.run(0.1)
+    world.cut(program.bus)
+    world.run(1.0)
+    assert not program.swarm.connected
+    rover.at(15.0, -5.0)
+    world.run(0.1)
+    assert {body.x_m for body in bodies} == {5.0}
+    world.heal(program.bus)
+    world.run(0.1)
+    assert program.swarm.connected
+    assert bodies[-1].x_m == 15.0
+
+
+def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Swarm) -> None:
+    program = Program(world)
+    rover = program.swarm.vehicle("rover")
+    world.kill("planner-t-1")
+    world.kill("a0.1")
+    world.cut(program.bus)
+    other = world.bus("other")
+
+    def answer(event: Any) -> None:
+        event.answer(run_info(GRID, "run2"))
+        event.end()
+
+    other.serve(RUN, answer, role="keeper", id="0")
+    world.run(0.5)
+    world.heal(program.bus)
+    world.run(3.0)
+    with pytest.raises(RunMismatchError, match="run run is over, and run run2 is in its namespace: connect again"):
+        rover.at(5.0, -5.0)
+
+
+def test_a_closed_connection_takes_everything_away_and_says_so(world: Swarm) -> None:
+    bodies, program = Bodies(world), Program(world)
+    with program.swarm as swarm:
+        rover = swarm.vehicle("rover")
+        rover.at(5.0, -5.0)
+        asked = rover.route_soon("t")
+    world.run(0.1)
+    assert bodies[-1].lease_s == 0
+    with pytest.raises(BusError, match="closed"):
+        asked.result(0)
+    with pytest.raises(BusError, match="closed"):
+        rover.at(5.0, -5.0)
+    swarm.close()
+
+
+def test_a_callback_that_fails_ends_nothing_and_one_that_would_wait_for_ever_is_told(world: Swarm) -> None:
+    program = Program(world)
+    rover = program.swarm.vehicle("rover")
+    rover.at(*GRID.centre_m(GRID.cell(30, 3)))
+    errors: list[BaseException] = []
+
+    def wait(route: Route) -> None:
+        try:
+            rover.route("t")
+        except ConfigError as error:
+            errors.append(error)
+        raise ValueError("a fault of the program")
+
+    rover.on_route(wait)
+    rover.follow("t")
+    world.run(1.0)
+    assert "callback must not wait" in str(errors[0])
+    assert program.swarm.counts["callbacks_failed"] == 1
+
+
+# --- values -------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from([0.5, 10.0, 90.0]), st.data())
+def test_the_middle_of_every_cell_is_in_that_cell(rows: int, cols: int, resolution_m: float, data: Any) -> None:
+    frame = Frame(GridSpec(rows, cols, resolution_m, 432_100.5, 5_400_000.25, "EPSG:32632"))
+    cell = data.draw(st.integers(0, rows * cols - 1))
+    assert frame.cell(*frame.centre_m(cell)) == cell
+    x_m, y_m = frame.centre_m(cell)
+    assert frame.cells_within(x_m, y_m, 0.0) == [cell]
+    radius_m = data.draw(st.floats(0, 4 * resolution_m))
+    near = [c for c in range(rows * cols) if math.dist(frame.centre_m(c), (x_m, y_m)) <= radius_m]
+    assert frame.cells_within(x_m, y_m, radius_m) == near
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(st.floats(-30, 230), st.floats(-230, 30)), min_size=3, max_size=7))
+def test_the_cells_of_a_polygon_are_those_whose_middle_a_ray_leaves_an_odd_number_of_times(corners: Any) -> None:
+    frame = Frame(GridSpec(20, 20, 10.0))
+
+    def inside(x: float, y: float) -> bool:
+        odd = False
+        for (ax, ay), (bx, by) in zip(corners, [*corners[1:], corners[0]], strict=True):
+            if (ay <= y) != (by <= y) and x >= ax + (y - ay) / (by - ay) * (bx - ax):
+                odd = not odd
+        return odd
+
+    assert frame.cells_in(corners) == [c for c in range(400) if inside(*frame.centre_m(c))]
+
+
+def test_latitudes_need_coordinates_and_pyproj() -> None:
+    with pytest.raises(ConfigError, match="has no coordinates"):
+        Frame(GridSpec(2, 2, 10.0)).from_wgs84(48.0, 9.0)
+    with pytest.raises(ConfigError, match="no place on Earth"):
+        Frame(GridSpec(2, 2, 10.0, crs="EPSG:32632")).from_wgs84(148.0, 9.0)
+    frame = Frame(GridSpec(2, 2, 10.0, 499_990.0, 5_316_300.0, crs="EPSG:32632"))
+    try:
+        x_m, y_m = frame.from_wgs84(48.0, 9.0)
+    except ConfigError as error:
+        assert "pip install 'terrain-swarm[wgs84]'" in str(error)  # noqa: PT017
+    else:
+        assert (x_m, y_m) == pytest.approx((500_000.0, 5_316_300.0), abs=100)
+        assert frame.to_wgs84(x_m, y_m) == pytest.approx((48.0, 9.0), abs=1e-9)
+
+
+def a_route(*cells: tuple[int, int]) -> Route:
+    frame = Frame(GRID)
+    return Route(frame, "t", "ok", tuple(GRID.cell(*cell) for cell in cells), 1.0, 1.0, 0.0)
+
+
+def test_ahead_goes_on_from_the_nearest_point_and_ends_at_the_end() -> None:
+    route = a_route((0, 0), (0, 1), (0, 2), (1, 2))
+    assert route.length_m == 30.0
+    assert route.ahead(5.0, -5.0, 4.0) == (9.0, -5.0, math.pi / 2)
+    assert route.ahead(12.0, 3.0, 4.0) == (16.0, -5.0, math.pi / 2)
+    assert route.ahead(5.0, -5.0, 24.0) == pytest.approx((25.0, -9.0, math.pi))
+    assert route.ahead(5.0, -5.0, 1e9)[:2] == (25.0, -15.0)
+    assert a_route((3, 3)).ahead(0.0, 0.0, 5.0)[:2] == GRID.centre_m(GRID.cell(3, 3))
+    assert Route(Frame(GRID), "t", "unreachable", (), math.inf, 0.0, 0.0).ahead(1.0, 2.0, 5.0) == (1.0, 2.0, 0.0)
+
+
+def test_a_stream_is_read_by_a_thread_and_by_asyncio_and_ends_when_closed() -> None:
+    stream: Stream[int] = Stream()
+    threading.Timer(0.05, lambda: [stream.put(n) for n in range(3)]).start()
+    threading.Timer(0.3, stream.close).start()
+    assert list(stream) == [0, 1, 2]
+    later: Stream[int] = Stream()
+
+    async def read() -> list[int]:
+        threading.Timer(0.05, lambda: [later.put(n) for n in range(3)]).start()
+        threading.Timer(0.3, later.close).start()
+        return [value async for value in later]
+
+    assert asyncio.run(read()) == [0, 1, 2]
+    assert later.newest == 2
+    bounded: Stream[int] = Stream(2)
+    for n in range(5):
+        bounded.put(n)
+    assert (bounded.next(0), bounded.next(0), bounded.next(0)) == (3, 4, None)
+
+
+def test_poses_of_a_target_go_out_twice_a_second(world: Swarm) -> None:
+    heard: list[Any] = []
+    world.bus("ear2").subscribe(POSE, heard.append, target="x")
+    Program(world).swarm.target("x").at(5.0, -5.0)
+    world.run(3.0)
+    assert len(heard) >= 7

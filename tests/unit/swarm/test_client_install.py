@@ -1,0 +1,115 @@
+"""What a robot installs: the client library imports little, quickly, and reads every message without NumPy."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.wire_strategies import EXAMPLES, routes
+
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.marks import MarkSets
+from swarm.wire.routes import RouteBatch, Routes
+
+ROOT = Path(__file__).parents[3]
+LARGE = (
+    "numba",
+    "rasterio",
+    "rerun",
+    "matplotlib",
+    "scipy",
+    "numpy",
+    "skimage",
+    "sklearn",
+    "typer",
+    "rich",
+    "cryptography",
+)
+BLOCKED = f"import sys; sys.modules.update(dict.fromkeys({LARGE!r}))\n"
+"""Makes them as good as not installed."""
+
+
+def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    at_home = {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+    return subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **at_home, **environment}, capture_output=True, text=True,
+        timeout=60, check=False,
+    )  # fmt: skip
+
+
+def test_the_client_imports_nothing_large() -> None:
+    code = f"import sys, swarm.client; print([name for name in {LARGE!r} if name in sys.modules])"
+    assert python(code).stdout == "[]\n"
+    done = python(BLOCKED + "import swarm.client.connection, swarm.bus.zenoh_bus, swarm.config.load; print('fine')")
+    assert done.stdout == "fine\n", done.stderr
+
+
+def test_the_client_imports_within_a_third_of_a_second() -> None:
+    """The processor's time, the best of five: 0.13 s on two shared virtual cores, with its bytecode compiled."""
+    code = "import time; began_s = time.process_time(); import swarm.client; print(time.process_time() - began_s)"
+    assert min(float(python(code, PYTHONDONTWRITEBYTECODE="").stdout) for _ in range(5)) < 0.33
+
+
+def test_without_numpy_every_message_is_read_as_with_it() -> None:
+    """But many sets of marks in one message, for which a client does not ask."""
+    payloads = [encode(each).hex() for each in EXAMPLES if not isinstance(each, MarkSets)]
+    code = BLOCKED + (
+        "import swarm.wire.topics as topics\n"
+        "from swarm.wire.codec import decode, encode, schema_of_type\n"
+        "import msgpack\n"
+        "kinds = {schema_of_type(k): k for t in topics.TOPICS for k in (t.message, t.request) if k}\n"
+        "for text in sys.stdin.read().split():\n"
+        "    payload = bytes.fromhex(text)\n"
+        "    kind = kinds[msgpack.unpackb(payload, strict_map_key=False)['schema']]\n"
+        "    message = decode(payload, kind)\n"
+        "    routes = [each.cost_s for each in message.routes] if kind.__name__ == 'RouteReply' else ''\n"
+        "    print(encode(message).hex(), routes)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], input="\n".join(payloads), capture_output=True, text=True, cwd=ROOT,
+        timeout=60, check=False,
+    )  # fmt: skip
+    assert [line.split()[0] for line in done.stdout.splitlines()] == payloads, done.stderr
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(routes, max_size=5))
+def test_routes_read_as_lists_are_those_read_as_arrays(some: list[object]) -> None:
+    columns: Routes = RouteBatch.of(some).columns()  # type: ignore[arg-type]
+    assert columns.listed == list(columns.batch)
+
+
+def test_bulk_marks_without_numpy_are_refused_in_a_sentence() -> None:
+    [bulk] = [each for each in EXAMPLES if isinstance(each, MarkSets)]
+    assert decode(encode(bulk), MarkSets) == bulk
+    code = BLOCKED + (
+        "from swarm.wire.codec import decode; from swarm.wire.messages.marks import MarkSets\n"
+        "from swarm.errors import ProtocolError\n"
+        f"try: decode(bytes.fromhex('{encode(bulk).hex()}'), MarkSets)\n"
+        "except ProtocolError as error: print(error)\n"
+    )
+    assert python(code).stdout == "many sets at once are read with NumPy only: ask without `bulk`\n"
+
+
+def test_the_command_on_a_small_install_says_what_to_install() -> None:
+    done = python(BLOCKED + "from launch_scripts.entry import main; sys.exit(main())")
+    assert done.returncode == 1
+    assert done.stdout == ""
+    [sentence] = done.stderr.splitlines()
+    assert sentence.startswith(
+        "swarm: the command needs typer, which is not installed: pip install 'terrain-swarm[all]'"
+    )
+
+
+def test_what_a_small_install_brings_is_zenoh_and_the_messages() -> None:
+    """38 MB with all that they need, where the whole takes 1 GB (`du -sm` of a new environment's site-packages)."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert {each.partition("=")[0].partition(">")[0] for each in project["dependencies"]} == {
+        "eclipse-zenoh", "msgpack", "msgspec",
+    }  # fmt: skip
+    assert project["scripts"] == {"swarm": "launch_scripts.entry:main"}

@@ -1,0 +1,236 @@
+"""What a body's report is taken for: bad ones are named once, counted, and open no cell."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+
+import msgpack
+import numpy as np
+import pytest
+
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import PlannerConfig
+from swarm.errors import ProtocolError
+from swarm.grid import GridSpec
+from swarm.wire.codec import decode, encode
+from swarm.wire.messages.bodies import Body
+from vehicle_agent.bodies import MOST_BODIES, Bodies
+from vehicle_agent.driving.vehicle import GivenRoute, Vehicle
+from vehicle_agent.traffic.detours import Detours
+from vehicle_agent.traffic.steering import Steering
+
+GRID = GridSpec(40, 40, 10.0)
+NOW = 10**18
+TICK = NS_PER_S // 10
+
+
+def body(row: float, col: float, **said: object) -> Body:
+    """A body at (row, col), in cells from the corner."""
+    place = {"x_m": col * 10.0, "y_m": -row * 10.0}
+    return Body(**({"id": "r1", "incarnation": 1, "seq": 1, "radius_m": 1.0, **place} | said))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def bodies() -> Bodies:
+    bodies = Bodies(GRID)
+    bodies.tick(NOW)
+    return bodies
+
+
+def closed(bodies: Bodies) -> set[tuple[int, int]]:
+    return {divmod(cell, 40) for cell in range(GRID.cells) if cell in bodies.closed}
+
+
+def test_a_body_closes_its_cell_until_its_lease_ends_by_our_clock_whatever_its_own_says(bodies: Bodies) -> None:
+    bodies.hear(body(5.5, 5.5, lease_s=0.3, stamp_ns=NOW - 3600 * NS_PER_S), NOW)
+    assert closed(bodies) == {(5, 5)}
+    for tick in range(1, 4):
+        assert closed(bodies) == {(5, 5)}
+        bodies.tick(NOW + tick * TICK)
+    assert closed(bodies) == set()
+    assert bodies.take_changed()
+    assert bodies.refused == 0
+
+
+def test_a_moving_body_closes_the_way_that_it_may_have_gone_since_it_was_heard(bodies: Bodies) -> None:
+    bodies.hear(body(5.5, 5.5, heading_rad=math.pi / 2, speed_m_per_s=20.0, lease_s=2.0), NOW)
+    assert closed(bodies) == {(5, 5), (5, 6)}
+    for tick in range(1, 11):
+        bodies.tick(NOW + tick * TICK)
+    assert closed(bodies) == {(5, col) for col in range(5, 9)}
+    bodies.hear(body(5.5, 7.5, seq=2, heading_rad=0.0, speed_m_per_s=20.0), NOW + 10 * TICK)
+    assert closed(bodies) == {(5, 7), (4, 7)}
+
+
+def test_without_a_heading_it_may_go_any_way(bodies: Bodies) -> None:
+    bodies.hear(body(5.5, 5.5, speed_m_per_s=10.0), NOW)
+    assert closed(bodies) == {(row, col) for row in (4, 5, 6) for col in (4, 5, 6)} - {
+        (4, 4),
+        (4, 6),
+        (6, 4),
+        (6, 6),
+    }
+
+
+def test_a_body_that_says_that_it_leaves_opens_its_cells_at_once(bodies: Bodies) -> None:
+    bodies.hear(body(5.5, 5.5), NOW)
+    bodies.hear(body(5.5, 5.5, seq=2, lease_s=0.0), NOW)
+    assert closed(bodies) == set()
+    assert not bodies.any
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ({"x_m": -500.0}, "outside the grid, whose west is 0 and north 0"),
+        ({"y_m": 9e8}, "outside the grid"),
+        ({"radius_m": 1000.0}, "its radius_m is 1000, expected at most 100"),
+    ],
+)
+def test_a_report_that_cannot_be_taken_in_is_named_once_and_counted(bodies: Bodies, said, why) -> None:
+    bodies.hear(body(5.5, 5.5), NOW)
+    for seq in range(2, 6):
+        bodies.hear(body(5.5, 5.5, seq=seq, **said), NOW)
+    assert closed(bodies) == {(5, 5)}, "what was known before lasts until its lease ends"
+    (text,) = bodies.complaints
+    assert text.startswith("body r1 is not avoided: ")
+    assert why in text
+    assert bodies.refused == 4
+
+
+@pytest.mark.parametrize("field", ["x_m", "y_m", "radius_m", "speed_m_per_s", "heading_rad", "lease_s"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e300, "here"])
+def test_what_is_no_number_is_refused_at_the_door_by_the_name_of_its_field(field: str, value: object) -> None:
+    payload = msgpack.packb(msgpack.unpackb(encode(body(1, 1))) | {field: value})
+    with pytest.raises(ProtocolError, match=field):
+        decode(payload, Body)
+
+
+def test_a_body_that_leaps_keeps_both_places_closed_and_is_named(bodies: Bodies) -> None:
+    bodies.hear(body(5.5, 5.5), NOW)
+    bodies.hear(body(30.5, 30.5, seq=2), NOW + TICK)
+    assert closed(bodies) == {(5, 5), (30, 30)}
+    assert bodies.complaints == ["body r1 leaps 354 m: where it was stays closed until the lease of that ends"]
+    for tick in range(1, 11):
+        bodies.tick(NOW + tick * TICK)
+    assert closed(bodies) == {(30, 30)}
+
+
+def test_two_senders_under_one_id_are_two_bodies_and_one_that_was_started_again_is_not(bodies: Bodies) -> None:
+    bodies.hear(body(5.5, 5.5, incarnation=1), NOW)
+    bodies.hear(body(30.5, 30.5, incarnation=2), NOW + 1)
+    bodies.hear(body(30.5, 30.5, incarnation=2, seq=2), NOW + 2)
+    assert closed(bodies) == {(5, 5), (30, 30)}
+    assert bodies.complaints == []
+    bodies.hear(body(5.5, 5.5, incarnation=1, seq=2), NOW + 3)
+    assert closed(bodies) == {(5, 5), (30, 30)}
+    assert bodies.complaints == ["body r1 has two senders, of incarnations 2 and 1: both places are closed"]
+
+
+def test_too_many_bodies_and_too_many_cells_are_refused_and_those_before_stay(bodies: Bodies) -> None:
+    for number in range(MOST_BODIES + 5):
+        bodies.hear(body(5.5, 5.5, id=f"r{number}"), NOW)
+    assert bodies.refused == 5
+    assert "256 others already" in bodies.complaints[0]
+    fine = Bodies(GridSpec(2000, 2000, 1.0))
+    fine.tick(NOW)
+    for number in range(10):
+        fine.hear(body(20.0 + number, 20.0, id=f"r{number}", radius_m=95.0), NOW)
+    assert fine.refused == 8
+    assert "expected at most 100000" in fine.complaints[0]
+    for tick in range(1, 21):
+        bodies.tick(NOW + tick * TICK)
+        fine.tick(NOW + tick * TICK)
+    assert not bodies.any
+    assert not fine.any
+    fine.hear(body(20.0, 20.0, radius_m=95.0), NOW + 2 * NS_PER_S)
+    assert fine.any, "what was given back can be used again"
+
+
+def test_a_stopped_process_forgets_no_body_in_the_time_in_which_it_did_not_listen(bodies: Bodies) -> None:
+    bodies.hear(body(5.5, 5.5, lease_s=1.0), NOW)
+    bodies.tick(NOW + 60 * NS_PER_S)
+    assert closed(bodies) == {(5, 5)}
+    assert bodies.was_deaf(60.0)
+    assert not bodies.was_deaf(0.2)
+
+
+# --- what vehicles make of it -------------------------------------------------------------------------------
+
+
+def steering(bodies: Bodies, pace: np.ndarray) -> Steering:
+    return Steering(GRID, pace, PlannerConfig(), 4, random.Random(1), lambda cell: False, bodies)
+
+
+def standing(bodies: Bodies, report: Body) -> None:
+    bodies.hear(report, NOW)
+    bodies.tick(NOW + NS_PER_S - 1)
+    bodies.hear(Body(**{f: getattr(report, f) for f in report.__struct_fields__} | {"seq": 2}), NOW + NS_PER_S - 1)
+    bodies.tick(NOW + NS_PER_S)
+
+
+def vehicle_on(route: list[int]) -> Vehicle:
+    vehicle = Vehicle("a0-00", GRID, route[0])
+    vehicle.assign("t", 0)
+    given = GivenRoute("t", tuple(route), 1.0, 1.0, partial=False)
+    assert vehicle.give_route(given, [route[0]], 0) is not None
+    return vehicle
+
+
+def drive_around(bodies: Bodies, pace: np.ndarray, ticks: int = 60) -> tuple[Vehicle, Detours]:
+    route = [GRID.cell(20, col) for col in range(5, 35)]
+    vehicle = vehicle_on(route)
+    detours = Detours(GRID, pace, steering(bodies, pace).steps, bodies)
+    for tick in range(ticks):
+        detours.tick([vehicle], lambda id: [route[0]], NOW + NS_PER_S + tick * TICK)
+    return vehicle, detours
+
+
+def test_a_body_that_stands_on_a_route_is_driven_around_by_the_cheapest_way(bodies: Bodies) -> None:
+    standing(bodies, body(20.5, 20.5, radius_m=25.0))
+    vehicle, detours = drive_around(bodies, np.full((40, 40), 0.1, np.float32))
+    cells = [GRID.cell(20, 5), *vehicle.route.ahead()]
+    assert detours.found == 1
+    assert cells[-1] == GRID.cell(20, 34)
+    assert not any(cell in bodies.closed for cell in cells)
+    assert all(GRID.distance_cells(a, b) == 1 for a, b in itertools.pairwise(cells))
+    assert len(cells) == 30, "diagonal steps aside cost no cell"
+
+
+def test_a_long_way_around_is_found_over_several_ticks(bodies: Bodies) -> None:
+    pace = np.full((40, 40), 0.1, np.float32)
+    pace[1:, 20] = np.inf
+    pace[20, 20] = 0.1  # a gate, and the way around the wall's north end
+    standing(bodies, body(20.5, 20.5, radius_m=2.0))
+    vehicle, detours = drive_around(bodies, pace)
+    assert detours.found == 1
+    assert GRID.cell(0, 20) in vehicle.route.ahead()
+
+
+def test_where_there_is_no_way_around_it_is_seldom_looked_for(bodies: Bodies) -> None:
+    pace = np.full((40, 40), 0.1, np.float32)
+    pace[:, 20] = np.inf
+    pace[20, 20] = 0.1
+    standing(bodies, body(20.5, 20.5, radius_m=2.0, lease_s=60.0))
+    vehicle, detours = drive_around(bodies, pace)
+    assert detours.found == 0
+    assert vehicle.route.left == 29
+
+
+def test_a_body_that_drives_on_is_waited_for(bodies: Bodies) -> None:
+    bodies.hear(body(20.5, 20.5, radius_m=5.0, heading_rad=0.0, speed_m_per_s=1.0), NOW)
+    _vehicle, detours = drive_around(bodies, np.full((40, 40), 0.1, np.float32), ticks=1)
+    assert detours.found == 0
+
+
+def test_a_vehicle_at_rest_makes_way_for_a_body_that_comes(bodies: Bodies) -> None:
+    pace = np.full((40, 40), 0.1, np.float32)
+    bodies.hear(body(20.5, 10.5, radius_m=2.0, heading_rad=math.pi / 2, speed_m_per_s=20.0), NOW)
+    bodies.tick(NOW)
+    wish = steering(bodies, pace).wish(Vehicle("a0-00", GRID, GRID.cell(20, 13)), [GRID.cell(20, 13)], 0, bool, 0)
+    assert wish.better == len(wish.wants) == 8
+    assert all(row != 20 for row, _ in (divmod(cell, 40) for cell in wish.wants[:2]))
+    aside = steering(bodies, pace).wish(Vehicle("a0-00", GRID, GRID.cell(25, 13)), [GRID.cell(25, 13)], 0, bool, 0)
+    assert aside.better == 0

@@ -1,0 +1,112 @@
+"""Vehicles driven at the speeds of a plug-in: never faster than the ground allows, never beyond their path."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
+from swarm.grid import GridSpec
+from swarm.plugins.find import Plugin
+from vehicle_agent.driving.dynamics import DynamicsWorld, PluginDynamics, Stretch, dynamics_of
+from vehicle_agent.driving.motion import Motion
+
+GRID = GridSpec(1, 30, 10.0)
+PACE = 0.1
+TICK_S = 0.1
+
+
+def driven_by(speed: Any) -> tuple[PluginDynamics, list[str], list[Stretch]]:
+    """Dynamics whose plug-in says these speeds, what is told of it, and what it was asked."""
+    told: list[str] = []
+    asked: list[Stretch] = []
+
+    class Says:
+        def speed(self, stretch: Stretch) -> Any:
+            asked.append(stretch)
+            return speed(stretch)
+
+    named = NamedPlugin(PLUGIN_KINDS["dynamics"], "vehicles.dynamics", "my:Own", {})
+    made = dynamics_of(Plugin(named, lambda world, options: Says(), {}), DynamicsWorld("a0", GRID, 1), told.append)
+    assert made is not None
+    return made, told, asked
+
+
+def drive(dynamics: PluginDynamics, motion: Motion, path: list[int], ticks: int) -> list[float]:
+    """Metres from the west after each tick, of a vehicle that was granted this path."""
+    places = []
+    for _ in range(ticks):
+        dynamics.begin(TICK_S)
+        left_s = TICK_S
+        while left_s > 0 and not (motion.at_rest and len(path) < 2):
+            if motion.at_rest:
+                motion.set_out(path[1])
+            left_s = dynamics.advance("v", motion, path, left_s, PACE)
+            if motion.cell != path[0]:
+                del path[0]
+        places.append(motion.place_m()[0])
+    return places
+
+
+def test_what_is_built_in_costs_no_call() -> None:
+    named = NamedPlugin(PLUGIN_KINDS["dynamics"], "vehicles.dynamics", "ground", {})
+    assert dynamics_of(Plugin(named, None, None), DynamicsWorld("a0", GRID, 1), print) is None
+
+
+def test_a_vehicle_keeps_the_speed_that_it_is_told() -> None:
+    dynamics, told, _ = driven_by(lambda stretch: 4.0)
+    places = drive(dynamics, Motion(GRID, 0), list(range(20)), 100)
+    assert places[-1] == pytest.approx(5.0 + 4.0 * 10.0)
+    assert not told
+
+
+def test_a_vehicle_speeds_up_tick_by_tick_however_many_stretches_a_tick_has() -> None:
+    dynamics, _, asked = driven_by(lambda stretch: stretch.speed_m_per_s + 2.0 * stretch.tick_s)
+    places = drive(dynamics, Motion(GRID, 0), list(range(30)), 40)
+    assert places[-1] - 5.0 == pytest.approx(sum(0.2 * n * TICK_S for n in range(1, 41)))
+    assert {stretch.tick_s for stretch in asked} == {TICK_S}
+    assert asked[0].speed_m_per_s == 0.0
+    assert asked[-1].speed_m_per_s == pytest.approx(0.2 * 39)
+
+
+def test_a_vehicle_that_stood_for_a_tick_begins_from_rest() -> None:
+    dynamics, _, asked = driven_by(lambda stretch: 10.0)
+    motion = Motion(GRID, 0)
+    drive(dynamics, motion, [0, 1], 20)
+    drive(dynamics, motion, [1, 2], 1)
+    assert asked[-1].speed_m_per_s == 0.0
+
+
+def test_a_plugin_is_told_how_far_its_vehicle_may_drive_and_how_it_turns() -> None:
+    square = GridSpec(5, 5, 10.0)
+    dynamics, _, asked = driven_by(lambda stretch: 10.0)
+    dynamics._grid = square
+    path = [0, 1, 7, 12]
+    drive(dynamics, Motion(square, 0), path, 60)
+    assert asked[0].ahead_m == pytest.approx(10 + 10 * math.sqrt(2) + 10)
+    assert asked[-1].ahead_m <= 5.0
+    turns = [stretch.turn_rad for stretch in asked if stretch.turn_rad]
+    assert turns == pytest.approx([math.pi / 4, math.pi / 4])
+    assert all(stretch.limit_m_per_s == pytest.approx(10.0) for stretch in asked)
+
+
+speeds = st.one_of(st.floats(), st.integers(), st.none(), st.booleans(), st.text(max_size=3))
+
+
+@given(st.lists(speeds, min_size=1, max_size=40), st.integers(1, 6))
+def test_whatever_is_said_no_vehicle_is_faster_than_the_ground_or_leaves_its_path(
+    said: list[Any], granted: int
+) -> None:
+    answers = iter(said)
+    dynamics, told, _ = driven_by(lambda stretch: next(answers))
+    motion = Motion(GRID, 0)
+    places = [5.0, *drive(dynamics, motion, list(range(granted)), len(said) + 20)]
+    for before, after in pairwise(places):
+        assert -1e-9 <= after - before <= TICK_S / PACE + 1e-9
+    assert motion.cell < granted
+    assert len(told) <= 1

@@ -1,0 +1,83 @@
+"""Vehicles and zones: whoever stands in one drives out, nobody drives in, and what they see there is no news."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from support.agent_world import OPEN, AgentWorld, pace_of, scenario
+
+from shared_map.keeper.store import KeeperStore
+from swarm.bus.bus import Event, Replied
+from swarm.wire.messages.orders import ZoneOrder, Zones
+from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.topics import ZONES
+
+
+class ClosedWorld(AgentWorld):
+    """Agents, and a keeper that takes orders."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.keeper("k", KeeperStore(":memory:"))
+        self.entered: list[str] = []
+        self._closed: set[int] = set()
+        self._inside: dict[str, int] = {}
+        self.after_tick.append(self._watch_borders)
+
+    def close(self, row0: int, col0: int, row1: int, col1: int) -> None:
+        corners: Any = [(row0, col0), (row0, col1), (row1, col1), (row1, col0)]
+        heard: list[Event] = []
+        self._watch.ask(
+            ZONES, ZoneOrder(action="add", name="z", polygon=corners), heard.append, tag="z", keeper="k"
+        )
+        self.run(0.5)
+        assert any(isinstance(event, Replied) and isinstance(event.message, Zones) for event in heard)
+        cols = self.terrain.grid.cols
+        self._closed = {row * cols + col for row in range(row0, row1) for col in range(col0, col1)}
+        self._inside = {vehicle.id: vehicle.cell for vehicle in self.vehicles() if vehicle.cell in self._closed}
+
+    def _watch_borders(self) -> None:
+        inside = {vehicle.id: vehicle.cell for vehicle in self.vehicles() if vehicle.cell in self._closed}
+        self.entered += inside.keys() - self._inside.keys() if self._closed else ()
+        self._inside = inside
+
+
+def test_vehicles_drive_out_of_a_zone_and_nobody_drives_in() -> None:
+    inside = [(row, col) for row in (7, 8, 9, 10) for col in (7, 8, 9, 10)]
+    world = ClosedWorld(scenario(len(inside), inside, per_agent=4, capture=15.0), pace_of(OPEN))
+    world.put_target("t", 9, 9)
+    world.start_all()
+    world.run(3.0)
+    world.close(5, 5, 13, 13)
+    world.until(lambda: not world._inside, within_s=30)
+    world.put_target("t", 9, 18, jumped=True)
+    # Nine places are within reach of it.
+    world.until(lambda: list(world.states().values()).count(VehicleState.ARRIVED) >= 6, within_s=60)
+    assert world.entered == []
+    world.assert_lawful()
+
+
+def test_what_is_seen_in_a_zone_is_not_marked() -> None:
+    world = ClosedWorld(scenario(1, [(10, 2)]), pace_of(OPEN))
+    world.put_target("t", 10, 12)
+    world.start_all()
+    world.run(1.0)
+    world.close(0, 6, 18, 8)
+    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
+    assert world.count("marks") == 0
+    assert world.entered == []
+    world.assert_lawful()
+
+
+def test_inflated_borders_of_a_zone_are_left_too_and_walls_are_not_crossed() -> None:
+    picture = ["." * 20 for _ in range(20)]
+    for row in range(6, 12):
+        picture[row] = picture[row][:10] + "#" + picture[row][11:]
+    world = ClosedWorld(scenario(2, [(8, 9), (9, 11)], per_agent=1), pace_of(picture))
+    world.put_target("t", 8, 19)
+    world.start_all()
+    world.run(0.5)
+    world.close(5, 6, 13, 15)
+    world.until(lambda: not world._inside, within_s=30)
+    assert world.entered == []
+    world.assert_lawful()

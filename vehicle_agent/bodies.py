@@ -1,0 +1,307 @@
+"""Which cells are closed by bodies: whatever reports where it is, with a lease, and speaks no right of way. Pure.
+
+A report closes the cells that its disc touches, and those that it touches within `REACTION_S` if it keeps its
+speed and heading. Until the next report it may have gone on as it said, so what is closed grows with its age. A
+cell is open again only if a newer report of the same body leaves it, or its lease ends. Leases count by the
+receiver's clock, from when a report was heard; nothing depends on what the sender's clock says.
+
+Where reports contradict each other, everything that either says is closed: two senders under one id are two bodies,
+and a body that leaps keeps its old place closed until that report's lease ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Container
+from dataclasses import dataclass, field
+
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec, Window
+from swarm.wire.messages.bodies import Body
+from vehicle_agent.discs import Capsule
+
+REACTION_S = 0.5
+"""Reports come ten times a second, take up to two ticks, and one or two of them may be lost."""
+MAKE_WAY_S = 2.0
+"""Vehicles at rest leave cells to which a body comes within this time."""
+STANDS_NS = NS_PER_S
+"""A body that has kept its place for so long is driven around, not waited for."""
+MOST_BODIES = 256
+MOST_RADIUS_M = 100.0
+MOST_CELLS = 100_000
+"""That all bodies together may close: bounds time and memory, and what liars can do."""
+_FURTHEST_CELLS = 64
+"""Cells ahead of a body that are closed, at most: whoever is quicker must look out."""
+_LONGEST_PAUSE_NS = NS_PER_S // 4
+"""Time between two ticks that counts for leases. A process that was stopped has not listened meanwhile."""
+_DEAF_S = 0.5
+_GHOSTS = 3
+"""Places that a body has leapt from and that are still closed, at most."""
+_MOST_TOLD = 1000
+_LEAP_M = 5.0
+"""Beyond what its speed explains: how far a place that satellites told may be wrong."""
+
+
+_NOTHING = Window(0, 0, 0, 0)
+
+
+def capsule_of(report: Body, grid: GridSpec, ahead_m: float, margin_m: float = 0.0) -> Capsule:
+    """What a body touches while it goes so far: by its heading, or any way if it tells none."""
+    ahead_m = min(ahead_m, _FURTHEST_CELLS * grid.resolution_m)
+    radius_m = report.radius_m + margin_m
+    if report.heading_rad is None:
+        return Capsule(report.x_m, report.y_m, 0.0, 0.0, radius_m + ahead_m)
+    east_m, north_m = math.sin(report.heading_rad) * ahead_m, math.cos(report.heading_rad) * ahead_m
+    return Capsule(report.x_m, report.y_m, east_m, north_m, radius_m)
+
+
+@dataclass(slots=True, eq=False)
+class _Known:
+    """What one report says.
+
+    cells     closed now; `ahead_m` is the length of the way to which they belong
+    charge    cells of the box that holds all that it can ever close
+    since_ns  since when the body has been near `anchor`
+    """
+
+    report: Body
+    heard_ns: int
+    until_ns: int
+    charge: int
+    anchor: tuple[float, float]
+    since_ns: int
+    ahead_m: float = -1.0
+    cells: frozenset[int] = frozenset()
+    window: Window = _NOTHING
+    coming: Capsule | None = None
+    ghosts: list[_Known] = field(default_factory=list)
+
+
+class Bodies:
+    """Bodies and the cells that they close.
+
+    Call `tick` before each use, and before the reports that have come since the last one: all answers are as of
+    then.
+
+    margin_m    added to each body's radius: the radius of a vehicle
+    complaints  a sentence for each id and kind of report that was not taken as it is; who tells them clears them
+    refused     how many such reports there were
+    """
+
+    def __init__(self, grid: GridSpec, margin_m: float = 0.0) -> None:
+        self.complaints: list[str] = []
+        self.refused = 0
+        self._grid = grid
+        self._margin_m = margin_m
+        self._known: dict[tuple[str, int], _Known] = {}
+        """(id, incarnation) -> its newest report."""
+        self._senders: dict[str, dict[int, None]] = {}
+        """Id -> the incarnations under which it is known."""
+        self._closed: Counter[int] = Counter()
+        """Cell -> by how many reports it is closed."""
+        self._charged = 0
+        self._told: set[tuple[str, str]] = set()
+        self._standing: set[int] | None = set()
+        self._changed: list[Window] = []
+        self._ticked_ns: int | None = None
+
+    @property
+    def closed(self) -> Container[int]:
+        """The cells that no vehicle may enter; one object for good, which changes with `hear` and `tick`."""
+        return self._closed
+
+    @property
+    def any(self) -> bool:
+        return bool(self._known)
+
+    def take_changed(self) -> list[Window]:
+        """Windows with all cells that were closed or opened since the last call."""
+        changed, self._changed = self._changed, []
+        return changed
+
+    # --- reports --------------------------------------------------------------------------------------------
+
+    def hear(self, report: Body, now_ns: int) -> None:
+        """Take in a report, after `tick` at the same time. One that is older than what is known of its sender
+        changes nothing."""
+        key = report.id, report.incarnation
+        known = self._known.get(key)
+        if known is not None and report.seq <= known.report.seq:
+            return
+        if report.lease_s <= 0.0:
+            if known is not None:
+                self._forget(key)
+            return
+        leaps = known is not None and self._leaps(known.report, report, now_ns - known.heard_ns)
+        charge, wrong = self._charge(report)
+        if wrong is None:
+            wrong = self._crowded(known, leaps, charge)
+        if wrong is not None:
+            self._complain("refused", report.id, f"is not avoided: {wrong}")
+            return
+        self._meet_namesake(report, known)
+        x_m, y_m = report.x_m, report.y_m
+        self._standing = None
+        made = _Known(report, now_ns, now_ns + int(report.lease_s * NS_PER_S), charge, (x_m, y_m), now_ns)
+        self._charged += charge
+        self._known[key] = made
+        self._cover(made, now_ns)
+        if known is None:
+            return
+        near_m = max(self._grid.resolution_m, report.radius_m)
+        if math.dist(known.anchor, made.anchor) <= near_m:
+            made.anchor, made.since_ns = known.anchor, known.since_ns
+        made.ghosts, known.ghosts = known.ghosts, []
+        if leaps:
+            made.ghosts.append(known)
+            far_m = math.hypot(x_m - known.report.x_m, y_m - known.report.y_m)
+            self._complain(
+                "leaps", report.id, f"leaps {far_m:.0f} m: where it was stays closed until the lease of that ends"
+            )
+            if len(made.ghosts) > _GHOSTS:
+                self._open(made.ghosts.pop(0))
+        else:
+            self._open(known)
+
+    def _charge(self, report: Body) -> tuple[int, str | None]:
+        """How many cells it may close until its lease ends, at most, and why it cannot be taken in."""
+        if report.radius_m > MOST_RADIUS_M:
+            return 0, f"its radius_m is {report.radius_m:g}, expected at most {MOST_RADIUS_M:g}"
+        window = self._capsule(report, report.speed_m_per_s * (REACTION_S + report.lease_s)).window(self._grid)
+        if window.empty:
+            grid, place = self._grid, f"x_m {report.x_m:g}, y_m {report.y_m:g}"
+            return 0, f"{place} is outside the grid, whose west is {grid.west_m:g} and north {grid.north_m:g}"
+        return window.cells, None
+
+    def _crowded(self, known: _Known | None, leaps: bool, charge: int) -> str | None:
+        if known is None and len(self._known) >= MOST_BODIES:
+            return f"there are {MOST_BODIES} others already, as many as there may be"
+        charged = self._charged + charge - (0 if known is None or leaps else known.charge)
+        if charged > MOST_CELLS:
+            return f"with it, bodies could close {charged} cells, expected at most {MOST_CELLS}"
+        return None
+
+    def _leaps(self, before: Body, report: Body, passed_ns: int) -> bool:
+        speed = max(before.speed_m_per_s, report.speed_m_per_s)
+        slack_m = _LEAP_M + self._grid.resolution_m + report.radius_m
+        far_m = slack_m + 2.0 * speed * (passed_ns / NS_PER_S + REACTION_S)
+        return math.hypot(report.x_m - before.x_m, report.y_m - before.y_m) > far_m
+
+    def _meet_namesake(self, report: Body, known: _Known | None) -> None:
+        """Tell if two senders take turns under one id; one that was started again does not return."""
+        senders = self._senders.setdefault(report.id, {})
+        senders[report.incarnation] = None
+        if known is None or len(senders) == 1:
+            return
+        for incarnation in senders:
+            namesake = self._known.get((report.id, incarnation))
+            if namesake is not None and namesake is not known and namesake.heard_ns > known.heard_ns:
+                both = f"{incarnation} and {report.incarnation}"
+                self._complain(
+                    "twice", report.id, f"has two senders, of incarnations {both}: both places are closed"
+                )
+                return
+
+    def _complain(self, kind: str, id: str, text: str) -> None:
+        self.refused += 1
+        if (kind, id) not in self._told and len(self._told) < _MOST_TOLD:
+            self._told.add((kind, id))
+            self.complaints.append(f"body {id} {text}")
+
+    # --- time passes ----------------------------------------------------------------------------------------
+
+    def tick(self, now_ns: int) -> None:
+        """End leases, and let what moves go on."""
+        passed_ns = 0 if self._ticked_ns is None else now_ns - self._ticked_ns
+        self._ticked_ns = now_ns
+        deaf_ns = max(passed_ns - _LONGEST_PAUSE_NS, 0)
+        self._standing = None
+        for key, known in list(self._known.items()):
+            for each in (known, *known.ghosts):
+                if deaf_ns and each.heard_ns < now_ns - deaf_ns:
+                    each.heard_ns += deaf_ns
+                    each.until_ns += deaf_ns
+            for ghost in [ghost for ghost in known.ghosts if now_ns >= ghost.until_ns]:
+                known.ghosts.remove(ghost)
+                self._open(ghost)
+            if now_ns >= known.until_ns:
+                self._forget(key)
+            elif known.report.speed_m_per_s > 0.0:
+                self._cover(known, now_ns)
+
+    @staticmethod
+    def was_deaf(pause_s: float) -> bool:
+        """Whether a process that let so much time pass between two ticks may not have heard what came meanwhile."""
+        return pause_s > _DEAF_S
+
+    def _forget(self, key: tuple[str, int]) -> None:
+        self._standing = None
+        known = self._known.pop(key)
+        senders = self._senders[key[0]]
+        senders.pop(key[1], None)
+        if not senders:
+            del self._senders[key[0]]
+        for each in (known, *known.ghosts):
+            self._open(each)
+
+    def _open(self, known: _Known) -> None:
+        self._charged -= known.charge
+        self._close(known, frozenset(), _NOTHING)
+
+    def _cover(self, known: _Known, now_ns: int) -> None:
+        """Close what the body can reach by now and within the reaction time."""
+        report = known.report
+        age_s = max(now_ns - known.heard_ns, 0) / NS_PER_S
+        # In steps of half a cell, so that it is seldom computed; never less than said.
+        step_m = 0.5 * self._grid.resolution_m
+        ahead_m = min(report.speed_m_per_s * (age_s + REACTION_S), _FURTHEST_CELLS * self._grid.resolution_m)
+        ahead_m = math.ceil(ahead_m / step_m) * step_m
+        if ahead_m == known.ahead_m:
+            return
+        known.ahead_m = ahead_m
+        capsule = self._capsule(report, ahead_m)
+        self._close(known, frozenset(capsule.cells(self._grid)), capsule.window(self._grid))
+        if report.speed_m_per_s > 0.0:
+            known.coming = self._capsule(report, report.speed_m_per_s * (age_s + MAKE_WAY_S))
+
+    def _close(self, known: _Known, cells: frozenset[int], window: Window) -> None:
+        closed = self._closed
+        for cell in cells - known.cells:
+            closed[cell] += 1
+        for cell in known.cells - cells:
+            if closed[cell] > 1:
+                closed[cell] -= 1
+            else:
+                del closed[cell]
+        if cells != known.cells:
+            self._changed.append(window.union(known.window))
+        known.cells, known.window = cells, window
+
+    def _capsule(self, report: Body, ahead_m: float) -> Capsule:
+        return capsule_of(report, self._grid, ahead_m, self._margin_m)
+
+    # --- what is asked --------------------------------------------------------------------------------------
+
+    def danger(self, cell: int) -> float:
+        """How directly bodies come to a cell within `MAKE_WAY_S`: 0 if none does, more the nearer their way passes
+        its middle."""
+        worst = 0.0
+        for known in self._known.values():
+            if known.coming is not None:
+                worst = max(worst, known.coming.depth(self._grid, cell))
+        return worst
+
+    @property
+    def standing(self) -> set[int]:
+        """Cells closed by bodies that keep their places."""
+        if self._standing is None:
+            now_ns = self._ticked_ns or 0
+            known = (known for known in self._known.values() if now_ns - known.since_ns >= STANDS_NS)
+            self._standing = {cell for each in known for cell in each.cells}
+        return self._standing
+
+    @property
+    def reports(self) -> list[Body]:
+        """The newest report of each body, by each of its senders."""
+        return [known.report for known in self._known.values()]
