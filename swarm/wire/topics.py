@@ -196,10 +196,8 @@ CHASERS = Topic(
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", Standing,
     "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
-    "none is heard; each counts, as two lives of a host must not hide each other's words; by it an operator says "
-    "that a guest is gone", "on change, else 5 Hz",
-    access(put="agent:agent operator", hear="agent:member"), newest=False, trusted=True,
-    priority=Priority.INTERACTIVE,
+    "none is heard; each counts, as two lives of a host must not hide each other's words", "on change, else 5 Hz",
+    access(put="agent:agent", hear="agent:member"), newest=False, trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
     "table", "table/{plot}/{agent}", Table,
