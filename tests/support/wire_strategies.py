@@ -184,9 +184,14 @@ orders = st.builds(
 MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     RunInfo: st.builds(
         RunInfo, run_id=texts, role=ids, id=ids, incarnation=naturals, scenario=texts, terrain=texts, rows=sides,
-        cols=sides, resolution_m=st.floats(0, 1e9), started_ns=naturals,
+        cols=sides, resolution_m=st.floats(0, 1e9), started_ns=naturals, west_m=metres, north_m=metres, crs=texts,
+        now_ns=naturals,
     ),
     Nothing: st.just(Nothing()),
+    RemoveVehicles: st.builds(RemoveVehicles, vehicles=st.lists(ids, max_size=3)),
+    Removed: st.builds(
+        Removed, agent=ids, left=st.lists(ids, max_size=3), unknown=st.lists(ids, max_size=3), held=counts
+    ),
     MarkSet: mark_sets(),
     MarkSets: bulks(),
     Digest: digests(),
@@ -317,6 +322,8 @@ EXAMPLES: tuple[Message, ...] = (
         cols=403, resolution_m=90.0, started_ns=5,
     ),
     Nothing(),
+    RemoveVehicles(vehicles=["a0-00"]),
+    Removed(agent="a0", left=["a0-00"], unknown=["a0-07"], held=1),
     MarkSet(
         author="a0.7", group="all", tile=3, epoch=7, seq=2, cells=pack_column([5, 1023], "<u2"),
         kinds=bytes([0, 1]), paces=pack_column([0.5, math.inf], "<f4"), stamps_ns=pack_column([10, 20], "<i8"),
