@@ -60,12 +60,14 @@ def capsule_of(report: Body, grid: GridSpec, ahead_m: float, margin_m: float = 0
 class _Known:
     """What one report says.
 
+    heard_ns  when it was heard; later where the process has not listened meanwhile, `came_ns` never
     cells     closed now; `ahead_m` is the length of the way to which they belong
     charge    cells of the box that holds all that it can ever close
     since_ns  since when the body has been near `anchor`
     """
 
     report: Body
+    came_ns: int
     heard_ns: int
     until_ns: int
     charge: int
@@ -133,7 +135,7 @@ class Bodies:
             if known is not None:
                 self._forget(key)
             return
-        leaps = known is not None and self._leaps(known.report, report, now_ns - known.heard_ns)
+        leaps = known is not None and self._leaps(known.report, report, now_ns - known.came_ns)
         charge, wrong = self._charge(report)
         if wrong is None:
             wrong = self._crowded(known, leaps, charge)
@@ -143,7 +145,8 @@ class Bodies:
         self._meet_namesake(report, known)
         x_m, y_m = report.x_m, report.y_m
         self._standing = None
-        made = _Known(report, now_ns, now_ns + int(report.lease_s * NS_PER_S), charge, (x_m, y_m), now_ns)
+        until_ns = now_ns + int(report.lease_s * NS_PER_S)
+        made = _Known(report, now_ns, now_ns, until_ns, charge, (x_m, y_m), now_ns)
         self._charged += charge
         self._known[key] = made
         self._cover(made, now_ns)
