@@ -35,7 +35,9 @@ _FURTHEST_CELLS = 64
 """Cells ahead of a body that are closed, at most: whoever is quicker must look out."""
 _LONGEST_PAUSE_NS = NS_PER_S // 4
 """Time between two ticks that counts for leases. A process that was stopped has not listened meanwhile."""
-_DEAF_S = 0.5
+_DEAF_NS = NS_PER_S // 2
+LISTEN_NS = NS_PER_S
+"""Each body says where it is at least so often, so that whoever has just begun to listen knows it."""
 _GHOSTS = 3
 """Places that a body has leapt from and that are still closed, at most."""
 _MOST_TOLD = 1000
@@ -107,6 +109,8 @@ class Bodies:
         self._standing: set[int] | None = set()
         self._changed: list[Window] = []
         self._ticked_ns: int | None = None
+        self._listens_ns = 0
+        """From when on all bodies are known."""
 
     @property
     def closed(self) -> Container[int]:
@@ -217,6 +221,8 @@ class Bodies:
     def tick(self, now_ns: int) -> None:
         """End leases, and let what moves go on."""
         passed_ns = 0 if self._ticked_ns is None else now_ns - self._ticked_ns
+        if passed_ns > _DEAF_NS and self._known:
+            self._listens_ns = max(self._listens_ns, now_ns + 1)  # this tick
         self._ticked_ns = now_ns
         deaf_ns = max(passed_ns - _LONGEST_PAUSE_NS, 0)
         self._standing = None
@@ -233,10 +239,15 @@ class Bodies:
             elif known.report.speed_m_per_s > 0.0:
                 self._cover(known, now_ns)
 
-    @staticmethod
-    def was_deaf(pause_s: float) -> bool:
-        """Whether a process that let so much time pass between two ticks may not have heard what came meanwhile."""
-        return pause_s > _DEAF_S
+    @property
+    def is_deaf(self) -> bool:
+        """Whether there may be bodies of which nothing has been heard: the process has just begun, or let so much time
+        pass before its last tick that what came meanwhile may not have been read. Nobody drives then."""
+        return self._ticked_ns is not None and self._ticked_ns < self._listens_ns
+
+    def listen_anew(self, now_ns: int) -> None:
+        """Nothing was heard before now: for a second, in which every body says where it is, nobody drives."""
+        self._listens_ns = now_ns + LISTEN_NS
 
     def _forget(self, key: tuple[str, int]) -> None:
         self._standing = None
