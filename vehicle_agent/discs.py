@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from swarm.grid import GridSpec, Window
 
 _MOST = 1 << 31
+_LEAST = 1e-12
+"""Cells to one side: less is straight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,7 @@ def _crossed(cols: NDArray[np.float64], rows: NDArray[np.float64], line: Line) -
     enter = np.zeros(np.broadcast_shapes(cols.shape, rows.shape))
     leave = np.ones_like(enter)
     for low, start, step in ((cols, u0, u1 - u0), (rows, v0, v1 - v0)):
-        if step == 0.0:
+        if abs(step) < _LEAST:
             missed = (start < low) | (start > low + 1.0)
             enter = np.where(missed, 2.0, enter)
         else:

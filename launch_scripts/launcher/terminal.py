@@ -41,6 +41,7 @@ REPORTED = {
     "growth_ms": "growing a tree, ms",
     "route_query_ms": "asking for a route, ms",
     "mark_to_tree_ms": "from mark to tree, ms",
+    "body_ms": "from a body's report to being avoided, ms",
     "messages_per_s": "messages/s",
     "payloads_dropped": "payloads dropped",
 }

@@ -56,6 +56,7 @@ class Rovers:
         self.incarnation = incarnation
         self._terrain = terrain
         self._time_scale = scenario.time_scale
+        """As of the last tick; 0 while the run is paused."""
         self._ticked_ns: int | None = None
         self.all = [self._begin(id, each, scenario.seed) for each in scenario.rovers for id in ids_of(each)]
         self._by_id = {rover.id: rover for rover in self.all}
@@ -73,13 +74,15 @@ class Rovers:
             rover.x_m, rover.y_m = body.x_m, body.y_m
             rover.seq = max(rover.seq, body.seq)
 
-    def tick(self, now_ns: int) -> list[Body]:
-        """Move all rovers. Returns what they say now."""
+    def tick(self, time_scale: float, now_ns: int) -> list[Body]:
+        """Move all rovers, so many seconds on the terrain per second. Returns what they say now."""
+        self._time_scale = time_scale
         passed_s = 0.0 if self._ticked_ns is None else max(now_ns - self._ticked_ns, 0) / NS_PER_S
         self._ticked_ns = now_ns
         said = []
         for rover in self.all:
-            self._move(rover, min(passed_s, _LONGEST_TICK_S))
+            if time_scale > 0.0:
+                self._move(rover, min(passed_s, _LONGEST_TICK_S))
             speed = rover.config.speed_m_per_s * self._time_scale if self._goes(rover) else 0.0
             state = (rover.x_m, rover.y_m, rover.heading_rad, speed)
             if state == rover.told and 0 <= now_ns - rover.told_ns < _TOLD_AGAIN_NS:

@@ -24,11 +24,12 @@ from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.order_book import OrderBook
 from swarm.plugins.find import find_plugin
-from swarm.runtime.tracking import Trackings, Verdict
+from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
+from vehicle_agent.target_bodies import TargetBodies
 
 LISTEN_NS = NS_PER_S
 """A starting process asks planners where their targets are before it places them itself: it waits so long for a
@@ -110,10 +111,11 @@ class TargetWorld:
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
         self._terrain = TrueTerrain(terrain.grid, pace)
         self._referee = Referee(truth_s_per_m, terrain.grid)
+        self._target_bodies = TargetBodies(scenario, terrain.grid)
         self.rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
         # Who tracks external targets, and for a standby who leads; and the highest incarnation of a leader.
-        self._trackings = Trackings(terrain.grid.cells)
+        self._trackings = Trackings(terrain.grid)
         self._others_incarnation = 0
         self._capture_range_m = scenario.vehicles.capture_range_m
         self._time_scale = scenario.time_scale
@@ -215,8 +217,10 @@ class TargetWorld:
         target = self._targets.get(pose.target)
         if target is None or (target.config.is_simulated and self.leads):
             return
-        if self._trackings.hear(pose, now_ns) is not Verdict.COUNTS:
+        counts = self._trackings.hear(pose, now_ns)
+        if counts is None:
             return
+        pose = counts
         if target.config.is_simulated:
             if self._terrain.lethal(pose.cell):
                 return
@@ -229,6 +233,7 @@ class TargetWorld:
             target.walker.put(pose.cell)
         target.x_m, target.y_m = pose.x_m, pose.y_m
         target.placed = True
+        self._refer(pose, now_ns)
 
     def hear_body(self, body: Body, now_ns: int) -> None:
         """Takes where a body is: of anybody's for the referee, of a rover that another leader moves for itself."""
@@ -237,13 +242,14 @@ class TargetWorld:
         self._referee.hear_body(body, now_ns)
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
-        actions: list[Action] = list(self._referee.hear(fleet))
+        seen = self._referee.hear(fleet)
         if not self.leads or self.paused:
-            return actions if self.leads else []
+            return list(seen) if self.leads else []
+        actions: list[Action] = []
         for index, vehicle in self._catchers(fleet, now_ns):
             id = fleet.target_ids[index]
             actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
-        return actions
+        return [*actions, *seen]
 
     def tick(self, now_ns: int) -> list[Action]:
         """Moves all targets and returns their poses."""
@@ -258,7 +264,7 @@ class TargetWorld:
         waited_ns = now_ns - self._started_ns
         vehicles = self._referee.cells
         self._budget.ways = _WAYS_PER_TICK
-        actions: list[Action] = [*self.rovers.tick(now_ns)]
+        actions: list[Action] = [*self.rovers.tick(0.0 if self.paused else self._time_scale, now_ns)]
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
@@ -266,8 +272,14 @@ class TargetWorld:
             if target.placed:
                 target.walker.advance(self._terrain, elapsed_s, vehicles)
             target.placed = True
-            actions.append(Publish(self._pose(id, target, now_ns)))
+            pose = self._pose(id, target, now_ns)
+            self._refer(pose, now_ns)
+            actions.append(Publish(pose))
         return actions
+
+    def _refer(self, pose: TargetPose, now_ns: int) -> None:
+        for body in self._target_bodies.bodies_of(pose, now_ns):
+            self._referee.hear_body(body, now_ns)
 
     def _pose(self, id: str, target: _Target, now_ns: int) -> TargetPose:
         target.x_m, target.y_m = target.walker.position_m(self._terrain)

@@ -196,6 +196,8 @@ class TargetConfig(Section, frozen=True, kw_only=True):
                    and planners use the last sighting
     caught         jump: a captured target goes on from another place; stay: it goes on from where it is
     start          [row, col]; a random passable cell if not given
+    body_radius_m  vehicles keep out of the cells within so many metres of it, and of those that it drives to;
+                   if not given, they may share its cell
     """
 
     name: Name = "t"
@@ -206,6 +208,7 @@ class TargetConfig(Section, frozen=True, kw_only=True):
     tracker: Literal["always", "sighted"] = "always"
     caught: Literal["jump", "stay"] = "jump"
     start: tuple[int, int] | None = None
+    body_radius_m: Annotated[float, Meta(ge=0, le=100)] | None = None
 
     @property
     def is_simulated(self) -> bool:

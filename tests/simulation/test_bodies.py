@@ -1,0 +1,70 @@
+"""Bodies among the whole swarm: nobody drives into one, with faults and without, and work goes on."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+
+from launch_scripts.simulation.body_law import BodyLaw
+from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.worlds import CROWDS, SMALL, crowd, seeded
+from launch_scripts.world.service import TargetsService
+from swarm.config.scenario import RoverConfig
+from vehicle_agent.traffic.steering import Steering
+
+ROVERS = (
+    RoverConfig(name="quick", count=3, speed_m_per_s=3.0),
+    RoverConfig(name="wide", count=1, speed_m_per_s=1.0, radius_m=12.0),
+    RoverConfig(name="still", count=1, speed_m_per_s=0.0, radius_m=3.0),
+)
+
+
+def driven(kind: str, seed: int, seconds: float, faults: bool) -> tuple[BodyLaw, dict[str, int]]:
+    scenario, terrain = crowd(kind, seed, vehicles=40, per_agent=10, side=24)
+    scenario = msgspec.structs.replace(scenario, rovers=ROVERS)
+    plan = random_plan(seed, nodes_of(scenario), seconds) if faults else None
+    simulation = Simulation(scenario, terrain=terrain, faults=plan)
+    law = BodyLaw(simulation)
+    simulation.run_until(seconds)
+    service = simulation.nodes["targets-0"].service
+    assert isinstance(service, TargetsService)
+    return law, dict(service.counters.counts)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_vehicle_drives_into_a_rover_that_looks_out_for_nobody(seed) -> None:
+    law, counts = driven(CROWDS[seed], seed, 8.0, faults=False)
+    assert law.broken == law.met == []
+    assert law.near > 100
+    assert counts["driven_into"] == 0
+    assert counts["captures"] > 0
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_vehicle_drives_into_a_rover_that_was_reported_in_time_though_messages_are_lost(seed) -> None:
+    law, _ = driven("open", seed, 8.0, faults=True)
+    assert law.broken == []
+    assert law.entered > 0
+
+
+def test_vehicles_that_do_not_look_at_bodies_drive_into_them_and_the_referee_sees_it(monkeypatch) -> None:
+    monkeypatch.setattr(Steering, "closed", lambda self, cell: not math.isfinite(self._pace[cell]))
+    law, counts = driven("open", 0, 5.0, faults=False)
+    assert law.broken
+    assert law.met
+    assert counts["driven_into"] > 0
+
+
+def test_targets_that_are_bodies_are_captured_and_not_driven_into() -> None:
+    target = msgspec.structs.replace(SMALL.targets[0], body_radius_m=1.0)
+    vehicles = msgspec.structs.replace(SMALL.vehicles, capture_range_m=65.0)
+    simulation = Simulation(msgspec.structs.replace(seeded(1), targets=(target,), vehicles=vehicles))
+    simulation.run_until(15.0)
+    service = simulation.nodes["targets-0"].service
+    assert isinstance(service, TargetsService)
+    assert service.counters.counts["captures"] > 0
+    assert service.counters.counts["driven_into"] == 0
