@@ -335,7 +335,7 @@ _mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swa
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
 _mount("zone", "launch_scripts.commands.zone", "Close areas while the swarm runs. See `swarm zone --help`.")
 _mount("target", "launch_scripts.commands.target", "Add, move and remove targets. See `swarm target --help`.")
-_mount("vehicle", "launch_scripts.commands.vehicle", "Stop vehicles and let them go. See `swarm vehicle --help`.")
+_mount("vehicle", "launch_scripts.commands.guests", "Add, remove and stop vehicles. See `swarm vehicle --help`.")
 _mount(
     "plugins", "launch_scripts.commands.plugins", "Your own sensors, walks, and so on. See `swarm plugins --help`."
 )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.target_tree import TargetTree
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.routes import Route, RouteStatus
@@ -49,6 +50,8 @@ class RouteFinder:
         Where all routes lead. On a lethal cell there is no route; outside the grid raises OutsideGridError.
     resolution_m : float
         Side of a cell.
+    climb : Climb, optional
+        What a step costs for what it climbs, where uphill is not downhill.
     **settings
         Fields of `PlannerConfig`, such as ``strategy`` (here "full" unless given), ``edge``, ``corner_cutting``.
 
@@ -58,13 +61,21 @@ class RouteFinder:
         On a pace that is NaN, zero or negative, or an array without two dimensions.
     """
 
-    def __init__(self, pace: Any, target: tuple[int, int], *, resolution_m: float = 1.0, **settings: Any) -> None:
+    def __init__(
+        self,
+        pace: Any,
+        target: tuple[int, int],
+        *,
+        resolution_m: float = 1.0,
+        climb: Climb | None = None,
+        **settings: Any,
+    ) -> None:
         self._pace = np.array(pace, np.float32, order="C")
         if self._pace.ndim != 2:
             raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
         rows, cols = self._pace.shape
         self.grid = GridSpec(rows, cols, resolution_m)
-        self._tree = TargetTree(self.grid, PlannerConfig(**{"strategy": "full", **settings}))
+        self._tree = TargetTree(self.grid, PlannerConfig(**{"strategy": "full", **settings}), climb)
         self._version = 0
         self._target = self.grid.cell(*target)
         self._update([])

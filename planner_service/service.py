@@ -203,7 +203,7 @@ class PlannerService:
 
     def _obeys(self, order: Obey) -> bool:
         if order.subject is not None:
-            return True
+            return self._obeyed_version == self._obedience.book.version
         return self._sync.holds(order.author, order.sets, self._now_ns) and self._planner.knows_map
 
     def stop(self, now_ns: int) -> None:

@@ -101,7 +101,7 @@ class Strategy(Protocol):
     """Says what a planner grows. A plug-in is made as `Name(world: StrategyWorld, options)`, or a `StrategyRow`."""
 
     def row(self, growths: Growths) -> StrategyRow:
-        """The row in force from now on. Asked at the start, and whenever a full growth has been measured."""
+        """The row in force from now on. Asked at the start, and whenever one of these has changed."""
         ...
 
 

@@ -9,7 +9,7 @@ from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.runtime.tracking import Tracking, Verdict
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
 
 COUNTS = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off", "trackers_lost")
 FASTEST_M_PER_S = 100.0
@@ -38,7 +38,7 @@ class TargetWatch:
         self._grid = grid
         self._counters = counters
         self._fastest_m_per_s = FASTEST_M_PER_S * time_scale
-        self._tracking = Tracking(grid.cells)
+        self._tracking = Tracking(grid)
         self._lost = False
         self._lost_since_ns = 0
         self._handed_over = False
@@ -79,7 +79,8 @@ class TargetWatch:
         elif verdict is Verdict.OUTSIDE:
             self._count("poses_outside")
             shape = f"{self._grid.rows} x {self._grid.cols} cells"
-            said = f"{_name(pose)} puts it into cell {pose.cell}, outside of the terrain of {shape}: not used"
+            cell = f"cell {pose.cell}" if pose.cell != CELL_OF_PLACE else f"{pose.x_m:.0f}, {pose.y_m:.0f} m"
+            said = f"{_name(pose)} puts it into {cell}, outside of the terrain of {shape}: not used"
             self._name_once("pose-outside", pose, said)
 
     def see(self, pose: TargetPose, now_ns: int) -> None:

@@ -6,6 +6,7 @@ x grows to the east, y to the north; `west_m` and `north_m` are the outer corner
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -153,6 +154,12 @@ class GridSpec:
             self.west_m + (col + 0.5) * self.resolution_m,
             self.north_m - (row + 0.5) * self.resolution_m,
         )
+
+    def cell_at(self, x_m: float, y_m: float) -> int:
+        """The cell that holds a place, -1 outside the grid."""
+        row = math.floor((self.north_m - y_m) / self.resolution_m)
+        col = math.floor((x_m - self.west_m) / self.resolution_m)
+        return row * self.cols + col if self.inside(row, col) else -1
 
     def tile_of(self, cell: int) -> int:
         """The tile that holds a cell. Raises OutsideGridError outside the grid."""

@@ -109,12 +109,18 @@ def target_of(order: Order) -> TargetConfig:
     return TargetConfig(name=order.name, walk=order.walk, speed_m_per_s=order.speed_m_per_s)
 
 
+_OFF = {
+    "pause": "has ended", "vehicle": "goes", "group": "as the scenario says", "target": "is removed",
+    "set": "as the scenario says",
+}  # fmt: skip
+
+
 def described(order: Order) -> str:
     """An order in words."""
     words: Iterable[object] = (
         order.subject,
         order.name,
-        *(["is taken back"] if order.off else []),
+        *([_OFF[order.subject]] if order.off else []),
         *order.targets,
         *([f"{order.value:g}"] if order.value is not None else []),
     )

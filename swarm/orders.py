@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from swarm.bus.bus import AskEnded, Bus, Replied
 from swarm.errors import BusError, ConfigError
+from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, ZoneOrder, Zones
@@ -28,7 +29,7 @@ _OBEY_S = 3.0
 class Acknowledged:
     """What became of an order.
 
-    obeyed  processes that obey, as role-id, and after how many seconds each said so
+    obeyed  processes that obey, as role-id, and how many seconds after the order each said so
     silent  those which it concerns and that have not said so in time: they will obey once they hear a keeper
     """
 
@@ -56,9 +57,10 @@ class Operator:
         Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
         """
         members = self._members()
-        zones = self._order_zone(order, self._keeper(members))
+        keeper, began_s = self._keeper(members), time.monotonic()
+        zones = self._order_zone(order, keeper)
         author = f"operator.{zones.changed}"
-        return zones, self._obeyed(Obey(author=author, sets=zones.sets), members)
+        return zones, self._obeyed(Obey(author=author, sets=zones.sets), members, began_s)
 
     def orders(self) -> Orders:
         """What is ordered. Raises BusError without a keeper."""
@@ -72,12 +74,15 @@ class Operator:
         Raises ConfigError where the keeper refuses, in its words, and BusError without a keeper.
         """
         members = self._members()
-        reply = self._order(GIVE_ORDER, order, self._keeper(members))
+        keeper, began_s = self._keeper(members), time.monotonic()
+        reply = self._order(GIVE_ORDER, order, keeper)
         assert isinstance(reply, Orders)
         given = reply.given
         assert given is not None
         obey = Obey(subject=given.subject, name=given.name, stamp_ns=given.stamp_ns)
-        return given, self._obeyed(obey, members)
+        if given.subject == "target" and given.off:  # its planner ends, and may not answer any more
+            members = [each for each in members if (each.role, job_of(each.id)) != ("planner", given.name)]
+        return given, self._obeyed(obey, members, began_s)
 
     # --- asking ---------------------------------------------------------------------------------------------
 
@@ -107,14 +112,14 @@ class Operator:
             raise ConfigError(failure)
         raise BusError(f"keeper {keeper} does not answer: it is not known whether the order counts; give it again")
 
-    def _obeyed(self, order: Obey, members: list[RunInfo]) -> Acknowledged:
+    def _obeyed(self, order: Obey, members: list[RunInfo], began_s: float) -> Acknowledged:
         roles = _OBEY_ZONES if order.subject is None else _OBEY_ORDERS
         concerned = {f"{each.role}-{each.id}" for each in members if each.role in roles}
         inbox = Inbox()
-        began_s = time.monotonic()
+        deadline_s = time.monotonic() + self._patience_s + 1.0
         obeyed: dict[str, float] = {}
         self._bus.ask(OBEYED, order, inbox.post, tag="obey", timeout_s=self._patience_s)
-        while time.monotonic() < began_s + self._patience_s + 1.0:
+        while time.monotonic() < deadline_s:
             match inbox.take(0.5):
                 case Replied(message=Obeyed() as who):
                     obeyed.setdefault(f"{who.role}-{who.id}", time.monotonic() - began_s)

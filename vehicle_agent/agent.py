@@ -18,7 +18,7 @@ from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec, Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish
-from swarm.runtime.tracking import Trackings, Verdict
+from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
@@ -122,7 +122,7 @@ class Agent:
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
-        self._trackings = Trackings(local_map.grid.cells)
+        self._trackings = Trackings(local_map.grid)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         self._assignment = Assignment(self.targets, assigner or Spread(), config.reassign_s, chance.random())
@@ -165,6 +165,13 @@ class Agent:
             self.vehicles[id] = Vehicle(id, self._map.grid, cell)
             self._look_from[cell] = None
             self._unassigned = True
+
+    def remove(self, vehicles: Sequence[str]) -> None:
+        """These leave the map: their cells are given back."""
+        for id in vehicles:
+            self.holdings.leave(id)
+            for known in (self.vehicles, self.wishes, self._wished, self._left_s):
+                known.pop(id, None)
 
     def stand_down(self) -> None:
         """Another process drives the vehicles now."""
@@ -363,11 +370,11 @@ class Agent:
 
     # --- what is heard --------------------------------------------------------------------------------------
 
-    def hear_pose(self, pose: TargetPose, now_ns: int) -> bool:
-        """Where a tracker of a target says it is; False unless the pose counts."""
-        counts = self._trackings.hear(pose, now_ns) is Verdict.COUNTS
-        if counts:
-            self._moved(pose, now_ns)
+    def hear_pose(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
+        """Where a tracker of a target says it is; returns that, with its cell, if it counts."""
+        counts = self._trackings.hear(pose, now_ns)
+        if counts is not None:
+            self._moved(counts, now_ns)
         return counts
 
     def see_target(self, pose: TargetPose, now_ns: int) -> None:

@@ -114,7 +114,7 @@ class AssignmentWorld:
 
     agent    id of the agent whose vehicles it assigns
     group    their group
-    targets  those that the group may chase
+    targets  those that the group may chase at the start; operators add and remove some
     seed     of the run
     """
 

@@ -33,6 +33,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         inbox = Inbox()
         service = AgentService(setup, terrain, truth, bus, inbox.post, store)
         process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz)
+        service.when_over = process.stop
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

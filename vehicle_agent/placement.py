@@ -9,13 +9,15 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import CellsOf, private_copy
 from shared_map.terrain.homes import homes_of
-from swarm.config.agents import plan_agents
+from swarm.config.agents import AddedAgent, plan_agents
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 
 _STREAM = 77
 """Stream of the scenario's seed: terrain and targets draw from others."""
+_TRIES = 64
+"""Cells that each added vehicle may try."""
 
 
 def spawn_cells(
@@ -53,6 +55,23 @@ def spawn_cells(
         plan.id: dict(zip(plan.vehicle_ids, placed[plan.group.name][plan.first :], strict=False))
         for plan in plan_agents(scenario)
     }
+
+
+def entry_cells(added: AddedAgent, grid: GridSpec, homes: NDArray[np.bool_], seed: int) -> list[int]:
+    """Where the vehicles of an added agent may enter, the best first: near the place named, else anywhere. Raises
+    ConfigError for a place outside the terrain.
+
+    homes  bool (rows, cols), `homes_of` prior and truth
+    """
+    free = np.flatnonzero(homes)
+    tries = min(_TRIES * added.plan.count, len(free))
+    if added.at is None:
+        return [int(cell) for cell in np.random.default_rng([seed, _STREAM]).choice(free, tries, replace=False)]
+    row, col = added.at
+    if not grid.inside(row, col):
+        raise ConfigError(f"cell [{row}, {col}] is outside the terrain of {grid.rows} x {grid.cols} cells")
+    apart = np.hypot(free // grid.cols - row, free % grid.cols - col)
+    return [int(cell) for cell in free[np.argsort(apart, kind="stable")[:tries]]]
 
 
 def _along_a_curve(grid: GridSpec, cells: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from hashlib import blake2s
 
 from msgspec.structs import replace
@@ -41,6 +41,7 @@ class RightOfWaySync:
     placed  called with the vehicles that have found their places
     warn    called with a kind and a sentence: "refused", for what cannot be true; "waiting", for why vehicles wait;
             "promises", for the file of promises
+    vehicles  of an agent that is not in `spawns`
     """
 
     def __init__(
@@ -53,9 +54,10 @@ class RightOfWaySync:
         post: Post,
         placed: Callable[[Sequence[str]], None],
         warn: Callable[[str, str], None],
+        vehicles: Collection[str] = (),
     ) -> None:
         plots = Plots(grid, list(spawns))
-        self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved)
+        self.core = RightOfWay(setup.id, plots, spawns, store.own, store.saved, vehicles=vehicles)
         self._id = setup.id
         self._store = store
         self._bus = bus

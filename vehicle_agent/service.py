@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, load_homes
-from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
+from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
@@ -27,6 +27,7 @@ from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest
 from swarm.wire.messages.targets import Sighted, TargetPose
@@ -37,6 +38,7 @@ from swarm.wire.topics import (
     COST,
     FLEET,
     FOLLOWED,
+    LEAVE,
     POSE,
     PUSHED_ROUTE,
     ROUTE,
@@ -50,8 +52,9 @@ from vehicle_agent.chasers import ChasersReport
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
+from vehicle_agent.entering import Entering
 from vehicle_agent.fleet import FleetReport, directions_of
-from vehicle_agent.placement import spawn_cells
+from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
@@ -82,9 +85,10 @@ class AgentService:
         store: PromiseStore,
     ) -> None:
         scenario = setup.scenario
-        plan = _plan_of(setup)
+        plan = _plan_of(setup) if setup.added is None else setup.added.plan
         grid = terrain.grid
-        spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth, load_homes(setup, terrain, truth))
+        homes = load_homes(setup, terrain, truth)
+        spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth, homes)
         self._member = Member(setup.info(grid, terrain.digest), bus, post)
         self.counters = self._member.counters
         for name in ("reroute_requests", "routes_received", "marks", "blocked_ticks"):
@@ -118,7 +122,9 @@ class AgentService:
             group,
             scenario.vehicles.sense_range_m,
         )
-        self._right_of_way = RightOfWaySync(setup, grid, spawns, store, bus, post, self._place, self._warn)
+        self._right_of_way = RightOfWaySync(
+            setup, grid, spawns, store, bus, post, self._place, self._warn, plan.vehicle_ids
+        )
         bodies = Bodies(grid, scenario.cost.vehicle_radius_m)
         targets = plan.group.targets or tuple(scenario.target_ids)
         assigned = AssignmentWorld(setup.id, group, targets, scenario.seed)
@@ -137,12 +143,25 @@ class AgentService:
         self._obeyed_version = 0
         self._roster = Roster()
         self._now_ns = 0
+        self.when_over: Callable[[], None] | None = None
+        """Called once all vehicles of an added agent have left."""
+        self._removed: set[str] = set()
+        """Vehicles that an operator has let leave."""
+        self._entering: Entering | None = None
+        if setup.added is not None:
+            cells = entry_cells(setup.added, grid, homes, setup.incarnation)
+            self._entering = Entering(plan.vehicle_ids, cells, self._agent.holdings)
         self._fleet = FleetReport(self._author, group)
         self._chasers = ChasersReport(self._author)
 
     @property
     def agent(self) -> Agent:
         return self._agent
+
+    @property
+    def over(self) -> bool:
+        """Whether all vehicles of an agent that was added have left."""
+        return self._entering is not None and self._entering.over and self._agent.holdings.gone
 
     def start(self, now_ns: int) -> None:
         self._bus.watch_alive(self._post, role="planner")
@@ -158,6 +177,7 @@ class AgentService:
                 self._bus.subscribe(SIGHTED, self._post, target=target)
         self._bus.subscribe(PUSHED_ROUTE, self._post, agent=self._setup.id)
         self._right_of_way.start(now_ns)
+        self._bus.serve(LEAVE, self._post, agent=self._setup.id)
 
     def handle(self, event: Event, now_ns: int) -> None:
         if isinstance(event, LinkChanged) and event.up:
@@ -168,6 +188,9 @@ class AgentService:
             return
         agent = self._agent
         match event:
+            case Asked(topic=topic, request=RemoveVehicles() as request) if topic is LEAVE:
+                event.answer(self._remove(request.vehicles), agent=self._setup.id)
+                event.end()
             case Heard(message=Sighted() as sighted):
                 self._hear_sighted(sighted, now_ns)
             case Heard(message=PushedRoute() as pushed):
@@ -201,6 +224,8 @@ class AgentService:
         self._sync.tick(now_ns)
         agent = self._agent
         self._right_of_way.hear_granted(now_ns)
+        if self._entering is not None:
+            self._entering.tick(self._right_of_way.core.informed, now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
         self._zones.update(agent.places, now_ns)
@@ -229,8 +254,13 @@ class AgentService:
         self._right_of_way.tick(agent.wishes, now_ns)
         self._member.tell_faults(self._faults, now_ns)
         self._gauge()
+        if self.over and self.when_over is not None:
+            self.when_over()
 
     def stop(self, now_ns: int) -> None:
+        if self._entering is not None:
+            self._remove([])  # whoever ends this process takes its vehicles away; one that is killed leaves them
+            self._right_of_way.tick(self._agent.wishes, now_ns)
         self._member.publish_stats(now_ns)
 
     def _obey(self, now_ns: int) -> None:
@@ -248,7 +278,9 @@ class AgentService:
         orders.tick(now_ns)
 
     def _obeys(self, order: Obey) -> bool:
-        return order.subject is not None or self._sync.holds(order.author, order.sets, self._now_ns)
+        if order.subject is not None:
+            return self._obeyed_version == self._obedience.book.version
+        return self._sync.holds(order.author, order.sets, self._now_ns)
 
     # --- places ---------------------------------------------------------------------------------------------
 
@@ -256,6 +288,18 @@ class AgentService:
         if vehicles:
             self._agent.place(vehicles)
             log.info("%d vehicles have their places", len(self._agent.vehicles))
+
+    def _remove(self, asked: Sequence[str]) -> Removed:
+        """Let vehicles leave, all if none is named; of those that have left already say how far it is."""
+        ours = self._agent.plan.vehicle_ids
+        left = [id for id in ours if id in asked or not asked]
+        self._agent.remove([id for id in left if id not in self._removed])
+        self._removed.update(left)
+        if self._entering is not None:
+            self._entering.remove(left)
+        held = sum(self._agent.holdings.is_granted(id) for id in left)
+        unknown = sorted(set(asked).difference(ours))
+        return Removed(agent=self._setup.id, left=left, unknown=unknown, held=held)
 
     def _warn(self, kind: str, text: str) -> None:
         self._member.warn(self._now_ns, kind, text)
@@ -279,12 +323,13 @@ class AgentService:
     def _hear_pose(self, heard: Heard, now_ns: int) -> None:
         pose = heard.message
         assert isinstance(pose, TargetPose)
-        # A tracker's pose is the truth for the simulated sensor of targets only if it counts.
-        tracked = pose.target not in self._untracked.targets
-        if heard.topic is TRUE_POSE or (tracked and self._agent.hear_pose(pose, now_ns)):
+        if heard.topic is TRUE_POSE:
             self._detector.set_truth(pose, now_ns)
-            if tracked and heard.topic is POSE:
-                self._hear_target_bodies(pose, now_ns)
+        elif pose.target not in self._untracked.targets:
+            counts = self._agent.hear_pose(pose, now_ns)
+            if counts is not None:  # for the simulated sensor of targets it is the truth
+                self._detector.set_truth(counts, now_ns)
+                self._hear_target_bodies(counts, now_ns)
 
     def _hear_bodies(self, now_ns: int) -> None:
         bodies = self._agent.bodies

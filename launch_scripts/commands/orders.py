@@ -107,7 +107,7 @@ def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     if as_json:
         typer.echo(json.dumps([msgspec.to_builtins(order) for order in book.orders], indent=2))
         return
-    stands = [order for order in book.orders if not order.off or order.subject == "target"]
+    stands = [order for order in book.orders if not order.off or (order.subject == "target" and not order.added)]
     for order in stands:
         typer.echo(described(order))
     if not stands:

@@ -7,6 +7,7 @@ import math
 import time
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -51,26 +52,45 @@ class Where:
 @app.command(rich_help_panel=_PANEL)
 @spread
 def route(
-    target: Annotated[str, typer.Option(help="The target, such as t3.")],
-    row: Annotated[int, typer.Option(help="Row of the start, counted from the north.")],
-    col: Annotated[int, typer.Option(help="Column of the start, counted from the west.")],
     where: Where,
     tls: Tls,
+    target: Annotated[str | None, typer.Option(help="The target, such as t3.")] = None,
+    row: Annotated[int | None, typer.Option(help="Row of the start, counted from the north.")] = None,
+    col: Annotated[int | None, typer.Option(help="Column of the start, counted from the west.")] = None,
     steps: Annotated[int, typer.Option(min=0, help="Most steps to show; 1 is the next, 0 is all.")] = 0,
     cost: Annotated[bool, typer.Option("--cost", help="Only the cost, or that there is no way.")] = False,
+    terrain: Annotated[
+        str | None, typer.Option(help="Without a swarm: on this terrain file, scenario or built-in scenario.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--from", help="With --terrain: LAT,LON, xy:X,Y in metres or cell:ROW,COL.")
+    ] = None,
+    end: Annotated[str | None, typer.Option("--to", help="With --terrain: where to, as --from.")] = None,
+    out: Annotated[Path | None, typer.Option(help="With --terrain: write .geojson, .gpx, .kml or .csv.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Ask a planner for the cheapest route from a cell to its target.
+    """Ask a planner for the cheapest route from a cell to its target; or find one on a terrain, without a swarm.
 
     swarm route --target t3 --row 40 --col 200
 
     swarm route --target t3 --row 40 --col 200 --steps 1
 
     swarm route --target t3 --row 40 --col 200 --json | jq .routes[0].cost_s
+
+    swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --out way.gpx
     """
+    from swarm.errors import ConfigError
+
+    if terrain is not None:
+        if start is None or end is None or target is not None or row is not None or col is not None:
+            raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
+        _route_on_terrain(terrain, start, end, out, as_json)
+        return
+    if target is None or row is None or col is None or start is not None or end is not None or out is not None:
+        raise ConfigError("give --target, --row and --col to ask a swarm, or --terrain, --from and --to")
     from swarm.bus.bus import AskEnded, Replied
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.errors import BusError, ConfigError
+    from swarm.errors import BusError
     from swarm.runtime.inbox import Inbox
     from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
     from swarm.wire.readable import encode_readable
@@ -103,6 +123,22 @@ def route(
         _print_cost(reply, row, col)
     else:
         _print_route(reply, took_ms)
+
+
+def _route_on_terrain(terrain: str, start: str, end: str, out: Path | None, as_json: bool) -> None:
+    from launch_scripts.commands.route_on_terrain import find_route, profile_of, write_route
+
+    found = find_route(terrain, start, end)
+    if out is not None:
+        write_route(found, out)
+    facts = found.facts()
+    if as_json:
+        typer.echo(json.dumps(facts))
+        return
+    above, climbed = max(found.found.gap - 1, 0), f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
+    typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} cells")
+    typer.echo(f"proven to be at most {above:.2%} above the optimum")
+    typer.echo(profile_of(found))
 
 
 def _print_cost(reply: CostReply, row: int, col: int) -> None:

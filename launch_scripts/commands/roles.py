@@ -44,6 +44,15 @@ class Part(Place):
     ] = None
 
 
+@dataclass(frozen=True)
+class Joins:
+    """What an agent hosts that is not in the scenario."""
+
+    group: str
+    count: int
+    at: tuple[int, int] | None
+
+
 @app.command(rich_help_panel=_PANEL)
 @spread
 def router(
@@ -55,7 +64,7 @@ def router(
 
     With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
     """
-    _run("router", "0", place, tls, listen=listen)
+    run_role("router", "0", place, tls, listen=listen)
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -77,7 +86,7 @@ def keeper(
 
     swarm keeper jacksboro --id east --store /var/lib/swarm/east.sqlite
     """
-    _run("keeper", id, part, tls, store_path=store, rebuild=rebuild)
+    run_role("keeper", id, part, tls, store_path=store, rebuild=rebuild)
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -92,7 +101,7 @@ def planner(
 
     swarm planner jacksboro --target t0 --connect tls/HOST:7447 --tls-ca ca.pem --tls-cert me.pem --tls-key me.key
     """
-    _run("planner", ranked_id(target, rank), part, tls)
+    run_role("planner", ranked_id(target, rank), part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -103,24 +112,33 @@ def agent(
     tls: Tls,
 ) -> None:
     """Drive the vehicles of one agent process."""
-    _run("agent", id, part, tls)
+    run_role("agent", id, part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
 @spread
 def targets(part: Part, tls: Tls, rank: Rank = 0) -> None:
     """Move the simulated targets and referee the run, or stand by to do so."""
-    _run("targets", ranked_id("0", rank), part, tls)
+    run_role("targets", ranked_id("0", rank), part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
 @spread
 def monitor(part: Part, tls: Tls) -> None:
     """Show and record the run."""
-    _run("monitor", "0", part, tls)
+    run_role("monitor", "0", part, tls)
 
 
-def _run(role: str, id: str, part: Place, tls: Tls, *, listen: str | None = None, **role_options: Any) -> None:
+def run_role(
+    role: str,
+    id: str,
+    part: Place,
+    tls: Tls,
+    *,
+    listen: str | None = None,
+    joins: Joins | None = None,
+    **role_options: Any,
+) -> None:
     import msgspec
 
     from launch_scripts.launcher import options
@@ -131,6 +149,7 @@ def _run(role: str, id: str, part: Place, tls: Tls, *, listen: str | None = None
     from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import ENTRIES, processes_of
+    from swarm.config.agents import added_agent
     from swarm.errors import ConfigError
     from swarm.runtime.role import RoleSetup
 
@@ -145,11 +164,15 @@ def _run(role: str, id: str, part: Place, tls: Tls, *, listen: str | None = None
         network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, part.connect))
         scenario = msgspec.structs.replace(scenario, network=network)
     ids = [spec.id for spec in processes_of(scenario, (role,))]
-    if role == "keeper":
+    if joins is not None:
+        added_agent(scenario, id or "added0", joins.group, joins.count, joins.at)  # refused before anybody is asked
+    if role == "keeper" or (joins is not None and id):
         _check_id(id)
-    elif id not in ids:
+    elif joins is not None and scenario.network.tls is not None:
+        raise ConfigError("give a name with --id: the one in the certificate agent.GROUP.NAME")
+    elif joins is None and id not in ids:
         raise ConfigError(f"scenario {scenario.name} has no {role} {id!r}; it has {', '.join(ids)}")
-    scenario = options.as_process(scenario, role, id)
+    scenario = options.as_process(scenario, role, id if joins is None else f"{joins.group}.{id}")
     log_to(None)
     found: list[RunInfo] = []
     run_id = part.run_id if isinstance(part, Part) else None
@@ -161,17 +184,25 @@ def _run(role: str, id: str, part: Place, tls: Tls, *, listen: str | None = None
                 "nobody answers, not even a router: does it admit the name in %s?", scenario.network.tls.certificate
             )
         found = [info for info in found if info.run_id]
+        id = id or _free_id(found)
         check_vacant(found, role, id)
         run_id = run_id or (found[0].run_id if found else None)
     run_id = run_id or options.common_run_id(scenario)
+    added = None if joins is None else added_agent(scenario, id, joins.group, joins.count, joins.at)
     run_dir = options.make_run_dir(part.runs, run_id)
     if role != "router":
         with progress() as tell:
             fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
     life = next_life(run_dir, role, id)
     logging.getLogger(__name__).info("%s %s of run %s", role, id, run_id)
-    setup = RoleSetup(scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir)
+    setup = RoleSetup(scenario, run_id, role, id, incarnation=life, started_ns=life, run_dir=run_dir, added=added)
     load_entry(ENTRIES[role])(setup, None, **role_options)
+
+
+def _free_id(found: list[RunInfo]) -> str:
+    """The first of added0, added1, ... that no process has."""
+    taken = {info.id for info in found}
+    return next(id for n in range(len(taken) + 1) if (id := f"added{n}") not in taken)
 
 
 def _check_id(id: str) -> None:

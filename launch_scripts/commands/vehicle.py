@@ -16,7 +16,7 @@ Ids = Annotated[list[str], typer.Argument(metavar="ID...", help="Vehicles, such 
 
 @app.callback()
 def _root() -> None:
-    """Stop vehicles, and let them go again."""
+    """Let vehicles join a running swarm and leave it; stop vehicles, and let them go again."""
 
 
 @app.command()

@@ -35,7 +35,7 @@ from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
-from shared_map.terrain.terrain_report import summary_of
+from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
@@ -190,9 +190,7 @@ class _Run:
     def _run(self) -> int:
         with self._stop_asked.interrupting():
             self._terrain, self._truth = self._prepared()
-            log.info("terrain is ready: %s", summary_of(self._terrain))
-            for note in self._terrain.notes:
-                log.info("terrain: %s", note)
+            log.info("terrain is ready")
         if self._stop_asked:
             return 0
         self._wait(lambda: self._warm_up.progress, self._warm_up.done, again_s=2.0)
@@ -377,8 +375,10 @@ class _Run:
     def _say_begin(self) -> None:
         self._terminal.say(
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
-            f"{len(self._swarm.running)} processes, {self._terrain.grid.rows} x {self._terrain.grid.cols} cells"
+            f"{len(self._swarm.running)} processes"
         )
+        for line in said_of(self._terrain):
+            self._terminal.say(line)
         router = self._scenario.network.connect[0]
         self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 

@@ -13,6 +13,7 @@ from swarm.bus.bus import Event, Post
 from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
+from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
@@ -30,11 +31,18 @@ class Node:
     """One process, and the place where it is started again.
 
     name      in the network; a second life of an agent on another machine has a name of its own
+    added     of an agent that is not in the scenario: what it hosts
     skew_ns   by how much the machine's clock is wrong; a process reads it once, at its start
     """
 
     def __init__(
-        self, simulation: Simulation, spec: ProcessSpec, phase_ns: int, skew_ns: int, name: str | None = None
+        self,
+        simulation: Simulation,
+        spec: ProcessSpec,
+        phase_ns: int,
+        skew_ns: int,
+        name: str | None = None,
+        added: AddedAgent | None = None,
     ) -> None:
         self.spec = spec
         self.name = name or spec.name
@@ -47,6 +55,7 @@ class Node:
         self.skew_ns = skew_ns
         self.retired = False
         """Whether it never starts again."""
+        self.added = added
         self._simulation = simulation
         self._clock = simulation.scheduler.clock
         self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))
@@ -95,6 +104,7 @@ class Node:
             id=self.spec.id,
             incarnation=self._life,
             started_ns=EPOCH_NS,
+            added=self.added,
         )
         self.service = self._build(setup, bus, post, worker)
         self.service.start(self.now_ns())

@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 import msgspec
 
-from launch_scripts.process_table import STOP_ORDER, planner_spec, processes_of
+from launch_scripts.process_table import ENTRIES, STOP_ORDER, ProcessSpec, planner_spec, processes_of
 from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
@@ -24,6 +24,7 @@ from swarm.bus.bus import Appeared, AskEnded, Disappeared, Event, Heard, Replied
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
+from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.order_book import OrderBook
 from swarm.ranks import ranked_id
@@ -127,6 +128,14 @@ class Simulation:
             return
         backoff_s = min(BACKOFF_S * 2 ** (node.crashes - 1), 10.0)
         self.scheduler.after(int(backoff_s * NS_PER_S), node.boot)
+
+    def add(self, added: AddedAgent) -> Node:
+        """Let an agent join that is not in the scenario."""
+        spec = ProcessSpec("agent", added.plan.id, ENTRIES["agent"])
+        node = Node(self, spec, self._phases.randrange(NS_PER_S), 0, added=added)
+        self.nodes[node.name] = node
+        node.boot()
+        return node
 
     def disturbed(self) -> bool:
         """Whether a process is dead, hangs or is cut off now."""

@@ -19,6 +19,7 @@ from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet
@@ -43,7 +44,7 @@ class TargetsService:
         self._ask_due_ns = 0
         self._candidacy = Candidacy(setup, setup.scenario.standbys.targets, TICK_HZ, bus, post)
         self._world = TargetWorld(setup.scenario, terrain, truth, setup.incarnation, leads=self._candidacy.leads)
-        self._obedience = Obedience(setup, bus, post, lambda order: order.subject is not None)
+        self._obedience = Obedience(setup, bus, post, self._obeys)
         self._obeyed_version: int | None = None
         self._heard: set[str] = set()
         """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
@@ -131,6 +132,9 @@ class TargetsService:
             self._perform(obeyed, now_ns)
             self._hear_targets()
         orders.tick(now_ns)
+
+    def _obeys(self, order: Obey) -> bool:
+        return self._obeyed_version == self._obedience.book.version
 
     def _topic(self, target: str) -> Topic:
         return TRUE_POSE if target in self._scenario.untracked else POSE

@@ -19,12 +19,12 @@ from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
-from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
+from swarm.config.plugin_names import walk_named_by
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.order_book import OrderBook
 from swarm.plugins.find import find_plugin
-from swarm.runtime.tracking import Trackings, Verdict
+from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.targets import TargetPose
@@ -115,7 +115,7 @@ class TargetWorld:
         self.rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
         # Who tracks external targets, and for a standby who leads; and the highest incarnation of a leader.
-        self._trackings = Trackings(terrain.grid.cells)
+        self._trackings = Trackings(terrain.grid)
         self._others_incarnation = 0
         self._capture_range_m = scenario.vehicles.capture_range_m
         self._time_scale = scenario.time_scale
@@ -139,8 +139,8 @@ class TargetWorld:
             cell = self._grid.cell(*config.start)
             if self._terrain.lethal(cell):
                 raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
-        named = NamedPlugin(PLUGIN_KINDS["walk"], key, config.walk, config.walk_options)
-        plugin = find_plugin(named, scenario.plugin_folder)
+        # An order names a built-in walk by its type: nothing that comes over the network is imported.
+        plugin = find_plugin(walk_named_by(config, key), scenario.plugin_folder)
         world = WalkWorld(id, self._terrain, chance, self._budget)
         walk = walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
         walker = Walker(id, walk, slowness_of(config, scenario.cost), cell)
@@ -217,8 +217,10 @@ class TargetWorld:
         target = self._targets.get(pose.target)
         if target is None or (target.config.is_simulated and self.leads):
             return
-        if self._trackings.hear(pose, now_ns) is not Verdict.COUNTS:
+        counts = self._trackings.hear(pose, now_ns)
+        if counts is None:
             return
+        pose = counts
         if target.config.is_simulated:
             if self._terrain.lethal(pose.cell):
                 return
@@ -240,13 +242,14 @@ class TargetWorld:
         self._referee.hear_body(body, now_ns)
 
     def hear_fleet(self, fleet: Fleet, now_ns: int) -> list[Action]:
-        actions: list[Action] = list(self._referee.hear(fleet))
+        seen = self._referee.hear(fleet)
         if not self.leads or self.paused:
-            return actions if self.leads else []
+            return list(seen) if self.leads else []
+        actions: list[Action] = []
         for index, vehicle in self._catchers(fleet, now_ns):
             id = fleet.target_ids[index]
             actions.extend(self._reached(id, self._targets[id], vehicle, now_ns))
-        return actions
+        return [*actions, *seen]
 
     def tick(self, now_ns: int) -> list[Action]:
         """Moves all targets and returns their poses."""

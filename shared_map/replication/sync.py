@@ -187,7 +187,7 @@ class MapSync:
         """Whether the map has what these rows of a digest name of an author, as far as it is of interest here. What
         is missing is asked for."""
         lacking = self.replica.lacking(author, rows)
-        if lacking:
+        if lacking and not self._heard:  # else it may have come, and waits for the tick
             self._fetch(author, lacking, now_ns)
         return not lacking
 

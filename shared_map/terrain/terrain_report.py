@@ -81,8 +81,13 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
     return doubts
 
 
-def summary_of(terrain: Terrain) -> str:
-    """One line about the terrain of a run."""
+def said_of(terrain: Terrain) -> list[str]:
+    """What a run says of its terrain before anything drives: numbers, how it was made, what looks wrong."""
     grid, lethal = terrain.grid, float(np.isinf(terrain.pace_s_per_m).mean())
     water = float((terrain.classes == TerrainClass.WATER).mean())
-    return f"{grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m, {lethal:.1%} lethal, {water:.1%} water"
+    size = f"{grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m"
+    return [
+        f"terrain: {size}, {lethal:.1%} lethal, {water:.1%} water",
+        *(f"- {note}" for note in terrain.notes),
+        *(f"! {doubt}" for doubt in doubts_about(facts_of(terrain))),
+    ]

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 from swarm.client.frame import Frame
 from swarm.client.observer import Observer
+from swarm.client.orders import Orders
 from swarm.client.session import Session, SwarmThread
 from swarm.client.target import Target
 from swarm.client.vehicle import Vehicle
 from swarm.clock import MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError
 from swarm.wire.messages.processes import RunInfo
+from swarm.wire.messages.targets import POSE_LEASE_S
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
@@ -76,9 +78,18 @@ class Swarm:
         """
         return Vehicle(self._session, id, group, radius_m, lease_s)
 
-    def target(self, id: str) -> Target:
-        """A target of the scenario that this program tracks: its walk there is `external`."""
-        return Target(self._session, id)
+    def target(self, id: str, *, tracker: str | None = None, lease_s: float = POSE_LEASE_S) -> Target:
+        """A target of the scenario that this program tracks: its walk there is `external`.
+
+        id       of the target
+        tracker  name of this tracker, the same after a restart: it goes on at once then
+        lease_s  the target counts as lost, or as the next tracker's, so long after the last word
+        """
+        return Target(self._session, id, tracker, lease_s)
+
+    def orders(self) -> Orders:
+        """Orders to the swarm: pause, close areas, add targets ... With certificates for `operator.NAME` only."""
+        return Orders(self._session)
 
     def observer(self) -> Observer:
         """What happens in the swarm, from now on."""

@@ -10,6 +10,7 @@ from swarm.bus.bus import Event, Heard, LinkChanged, Replied
 from swarm.client.stream import Stream
 from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS, GridSpec, walk
+from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.marks import MarkSet, MarksRequest
 from swarm.wire.messages.processes import Note
@@ -50,12 +51,19 @@ class SeenVehicle:
 
 @dataclass(frozen=True, slots=True)
 class SeenTarget:
-    """A target, where it was said to be last. `captures`: how often it was captured."""
+    """A target, where its owner among the trackers said last that it is.
+
+    captures  how often it was captured
+    tracker   name of the owner, if it has one
+    lost      nobody tracks it now: it was there, and may be anywhere
+    """
 
     id: str
     x_m: float
     y_m: float
     captures: int
+    tracker: str | None
+    lost: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +88,9 @@ class Observer:
         self._fleets: dict[tuple[str, int], tuple[Fleet, int]] = {}
         """(author, region) -> its newest message, and when it came."""
         self._bodies: dict[str, tuple[Body, int]] = {}
-        self._targets: dict[str, TargetPose] = {}
+        self._trackings = Trackings(session.frame.grid)
+        self._targets: dict[str, None] = {}
+        """Ids of targets that were heard of, in order."""
         self._routes: dict[str, Followed] = {}
         self._sets: dict[tuple[int, str], MarkSet] = {}
         """(tile, author) -> its newest set."""
@@ -119,7 +129,13 @@ class Observer:
     def targets(self) -> Mapping[str, SeenTarget]:
         """All that were heard of, by id."""
         with self._session.lock:
-            return {id: SeenTarget(id, pose.x_m, pose.y_m, pose.captures) for id, pose in self._targets.items()}
+            now_ns = self._session.now_ns()
+            tracked = ((id, self._trackings.of(id)) for id in self._targets)
+            return {
+                id: SeenTarget(id, pose.x_m, pose.y_m, pose.captures, pose.tracker, tracking.lost(now_ns))
+                for id, tracking in tracked
+                if tracking is not None and (pose := tracking.pose) is not None
+            }
 
     @property
     def routes(self) -> Mapping[str, list[tuple[float, float]]]:
@@ -152,7 +168,8 @@ class Observer:
             case Heard(message=Body() as body):
                 self._bodies[body.id] = body, now_ns
             case Heard(topic=topic, message=TargetPose() as pose) if topic is POSE:
-                self._targets[pose.target] = pose
+                if self._trackings.hear(pose, now_ns) is not None:
+                    self._targets[pose.target] = None
             case Heard(message=Followed() as followed):
                 self._hear_followed(followed)
             case Heard(message=Note() as note):

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 from swarm.client.frame import Frame, Point
 from swarm.grid import walk
+from swarm.wire.messages.planning import PushedRoute, RouteReply
 from swarm.wire.routes import Route as WireRoute
 from swarm.wire.routes import RouteStatus
 
@@ -23,6 +24,8 @@ class Route:
     cost_s         seconds that it takes
     lower_bound_s  proven: no route is quicker on the planner's present map
     remaining_s    cost-to-go from the last cell; 0 if that is the target's
+    pose_age_s     how long ago the target was heard of, when the planner answered; None if it does not say
+    tracker_lost   nobody tracks the target now: it was there, and may be anywhere
     """
 
     frame: Frame
@@ -32,13 +35,19 @@ class Route:
     cost_s: float
     lower_bound_s: float
     remaining_s: float
+    pose_age_s: float | None = None
+    tracker_lost: bool = False
 
     @classmethod
-    def of(cls, frame: Frame, target: str, route: WireRoute) -> Route:
-        """Raises ValueError on a route that leaves the terrain."""
+    def of(cls, frame: Frame, route: WireRoute, reply: RouteReply | PushedRoute) -> Route:
+        """A route of an answer, or one that was pushed. Raises ValueError if it leaves the terrain."""
         ok = route.status is RouteStatus.OK
         cells = tuple(walk(frame.grid, route.start, route.directions)) if ok else ()
-        return cls(frame, target, str(route.status), cells, route.cost_s, route.lower_bound_s, route.remaining_s)
+        age_s, lost = (reply.pose_age_s, reply.tracker_lost) if isinstance(reply, RouteReply) else (None, False)
+        return cls(
+            frame, reply.target, str(route.status), cells, route.cost_s, route.lower_bound_s, route.remaining_s,
+            age_s, lost,
+        )  # fmt: skip
 
     @property
     def ok(self) -> bool:

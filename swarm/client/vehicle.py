@@ -149,7 +149,7 @@ class Vehicle:
                 return
             reply: RouteReply = done.result()[0]
             try:
-                found.set_result(Route.of(session.frame, target, reply.routes[0]))
+                found.set_result(Route.of(session.frame, reply.routes[0], reply))
             except (ValueError, IndexError) as error:
                 found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
 
@@ -206,19 +206,20 @@ class Vehicle:
                 if (error := done.exception()) is not None:
                     self._session.problem("routes_missed", f"vehicle {self.id} gets no route to {target}: {error}")
                 else:
-                    self._take(target, done.result()[0].routes)
+                    self._take(done.result()[0])
 
         asked.add_done_callback(finish)
 
     def _near_end(self, route: Route) -> bool:
         return self.cell in route.cells[-_NEAR_END_CELLS:]
 
-    def _take(self, target: str, routes: Any) -> None:
+    def _take(self, reply: RouteReply | PushedRoute) -> None:
         """A route that was given: told if it says anything new."""
         try:
-            route = Route.of(self._session.frame, target, routes[0])
+            given = reply.route if isinstance(reply, PushedRoute) else reply.routes[0]
+            route = Route.of(self._session.frame, given, reply)
         except (ValueError, IndexError) as error:
-            self._session.problem("routes_refused", f"the planner of {target} answers nonsense: {error}")
+            self._session.problem("routes_refused", f"the planner of {reply.target} answers nonsense: {error}")
             return
         if self._route is not None and _is_rest(route, self._route):
             return
@@ -291,7 +292,7 @@ class Vehicle:
             case Heard(message=PushedRoute() as pushed) if (
                 pushed.vehicle == self.id and pushed.target == self._target
             ):
-                self._take(pushed.target, [pushed.route])
+                self._take(pushed)
             case Heard(message=MarkSet() as marks) if marks.author == self._marks.author:
                 self._put_marks(self._marks.heard(marks, now_ns))
             case Asked(topic=topic, request=MarksRequest() as request, fields=fields) if topic is MARKS and fields[
@@ -351,7 +352,7 @@ def _check_target(session: Session, target: str) -> None:
 
 def _is_rest(new: Route, old: Route) -> bool:
     """Whether a route says no more than the rest of the one before, of which the vehicle has driven a part."""
-    if (new.status, new.arrived, new.target) != (old.status, old.arrived, old.target):
+    if (new.status, new.arrived, new.tracker_lost) != (old.status, old.arrived, old.tracker_lost):
         return False
     if not new.ok or new.cells == old.cells:
         return True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from swarm.config.scenario import GroupConfig, Scenario
+from swarm.errors import ConfigError
 
 
 class AgentPlan(msgspec.Struct, frozen=True):
@@ -18,6 +19,31 @@ class AgentPlan(msgspec.Struct, frozen=True):
     @property
     def vehicle_ids(self) -> list[str]:
         return [f"{self.id}-{n:02d}" for n in range(self.count)]
+
+
+class AddedAgent(msgspec.Struct, frozen=True):
+    """An agent that joins a run which its scenario does not name it in.
+
+    at  [row, col] near which its vehicles enter; anywhere if None
+    """
+
+    plan: AgentPlan
+    at: tuple[int, int] | None = None
+
+
+def added_agent(
+    scenario: Scenario, id: str, group: str, count: int, at: tuple[int, int] | None = None
+) -> AddedAgent:
+    """Vehicles of a group of the scenario, beside those that it has. Raises ConfigError where that cannot be."""
+    groups = {each.name: each for each in scenario.groups}
+    if group not in groups:
+        raise ConfigError(f"scenario {scenario.name} has no group {group!r}; it has {', '.join(groups)}")
+    if any(plan.id == id for plan in plan_agents(scenario)):
+        raise ConfigError(f"scenario {scenario.name} has an agent {id!r} itself: choose another name")
+    if not 1 <= count <= scenario.vehicles.per_agent:
+        most = scenario.vehicles.per_agent
+        raise ConfigError(f"an agent hosts 1 to {most} vehicles (vehicles.per_agent), not {count}")
+    return AddedAgent(AgentPlan(id, groups[group], 0, count), at)
 
 
 def agent_of(vehicle: str) -> str:

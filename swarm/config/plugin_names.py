@@ -9,12 +9,15 @@ from __future__ import annotations
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING
 
 from swarm.config.explain import nearest
 from swarm.config.input_files import shown
-from swarm.config.scenario import Assigner, Dynamics, Scenario, Sensor, Strategy, Walk
+from swarm.config.scenario import Assigner, Dynamics, Scenario, Sensor, Strategy, TargetConfig, Walk
 from swarm.errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,18 +93,19 @@ def plugins_of(scenario: Scenario) -> list[NamedPlugin]:
     vehicles, planner = scenario.vehicles, scenario.planner
     sensor, assignment = PLUGIN_KINDS["sensor"], PLUGIN_KINDS["assignment"]
     dynamics, strategy = PLUGIN_KINDS["dynamics"], PLUGIN_KINDS["strategy"]
-    walk = PLUGIN_KINDS["walk"]
     return [
         NamedPlugin(sensor, "vehicles.sensor", vehicles.sensor, vehicles.sensor_options),
         NamedPlugin(assignment, "vehicles.assignment", vehicles.assignment, vehicles.assignment_options),
         NamedPlugin(dynamics, "vehicles.dynamics", vehicles.dynamics, vehicles.dynamics_options),
         NamedPlugin(strategy, "planner.strategy", planner.strategy, planner.strategy_options),
-        *(
-            NamedPlugin(walk, f"targets[{n}].walk", target.walk, target.walk_options)
-            for n, target in enumerate(scenario.targets)
-        ),
+        *(walk_named_by(target, f"targets[{n}].walk") for n, target in enumerate(scenario.targets)),
         *cost_layers_of(scenario),
     ]
+
+
+def walk_named_by(target: TargetConfig, key: str) -> NamedPlugin:
+    """The walk of a target, which stands under `key`."""
+    return NamedPlugin(PLUGIN_KINDS["walk"], key, target.walk, target.walk_options)
 
 
 def cost_layers_of(scenario: Scenario) -> list[NamedPlugin]:
@@ -115,6 +119,9 @@ def cost_layers_of(scenario: Scenario) -> list[NamedPlugin]:
 
 def installed(kind: PluginKind) -> dict[str, list[EntryPoint]]:
     """The plug-ins that installed packages offer, by name: more than one where two packages use the same."""
+    # Imported here: it takes a while, and few scenarios name what is not built in.
+    from importlib.metadata import entry_points
+
     found: dict[str, list[EntryPoint]] = {}
     for point in entry_points(group=kind.group):
         found.setdefault(point.name, []).append(point)

@@ -46,7 +46,7 @@ class GuestSession:
         self._inbox = Inbox()
         self._changed = threading.Condition(threading.RLock())
         """Guards the service; notified whenever it may have come to hold other cells."""
-        self._closed = False
+        self._closed = threading.Event()
         self._failure: BaseException | None = None
         self.warnings: list[str] = []
         """Sentences about why it waits, or what cannot be true."""
@@ -128,10 +128,10 @@ class GuestSession:
 
     def close(self) -> None:
         """Leave, and end the session."""
-        if not self._closed:
+        if not self._closed.is_set():
             self.leave()
             with self._changed:
-                self._closed = True
+                self._closed.set()
                 self._service.stop()
             self._inbox.close()
             self._thread.join(2 * _TICK_S + 1.0)
@@ -148,10 +148,10 @@ class GuestSession:
     def _run(self) -> None:
         due_ns = self._clock.now_ns()
         try:
-            while True:
+            while not self._closed.is_set():
                 event = self._inbox.take(_TICK_S)
                 with self._changed:
-                    if self._closed:
+                    if self._closed.is_set():
                         return
                     now_ns = self._clock.now_ns()
                     if event is not None:

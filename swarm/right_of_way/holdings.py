@@ -182,6 +182,10 @@ class Holdings:
         """Whether no vehicle of ours holds or wants a cell, and all wardens that we spoke to know it."""
         return not (self.plots or self._paths or self._enters)
 
+    def is_granted(self, vehicle: str) -> bool:
+        """Whether a table in use grants cells to a vehicle, though it may have left them."""
+        return any(vehicle in view.seen for view in self._views.values())
+
     def waiting(self, plot: int) -> list[str]:
         """The vehicles that hold cells of a plot, as far as its table in use tells."""
         return list(self._views[plot].seen) if plot in self._views else []

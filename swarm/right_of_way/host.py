@@ -90,7 +90,7 @@ class Host:
     def hear_token(self, peer: Peer, *, up: bool) -> None:
         """The liveliness token of another process has risen or fallen."""
         if peer.id == self.name:
-            (self._twins.appeared if up else self._twins.gone)(peer)
+            (self._twins.appeared if up else self._twins.gone)(Peer("host", peer.id, peer.incarnation))
 
     def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
         """What our vehicles have to say now."""
@@ -101,7 +101,7 @@ class Host:
         then: ask what is known of us, and `begin`."""
         if not self.holdings.replaced:
             return False
-        if self._twins.is_alive("agent", self.name) or self._alone_since_ns is None:
+        if self._twins.is_alive("host", self.name) or self._alone_since_ns is None:
             self._alone_since_ns = now_ns
         if now_ns - self._alone_since_ns < _ALONE_NS:
             return False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from swarm.bus.bus import Asked, Bus, Event, Heard, Post, Replied
+from swarm.bus.bus import Asked, AskEnded, Bus, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.order_book import OrderBook
 from swarm.runtime.role import RoleSetup
@@ -14,10 +14,13 @@ from swarm.wire.topics import OBEYED, ORDERS
 
 _MOST_WAITING = 64
 _TAG = "orders"
-_ASK_AGAIN_NS = NS_PER_S // 2
-_ASK_S = 1.0
+_ASK_AGAIN_NS = NS_PER_S // 4
+_ASK_S = 2.0
 _ASKS_OF_KEEPERS = 2
-_ASKS = 4
+_ASKS_OF_NOBODY = 4
+"""So many asks, a second in all, that reached nobody who knows: a keeper may start a little later than others."""
+_ASKS = 10
+"""So many that were not answered in time, though somebody is there."""
 
 
 class Obedience:
@@ -26,7 +29,7 @@ class Obedience:
     A process that starts asks keepers for their book; where none answers, everybody; where nobody answers, it goes
     on without. Later it hears keepers once a second.
 
-    obeys  whether the process goes by an order that it knows; called at ticks
+    obeys  whether the process goes by an order that it knows
 
     book   the orders
     known  whether a book was told, or nobody is there who could: until then nothing moves, as the swarm may be
@@ -44,6 +47,7 @@ class Obedience:
         self._obeys = obeys
         self._waiting: list[Asked] = []
         self._asks = 0
+        self._asking = False
         self._ask_due_ns = 0
 
     def start(self, now_ns: int) -> None:
@@ -63,22 +67,29 @@ class Obedience:
                 if self.known:
                     event.answer(Orders(role=self._obeyed.role, id=self._obeyed.id, orders=list(self.book)))
                 event.end()
+            case AskEnded(tag=tag, failure=failure) if tag == _TAG:
+                self._asking = False
+                enough = _ASKS_OF_NOBODY if failure is None else _ASKS
+                self.known = self.known or self._asks >= enough
             case Asked(request=Obey()):
                 if len(self._waiting) >= _MOST_WAITING:
                     event.refuse(f"{_MOST_WAITING} orders wait here already")
                     event.end()
                 else:
                     self._waiting.append(event)
+                    self._answer()
             case _:
                 return False
         return True
 
     def tick(self, now_ns: int) -> None:
+        """Ask again what is ordered if nobody has told, and answer those whose order is obeyed by now."""
+        if not self.known and not self._asking and now_ns >= self._ask_due_ns:
+            self._ask(now_ns)
+        self._answer()
+
+    def _answer(self) -> None:
         """Answer those whose order is obeyed now, and leave those who ask no more."""
-        if not self.known and now_ns >= self._ask_due_ns:
-            self.known = self._asks >= _ASKS
-            if not self.known:
-                self._ask(now_ns)
         left: list[Asked] = []
         for asked in self._waiting:
             assert isinstance(asked.request, Obey)
@@ -97,5 +108,6 @@ class Obedience:
     def _ask(self, now_ns: int) -> None:
         self._ask_due_ns = now_ns + _ASK_AGAIN_NS
         self._asks += 1
+        self._asking = True
         whom = {"role": "keeper"} if self._asks <= _ASKS_OF_KEEPERS else {}
         self._bus.ask(ORDERS, Nothing(), self._post, tag=_TAG, timeout_s=_ASK_S, **whom)

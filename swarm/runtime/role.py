@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.processes import RunInfo
@@ -17,6 +18,7 @@ class RoleSetup:
     incarnation  nanoseconds at its start: a later start of the same (role, id) has a larger one
     started_ns   start of the run
     run_dir      where this machine keeps the run: prepared terrain, the keeper's store, logs; None if nowhere
+    added        of an agent that the scenario does not name: what it hosts
     """
 
     scenario: Scenario
@@ -26,6 +28,7 @@ class RoleSetup:
     incarnation: int
     started_ns: int
     run_dir: Path | None = None
+    added: AddedAgent | None = None
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
         """What this process answers when others ask which run it belongs to."""

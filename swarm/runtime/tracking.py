@@ -24,9 +24,12 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 from enum import Enum
 
+import msgspec
+
 from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
 from swarm.liveness import POSE_SILENCE_NS
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
 
 SAME_NS = 3 * NS_PER_S // 4
 """Receivers measure when a tracker began as exactly as they look, which is at their ticks."""
@@ -71,17 +74,14 @@ class _Life:
 
 
 class Tracking:
-    """What one receiver knows about the trackers of one target.
+    """What one receiver knows about the trackers of one target."""
 
-    cells  how many the grid has
-    """
-
-    def __init__(self, cells: int) -> None:
+    def __init__(self, grid: GridSpec) -> None:
         self.pose: TargetPose | None = None
-        """The newest that counts: where the target was last."""
+        """The newest that counts, with its cell: where the target was last."""
         self.heard_ns = 0
         """When that arrived."""
-        self._cells = cells
+        self._grid = grid
         self._until_ns = 0
         """When the last lease ends."""
         self._lives: dict[tuple[str | None, int], _Life] = {}
@@ -97,7 +97,9 @@ class Tracking:
 
     def hear(self, pose: TargetPose, now_ns: int) -> Verdict:
         """Take in a pose of this target. Only if it counts has `pose` changed."""
-        if not 0 <= pose.cell < self._cells:
+        if pose.cell == CELL_OF_PLACE:
+            pose = msgspec.structs.replace(pose, cell=self._grid.cell_at(pose.x_m, pose.y_m))
+        if not 0 <= pose.cell < self._grid.cells:
             return Verdict.OUTSIDE
         key = (pose.tracker, pose.incarnation)
         life = self._lives.get(key)
@@ -124,7 +126,7 @@ class Tracking:
     def place(self, pose: TargetPose, now_ns: int) -> None:
         """Take a pose for where a target without a tracker is, for as long as its lease says. The same once more
         changes nothing."""
-        if pose != self.pose and 0 <= pose.cell < self._cells:
+        if pose != self.pose and 0 <= pose.cell < self._grid.cells:
             self.pose, self.heard_ns = pose, now_ns
             self._until_ns = now_ns + int(pose.lease_s * NS_PER_S)
 
@@ -144,26 +146,26 @@ class Tracking:
 class Trackings:
     """The trackers of many targets. Of targets beyond 4096 nothing is known, and all is refused."""
 
-    def __init__(self, cells: int) -> None:
-        self._cells = cells
+    def __init__(self, grid: GridSpec) -> None:
+        self._grid = grid
         self._of: dict[str, Tracking] = {}
 
-    def hear(self, pose: TargetPose, now_ns: int) -> Verdict:
-        """Take in a pose of any target."""
+    def hear(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
+        """Take in a pose of any target; returns it, with its cell, if it counts."""
         tracking = self._of.get(pose.target)
         if tracking is None:
             if len(self._of) >= _MOST_TARGETS:
-                return Verdict.REFUSED
-            tracking = Tracking(self._cells)
+                return None
+            tracking = Tracking(self._grid)
         verdict = tracking.hear(pose, now_ns)
         if tracking.pose is not None:
             self._of[pose.target] = tracking
-        return verdict
+        return tracking.pose if verdict is Verdict.COUNTS else None
 
     def place(self, pose: TargetPose, now_ns: int) -> None:
         """As `Tracking.place`, of any target."""
-        if pose.target not in self._of and len(self._of) < _MOST_TARGETS and 0 <= pose.cell < self._cells:
-            self._of[pose.target] = Tracking(self._cells)
+        if pose.target not in self._of and len(self._of) < _MOST_TARGETS and 0 <= pose.cell < self._grid.cells:
+            self._of[pose.target] = Tracking(self._grid)
         if (tracking := self._of.get(pose.target)) is not None:
             tracking.place(pose, now_ns)
 

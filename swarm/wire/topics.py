@@ -15,6 +15,7 @@ from swarm.wire.codec import prime
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.marks import Digest, MarkSet, MarkSets, MarksRequest
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Orders, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
@@ -195,8 +196,10 @@ CHASERS = Topic(
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", Standing,
     "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
-    "none is heard; each counts, as two lives of a host must not hide each other's words", "on change, else 5 Hz",
-    access(put="agent:agent", hear="agent:member"), newest=False, trusted=True, priority=Priority.INTERACTIVE,
+    "none is heard; each counts, as two lives of a host must not hide each other's words; by it an operator says "
+    "that a guest is gone", "on change, else 5 Hz",
+    access(put="agent:agent operator", hear="agent:member"), newest=False, trusted=True,
+    priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
     "table", "table/{plot}/{agent}", Table,
@@ -219,6 +222,11 @@ KNOWN = Topic(
     "known", "known/{agent}", Known, "what an agent has on file about another, for a new life of that",
     "asked at a start", access(serve="agent:agent", ask="agent"), request=KnownRequest, published=False,
     trusted=True, priority=Priority.INTERACTIVE,
+)  # fmt: skip
+LEAVE = Topic(
+    "leave", "leave/{agent}", Removed, "which vehicles have left, for an operator who asks an agent to let them",
+    "asked", access(serve="agent:agent"), request=RemoveVehicles, published=False, trusted=True,
+    priority=Priority.INTERACTIVE,
 )  # fmt: skip
 FOLLOWED = Topic(
     "followed", "vehicle/{agent}/{vehicle}/followed", Followed, "the route that a vehicle has begun",
@@ -309,9 +317,9 @@ NOTE = Topic(
 )  # fmt: skip
 
 TOPICS = (
-    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, FOLLOWED,
-    PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER, ORDERS, OBEYED,
-    STATS, NOTE,
+    RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, STANDING, TABLE, GRANTED, STORED, KNOWN, LEAVE,
+    FOLLOWED, PUSHED_ROUTE, POSE, SIGHTED, TRUE_POSE, BODY, ROUTE, COST, STATUS, LEAD, ZONES, GIVE_ORDER, ORDERS,
+    OBEYED, STATS, NOTE,
 )  # fmt: skip
 
 ALIVE_KEY = "alive/{role}/{id}/{incarnation}"

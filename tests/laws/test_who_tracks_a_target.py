@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
 from swarm.runtime.tracking import LONGEST_AGE_NS, MOST_LIVES, SAME_NS, Tracking, Trackings, Verdict
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
 
-CELLS = 1000
+GRID = GridSpec(25, 40, 10.0)
 HOUR_NS = 3600 * NS_PER_S
 START_NS = 1_800_000_000 * NS_PER_S
 """True time begins at a date, as every clock shows one."""
@@ -75,7 +76,7 @@ def test_receivers_agree_on_the_oldest_tracker_that_lives_whatever_each_has_hear
         )
         for name, age_s in zip(names, ages_s, strict=True)
     ]
-    receivers = [(Tracking(CELLS), data.draw(offsets)) for _ in range(3)]
+    receivers = [(Tracking(GRID), data.draw(offsets)) for _ in range(3)]
     ends_ns = {id(each): chance.choice([12, 3]) * NS_PER_S for each in trackers}
     arrivals: list[tuple[int, int, TargetPose]] = []
     for each in trackers:
@@ -117,7 +118,7 @@ def test_a_second_tracker_steals_no_target_while_the_first_lives_whatever_the_cl
 ) -> None:
     first = Tracker("m", START_NS, first_ns)
     second = Tracker(name, START_NS + 2 * NS_PER_S, second_ns)
-    tracking = Tracking(CELLS)
+    tracking = Tracking(GRID)
     for at_ns in range(0, 20 * NS_PER_S, NS_PER_S // 2):
         now_ns = START_NS + at_ns
         assert tracking.hear(first.pose(now_ns), now_ns + receiver_ns) is Verdict.COUNTS
@@ -134,7 +135,7 @@ def test_a_second_tracker_steals_no_target_while_the_first_lives_whatever_the_cl
 
 @given(st.sampled_from([0.0, 1e-9, 0.5, 2.0, 60.0]))
 def test_a_target_is_lost_when_the_lease_has_passed_since_the_last_arrival_and_not_before(lease_s: float) -> None:
-    tracking, tracker = Tracking(CELLS), Tracker("a", START_NS, lease_s=lease_s)
+    tracking, tracker = Tracking(GRID), Tracker("a", START_NS, lease_s=lease_s)
     assert not tracking.lost(START_NS)
     tracking.hear(tracker.pose(START_NS), START_NS)
     end_ns = START_NS + int(lease_s * NS_PER_S)
@@ -145,7 +146,7 @@ def test_a_target_is_lost_when_the_lease_has_passed_since_the_last_arrival_and_n
 
 
 def test_a_lease_of_zero_hands_the_target_over_and_what_comes_late_does_not_take_it_back() -> None:
-    first, second, tracking = Tracker("a", START_NS), Tracker("b", START_NS + NS_PER_S), Tracking(CELLS)
+    first, second, tracking = Tracker("a", START_NS), Tracker("b", START_NS + NS_PER_S), Tracking(GRID)
     now_ns = START_NS + 2 * NS_PER_S
     late = first.pose(now_ns)
     tracking.hear(first.pose(now_ns), now_ns)
@@ -158,7 +159,7 @@ def test_a_lease_of_zero_hands_the_target_over_and_what_comes_late_does_not_take
 
 
 def test_a_tracker_that_starts_again_takes_over_from_its_earlier_life_at_once() -> None:
-    tracking, first, again = Tracking(CELLS), Tracker("a", START_NS), Tracker("a", START_NS + 10)
+    tracking, first, again = Tracking(GRID), Tracker("a", START_NS), Tracker("a", START_NS + 10)
     last = first.pose(START_NS + 20)
     tracking.hear(first.pose(START_NS + 20), START_NS + 20)
     assert tracking.hear(again.pose(START_NS + 30), START_NS + 30) is Verdict.COUNTS
@@ -167,7 +168,7 @@ def test_a_tracker_that_starts_again_takes_over_from_its_earlier_life_at_once() 
 
 
 def test_of_two_trackers_with_one_name_the_later_counts_until_it_is_silent() -> None:
-    tracking, first, second = Tracking(CELLS), Tracker("a", START_NS), Tracker("a", START_NS + NS_PER_S)
+    tracking, first, second = Tracking(GRID), Tracker("a", START_NS), Tracker("a", START_NS + NS_PER_S)
     for at_ns in range(2 * NS_PER_S, 4 * NS_PER_S, NS_PER_S // 4):
         assert tracking.hear(second.pose(START_NS + at_ns), START_NS + at_ns) is Verdict.COUNTS
         assert tracking.hear(first.pose(START_NS + at_ns), START_NS + at_ns) is Verdict.REFUSED
@@ -178,7 +179,7 @@ def test_trackers_that_began_together_are_ordered_by_name_for_all_receivers() ->
     a, b, none = Tracker("a", START_NS + SAME_NS // 2), Tracker("b", START_NS), Tracker(None, START_NS)
     now_ns = START_NS + NS_PER_S
     for order in ((a, b, none), (none, b, a), (b, none, a)):
-        tracking = Tracking(CELLS)
+        tracking = Tracking(GRID)
         for each in order:
             tracking.hear(each.pose(now_ns), now_ns)
         assert owner_of(tracking, now_ns) == ("a", a.began_ns)
@@ -186,21 +187,21 @@ def test_trackers_that_began_together_are_ordered_by_name_for_all_receivers() ->
 
 @pytest.mark.parametrize("incarnation", [0, 1, START_NS + HOUR_NS, (1 << 62) - 1])
 def test_an_incarnation_that_is_no_time_gives_no_seniority(incarnation: int) -> None:
-    tracker, tracking = Tracker("z", START_NS), Tracking(CELLS)
+    tracker, tracking = Tracker("z", START_NS), Tracking(GRID)
     now_ns = START_NS + NS_PER_S
     tracking.hear(tracker.pose(now_ns), now_ns)
     odd = msgspec.structs.replace(Tracker("a", 0).pose(now_ns), incarnation=incarnation)
     assert odd.stamp_ns - incarnation not in range(LONGEST_AGE_NS)
     assert tracking.hear(odd, now_ns) is Verdict.REFUSED
     # Alone it is heard all the same.
-    assert Tracking(CELLS).hear(odd, now_ns) is Verdict.COUNTS
+    assert Tracking(GRID).hear(odd, now_ns) is Verdict.COUNTS
 
 
 @given(st.lists(st.tuples(st.integers(0, (1 << 62) - 1), st.integers(0, (1 << 62) - 1)), max_size=60))
 def test_whatever_is_made_up_a_tracker_that_goes_on_is_heard_after_the_longest_lease_of_a_lie(
     lies: list[tuple[int, int]],
 ) -> None:
-    tracking, tracker = Tracking(CELLS), Tracker("a", START_NS)
+    tracking, tracker = Tracking(GRID), Tracker("a", START_NS)
     for incarnation, seq in lies:
         lie = msgspec.structs.replace(tracker.pose(START_NS), incarnation=incarnation, seq=seq)
         tracking.hear(msgspec.structs.replace(lie, tracker=None if seq % 2 else "a"), START_NS)
@@ -212,7 +213,7 @@ def test_whatever_is_made_up_a_tracker_that_goes_on_is_heard_after_the_longest_l
 
 
 def test_a_flood_of_young_trackers_does_not_push_out_the_owner() -> None:
-    tracking, owner = Tracking(CELLS), Tracker("z", START_NS)
+    tracking, owner = Tracking(GRID), Tracker("z", START_NS)
     now_ns = START_NS + 10 * NS_PER_S
     tracking.hear(owner.pose(now_ns), now_ns)
     for n in range(100):
@@ -222,19 +223,19 @@ def test_a_flood_of_young_trackers_does_not_push_out_the_owner() -> None:
     assert len(tracking._lives) == MOST_LIVES
 
 
-@pytest.mark.parametrize("cell", [-1, CELLS, (1 << 32) - 1])
+@pytest.mark.parametrize("cell", [-2, GRID.cells, (1 << 32) - 1])
 def test_a_pose_off_the_map_neither_counts_nor_keeps_its_tracker_alive(cell: int) -> None:
-    trackings, tracker = Trackings(CELLS), Tracker("a", START_NS)
-    assert trackings.hear(tracker.pose(START_NS, cell), START_NS) is Verdict.OUTSIDE
+    trackings, tracker = Trackings(GRID), Tracker("a", START_NS)
+    assert trackings.hear(tracker.pose(START_NS, cell), START_NS) is None
     assert trackings.of("t") is None
     trackings.hear(tracker.pose(START_NS), START_NS)
     now_ns = START_NS + 2 * NS_PER_S
-    assert trackings.hear(tracker.pose(now_ns, cell), now_ns) is Verdict.OUTSIDE
+    assert trackings.hear(tracker.pose(now_ns, cell), now_ns) is None
     assert trackings.lost(now_ns) == {"t"}
 
 
 def test_replaying_everything_that_was_heard_changes_nothing() -> None:
-    chance, tracking = random.Random(3), Tracking(CELLS)
+    chance, tracking = random.Random(3), Tracking(GRID)
     trackers = [Tracker("a", START_NS), Tracker("b", START_NS + 5 * NS_PER_S)]
     told = [each.pose(START_NS + at_ns) for at_ns in range(0, NS_PER_S, NS_PER_S // 10) for each in trackers]
     for pose in told:
@@ -246,9 +247,22 @@ def test_replaying_everything_that_was_heard_changes_nothing() -> None:
 
 
 def test_a_pose_that_comes_late_does_not_make_its_tracker_younger() -> None:
-    first, second, tracking = Tracker("z", START_NS), Tracker("a", START_NS + 2 * NS_PER_S), Tracking(CELLS)
+    first, second, tracking = Tracker("z", START_NS), Tracker("a", START_NS + 2 * NS_PER_S), Tracking(GRID)
     for at_ns in range(3 * NS_PER_S, 9 * NS_PER_S, NS_PER_S // 2):
         late_ns = 0 if at_ns == 3 * NS_PER_S else 7 * NS_PER_S // 5
         arrives_ns = START_NS + at_ns + late_ns
         assert tracking.hear(first.pose(START_NS + at_ns), arrives_ns) is Verdict.COUNTS
         assert tracking.hear(second.pose(arrives_ns), arrives_ns) is Verdict.REFUSED
+
+
+@given(st.floats(-50, 450), st.floats(-300, 50))
+def test_a_pose_without_a_cell_is_in_the_cell_of_its_place_or_outside(x_m: float, y_m: float) -> None:
+    trackings, tracker = Trackings(GRID), Tracker("a", START_NS)
+    pose = msgspec.structs.replace(tracker.pose(START_NS), cell=CELL_OF_PLACE, x_m=x_m, y_m=y_m)
+    counts = trackings.hear(pose, START_NS)
+    if counts is None:
+        assert not (0 <= x_m < 400 and -250 < y_m <= 0)
+        return
+    middle_x_m, middle_y_m = GRID.centre_m(counts.cell)
+    assert max(abs(x_m - middle_x_m), abs(y_m - middle_y_m)) <= 5.0
+    assert counts == msgspec.structs.replace(pose, cell=counts.cell)

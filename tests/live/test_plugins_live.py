@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 from support.live_swarm import swarm, write_scenario
+from support.plugin_pages import write_all_examples
+
+from launch_scripts.launcher.options import free_ports
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -85,3 +88,36 @@ def test_a_swarm_all_whose_plugins_fail_names_each_and_goes_on(tmp_path: Path) -
     numbers = json.loads(report.read_text())
     assert (numbers["vehicles_routed"], numbers["collisions"], numbers["lethal_entries"]) == (12, 0, 0)
     assert numbers["restarts"] == 0
+
+
+ALL = """
+time_scale = 10
+[terrain]
+source = "synthetic"
+rows = 96
+cols = 128
+[terrain.hidden]
+rubble_fields = 5
+[[groups]]
+vehicles = 12
+[network]
+listen = ["tcp/127.0.0.1:{port}"]
+connect = ["tcp/127.0.0.1:{port}"]
+[monitor]
+grpc_port = 0
+web_port = 0
+"""
+
+
+def test_the_examples_of_all_pages_run_together(tmp_path: Path) -> None:
+    path = write_all_examples(tmp_path, ALL.format(port=free_ports(1)[0]))
+    assert sum(line.count(":") for line in path.read_text().splitlines() if '"tcp' not in line) == 6
+    told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 20, "--plain", timeout_s=110)
+    said = told.stdout + told.stderr
+    assert told.returncode == 0, said
+    assert "plug-in" not in said
+    (report,) = (tmp_path / "runs").glob("*/report.json")
+    numbers = json.loads(report.read_text())
+    assert (numbers["vehicles_routed"], numbers["collisions"], numbers["lethal_entries"]) == (12, 0, 0)
+    assert numbers["marks"] > 0
+    assert all("plugin_failed" not in log.read_text() for log in (tmp_path / "runs").glob("*/*.log"))

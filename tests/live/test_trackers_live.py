@@ -34,8 +34,8 @@ class Outside:
         self.started: list[subprocess.Popen[bytes]] = []
 
     def start(self, tracker: str, row: int, col: int) -> subprocess.Popen[bytes]:
-        cols, side_m = 128, 30.0  # as the scenario says; its corner in the north-west is 0, 0
-        place = (row * cols + col, (col + 0.5) * side_m, -(row + 0.5) * side_m)
+        side_m = 30.0  # as the scenario says; its corner in the north-west is 0, 0
+        place = ((col + 0.5) * side_m, -(row + 0.5) * side_m)
         command = [sys.executable, OUTSIDE, self._live.endpoint, schema_of("pose"), "x", tracker, *place]
         process = subprocess.Popen(list(map(str, command)), cwd="/")
         self.started.append(process)

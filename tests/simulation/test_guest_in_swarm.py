@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import random
 
+from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.worlds import seeded
-from swarm.bus.bus import Event
-from swarm.clock import NS_PER_S
+from swarm.bus.bus import Event, Replied
+from swarm.config.agents import added_agent
 from swarm.right_of_way.guest_service import GuestService
 from swarm.right_of_way.life_file import MemoryLives
+from swarm.wire.messages.guests import Removed, RemoveVehicles
+from swarm.wire.topics import LEAVE
+from vehicle_agent.agent import Agent
 from vehicle_agent.service import AgentService
 
 
@@ -94,7 +98,6 @@ def test_a_guest_enters_drives_dies_comes_back_and_leaves_among_vehicles_of_the_
         rover.on = None
     drive(simulation, rovers, 1.5)
     assert all(rover.service.guest is not None and rover.service.guest.gone for rover in rovers)
-    assert simulation.scheduler.clock.now_ns() > NS_PER_S
 
 
 def test_a_guest_must_not_have_the_name_of_an_agent() -> None:
@@ -104,3 +107,51 @@ def test_a_guest_must_not_have_the_name_of_an_agent() -> None:
     simulation.run_until(4)
     assert rover.service.guest is None
     assert rover.warnings == ["a0 is an agent of this run's scenario: a guest needs another name"]
+
+
+def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anybody() -> None:
+    simulation = Simulation(seeded(4))
+    simulation.run_until(3)
+    group = simulation.scenario.groups[0].name
+    here = simulation.terrain.grid.row_col(places(simulation)[0])
+    node = simulation.add(added_agent(simulation.scenario, "extra", group, 3, here))
+    drive(simulation, [], 8)
+    agent = agent_of_node(node)
+    assert sorted(agent.vehicles) == ["extra-00", "extra-01", "extra-02"]
+    assert any(vehicle.target for vehicle in agent.vehicles.values())
+    before = {id: vehicle.cell for id, vehicle in agent.vehicles.items()}
+    drive(simulation, [], 5)
+    assert any(vehicle.cell != before[id] for id, vehicle in agent.vehicles.items())
+    assert set(before) <= set(simulation.recorder.observed.vehicles().ids)  # whoever watches sees them
+
+    simulation.crash(node.name)
+    drive(simulation, [], 5)
+    agent = agent_of_node(node)
+    assert sorted(agent.vehicles) == sorted(before)
+    asked: list[Removed] = []
+
+    def hear(event: Event) -> None:
+        if isinstance(event, Replied) and isinstance(event.message, Removed):
+            asked.append(event.message)
+
+    bus = simulation.network.bus("operator", simulation.scenario.network.namespace, simulation.authenticator)
+    one, other = "extra-01", next(iter(agent_of_node(simulation.nodes["agent-a0"]).vehicles))
+    bus.ask(LEAVE, RemoveVehicles(vehicles=[one]), hear, tag="x", agent="extra")
+    bus.ask(LEAVE, RemoveVehicles(vehicles=[other, "nobody"]), hear, tag="x", agent="a0")
+    drive(simulation, [], 2)
+    assert [each.left for each in asked] == [[one], [other]]
+    assert asked[1].unknown == ["nobody"]
+    assert one not in agent.vehicles
+    assert other not in agent_of_node(simulation.nodes["agent-a0"]).vehicles
+    bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
+    drive(simulation, [], 2)
+    assert node.service is not None
+    assert node.service.over  # type: ignore[attr-defined]
+    bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
+    drive(simulation, [], 0.5)
+    assert asked[-1].held == 0
+
+
+def agent_of_node(node: Node) -> Agent:
+    assert isinstance(node.service, AgentService)
+    return node.service.agent

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from swarm.config.plugin_names import PLUGIN_KINDS
+
 PAGES = Path(__file__).parents[2] / "docs" / "plugins"
 _BLOCK = re.compile(r'^```(\w+) title="([\w.]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 
@@ -14,3 +16,20 @@ def write_example(page: str, folder: Path, more: str = "") -> Path:
     for _, name, text in _BLOCK.findall((PAGES / f"{page}.md").read_text(encoding="utf-8")):
         (folder / name).write_text(more + text if name == "scenario.toml" else text, encoding="utf-8")
     return folder / "scenario.toml"
+
+
+def write_all_examples(folder: Path, more: str) -> Path:
+    """As `write_example` of all pages together: one scenario with a plug-in of every kind, after `more`."""
+    arrays: list[str] = []
+    tables: dict[str, list[str]] = {}
+    for page in PLUGIN_KINDS:
+        text = write_example(page, folder).read_text(encoding="utf-8")
+        for header, body in re.findall(r"^(\[.+\])\n((?:[^\[\n].*\n)+)", text, re.MULTILINE):
+            if header.startswith("[["):
+                arrays.append(f"{header}\n{body}")
+            else:
+                tables.setdefault(header, []).append(body)
+    merged = [f"{header}\n{''.join(bodies)}" for header, bodies in tables.items()]
+    path = folder / "scenario.toml"
+    path.write_text("\n".join([more, *merged, *arrays]), encoding="utf-8")
+    return path

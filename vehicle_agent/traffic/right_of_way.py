@@ -79,6 +79,11 @@ class RightOfWay:
     # --- beginning a life -----------------------------------------------------------------------------------
 
     @property
+    def informed(self) -> bool:
+        """Whether we have heard of all plots that may hold cells of ours."""
+        return self._host.informed
+
+    @property
     def settled(self) -> bool:
         """Whether nobody needs to be asked what is known of us: we live, all other agents have noted our file (a
         guest's nobody notes; it has to hear of its plots), and no later life leaves it to us to say, wherever cells

@@ -101,6 +101,13 @@ def is_local(crs: Any) -> bool:
     )
 
 
+def degrees_of(crs: Any) -> Any:
+    """Latitude and longitude on the body on which a system lies: WGS 84 on the Earth."""
+    import rasterio
+
+    return rasterio.CRS.from_proj4(f"+proj=longlat {_shape_of(crs)} +no_defs")
+
+
 def _shape_of(crs: Any) -> str:
     """The body that a system lies on, for PROJ: the Earth, or the ellipsoid of another planet or moon."""
     ellipsoid = _ellipsoid_of(crs.to_dict(projjson=True)) or {}
@@ -210,8 +217,6 @@ def plan_grid(
         If the georeference is damaged, has neither metres nor degrees, is too near a pole or too wide for one flat
         grid; if no cell fits, or more than `MAX_CELLS` do.
     """
-    import rasterio
-
     if transform.determinant == 0 or not np.isfinite(list(transform)[:6]).all():
         raise TerrainError(
             f"{what} has pixels without a size ({tuple(transform)[:6]}); its georeference is damaged"
@@ -221,7 +226,7 @@ def plan_grid(
             f"{what} is in a coordinate system without metres or degrees ({crs_name(crs)});"
             " reproject it (gdalwarp -t_srs EPSG:...) or set terrain.crs"
         )
-    degrees = crs if is_local(crs) else rasterio.CRS.from_proj4(f"+proj=longlat {_shape_of(crs)} +no_defs")
+    degrees = crs if is_local(crs) else degrees_of(crs)
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees, what)
     if crs.is_geographic and not -90.000001 <= south <= north <= 90.000001:
         raise TerrainError(f"{what} reaches from latitude {south:.4g} to {north:.4g}; its georeference is damaged")

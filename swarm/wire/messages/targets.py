@@ -5,6 +5,8 @@ from __future__ import annotations
 from swarm.wire.fields import Cell, Count, Distance, Id, Incarnation, LeaseSeconds, Metres, Natural, StampNs
 from swarm.wire.messages.base import Message, schema_of
 
+CELL_OF_PLACE = -1
+"""In a pose: the sender knows no grid, and each receiver finds the cell by its own."""
 POSE_LEASE_S = 2.0
 """Of a tracker that tells at least twice a second, as simulated targets do."""
 
@@ -17,6 +19,7 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
     incarnation  when the tracker began to track this target, by the clock of `stamp_ns`
     seq          grows within an incarnation
     lease_s      the tracker counts as lost when no pose of it has arrived for so long; 0 hands the target over
+    cell         the cell of the place; left out it is that of `x_m`, `y_m`
     captures     how often it was captured
     jumps        how often it was put somewhere else, as after a capture
     """
@@ -27,7 +30,7 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
     seq: Natural
     lease_s: LeaseSeconds = POSE_LEASE_S
     stamp_ns: StampNs
-    cell: Cell
+    cell: Cell = CELL_OF_PLACE
     x_m: Metres
     y_m: Metres
     captures: Count = 0

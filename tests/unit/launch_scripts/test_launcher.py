@@ -95,9 +95,9 @@ def test_a_part_of_a_swarm_that_has_no_process_is_refused_in_a_sentence(tmp_path
         run_swarm(options)
 
 
-def test_targets_that_somebody_else_tracks_need_no_driver() -> None:
+def test_the_referee_watches_also_where_somebody_else_tracks_all_targets() -> None:
     scenario = Scenario(targets=(TargetConfig(walk="external"),))
-    assert "targets-0" not in [spec.name for spec in processes_of(scenario)]
+    assert "targets-0" in [spec.name for spec in processes_of(scenario)]
 
 
 def test_the_router_starts_first_and_ends_last() -> None:
@@ -344,3 +344,24 @@ def test_a_ctrl_c_that_reaches_the_whole_group_is_for_the_launcher_alone(tmp_pat
     assert order[2:] == ["-agent-a0", "-planner-t0"]
     assert "KeyboardInterrupt" not in (tmp_path / "planner-t0.log").read_text()
     eventually(lambda: not session_of(process.pid), 8, "the end of all")
+
+
+def test_processes_are_added_and_dismissed_while_the_others_run(tmp_path: Path, swarms: list[LocalSwarm]) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "quiet"))
+    swarm.start()
+    added = ProcessSpec("planner", "x", "support.dummy_roles:quiet", added=True)
+    swarm.add(added)
+    eventually(lambda: swarm.by_role() == {"agent": (1, 1), "planner": (1, 1)}, 10)
+    swarm.dismiss(added)
+    endings: list[Ending] = []
+    eventually(lambda: endings.extend(swarm.poll()) or len(swarm.running) == 1, 15, "the end of the planner")
+    assert endings == []
+    assert swarm.by_role() == {"agent": (1, 1)}
+
+
+def test_an_added_process_that_refuses_ends_no_run(tmp_path: Path, swarms: list[LocalSwarm]) -> None:
+    swarm = swarm_of(swarms, tmp_path)
+    swarm.add(ProcessSpec("planner", "x", "support.dummy_roles:refuse", added=True))
+    (ending,) = endings_within(swarm)
+    assert ending.refused
+    assert ending.restart_in_s is not None

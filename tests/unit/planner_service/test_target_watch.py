@@ -14,7 +14,7 @@ from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.targets import TargetPose
+from swarm.wire.messages.targets import CELL_OF_PLACE, TargetPose
 
 GRID = GridSpec(20, 30, 10.0)
 START_NS = 1_800_000_000 * NS_PER_S
@@ -65,6 +65,15 @@ def test_a_pose_outside_is_counted_said_once_and_not_used() -> None:
     assert here.counted() == {"poses_outside": 5}
     assert here.watch.pose is not None
     assert here.watch.pose.cell == GRID.cell(10, 20)
+
+
+def test_a_place_outside_without_a_cell_is_named_by_its_metres() -> None:
+    here = Watch()
+    here.hear(cell=CELL_OF_PLACE, x_m=1234.5, y_m=0.0)
+    here.tick()
+    assert here.sentences() == [
+        "target t0: tracker radar puts it into 1234, 0 m, outside of the terrain of 20 x 30 cells: not used"
+    ]
 
 
 def test_a_target_that_moves_faster_than_anything_is_followed_counted_and_said_once() -> None:

@@ -337,14 +337,52 @@ def test_a_target_that_a_program_tracks_is_followed_by_its_planner() -> None:
         assert world.ear.routes(GRID.cell(30, 30)).target_cell == GRID.cell(9, 10)
 
 
-def test_two_trackers_of_one_target_are_told_of_each_other(world: Swarm) -> None:
-    one, other = Program(world, "one"), Program(world, "other")
-    one.swarm.target("x").at(5.0, -5.0)
-    world.run(0.2)
-    other.swarm.target("x").at(95.0, -5.0)
+def test_of_two_trackers_both_are_told_whose_poses_count_and_the_second_takes_over_when_the_first_leaves(
+    world: Swarm,
+) -> None:
+    one, other, watcher = Program(world, "one"), Program(world, "other"), Program(world, "watcher")
+    watching = watcher.swarm.observer()
+    first = one.swarm.target("x", tracker="radar")
+    first.at(5.0, -5.0)
+    world.run(2.0)
+    second = other.swarm.target("x")
+    second.at(95.0, -5.0)
+    world.run(2.0)
+    assert (first.owned, second.owned) == (True, False)
+    assert one.problems == ["another tracker reports target x too: our poses count"]
+    assert other.problems == ["tracker radar owns target x: its poses count, not ours"]
+    seen = watching.targets["x"]
+    assert (seen.x_m, seen.tracker, seen.lost) == (5.0, "radar", False)
+    first.leave()
     world.run(1.0)
-    assert one.problems == ["another process tracks x; it started later, so it counts and we do not"]
-    assert len(other.problems) == 1
+    assert second.owned
+    assert watching.targets["x"].x_m == 95.0
+    other.bus.close()
+    world.run(3.0)
+    assert watching.targets["x"].lost
+
+
+@pytest.mark.parametrize("wrong", [{"id": "a b"}, {"tracker": "a/b"}, {"lease_s": 0.0}, {"lease_s": math.nan}])
+def test_a_target_that_cannot_be_is_refused_in_a_sentence(world: Swarm, wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=r"target|tracker|lease_s"):
+        Program(world).swarm.target(**({"id": "x"} | wrong))
+
+
+def test_a_follower_is_told_when_its_targets_tracker_is_lost() -> None:
+    world = Swarm(rough(3, lethal=0.0))
+    program = Program(world)
+    target = program.swarm.target("t", lease_s=1.0)
+    target.at(*GRID.centre_m(GRID.cell(9, 9)))
+    world.run(1.0)
+    follower = Program(world, "follower").swarm.vehicle("rover")
+    follower.at(*GRID.centre_m(GRID.cell(30, 3)))
+    routes = follower.follow("t")
+    world.run(1.5)
+    assert routes.newest is not None
+    assert (routes.newest.tracker_lost, routes.newest.pose_age_s is not None) == (False, True)
+    program.bus.close()
+    world.run(4.0)
+    assert routes.newest.tracker_lost
 
 
 def test_an_observer_sees_vehicles_targets_marks_and_captures(world: Swarm) -> None:

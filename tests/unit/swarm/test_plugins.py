@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import signal
 import sys
 import threading
@@ -17,7 +18,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.plugin_modules import forgotten_afterwards
 
-from swarm.config import plugin_names
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.errors import ConfigError
@@ -135,7 +135,9 @@ def test_an_installed_packages_name_is_found_and_two_of_one_name_are_refused(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     points = [EntryPoint("wide", "eyes:Wide", "terrain_swarm.sensor")]
-    monkeypatch.setattr(plugin_names, "entry_points", lambda group: points if group == points[0].group else [])
+    monkeypatch.setattr(
+        importlib.metadata, "entry_points", lambda group: points if group == points[0].group else []
+    )
     monkeypatch.syspath_prepend(str(folder))
     scenario = parse_scenario("[vehicles]\nsensor = 'wide'\nsensor_options = { reach_cells = 2 }")
     check_plugins(scenario, ["agent"])

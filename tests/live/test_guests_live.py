@@ -1,0 +1,167 @@
+"""Vehicles that are not in the scenario, in a swarm of real processes: one with a program of its own, and some that
+`swarm vehicle add` drives."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from support.live_swarm import SWARM, LiveSwarm, ask, client, swarm
+from support.processes import eventually
+
+from swarm.bus.zenoh_bus import open_bus
+from swarm.grid import GridSpec
+from swarm.right_of_way.guest_session import GuestSession
+from swarm.right_of_way.life_file import LifeFile
+from swarm.runtime.run_secret import authenticator_of
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.planning import RouteRequest
+from swarm.wire.messages.processes import RunInfo
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import FLEET, ROUTE, RUN
+
+pytestmark = [pytest.mark.network, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
+    live = LiveSwarm(tmp_path_factory.mktemp("guests"))
+    try:
+        live.wait_until_up()
+        yield live
+    finally:
+        live.kill()
+
+
+@pytest.fixture(scope="module")
+def run(live: LiveSwarm) -> RunInfo:
+    with client(live.network) as bus:
+        return next(info for info in ask(bus, RUN, Nothing()) if info.run_id)
+
+
+def route_of(live: LiveSwarm, grid: GridSpec) -> list[int]:
+    """The first cells of a route to a target."""
+    steps = ((-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1))
+    with client(live.network) as bus:
+        for n in range(10, 90, 7):
+            (reply,) = ask(bus, ROUTE, RouteRequest(row=n, col=n, max_cells=12), target="t0")
+            route = reply.routes[0]
+            if route.status is RouteStatus.OK and len(route.directions) >= 12:
+                path = [grid.cell(n, n)]
+                for code in route.directions:
+                    row, col = grid.row_col(path[-1])
+                    path.append(grid.cell(row + steps[code][0], col + steps[code][1]))
+                return path
+    raise AssertionError("no route of twelve cells from anywhere")
+
+
+def drive(rover: GuestSession, path: list[int]) -> None:
+    rover.want(path)
+    for here, there in pairwise(path):
+        assert rover.may_enter(there, timeout_s=20.0), (rover.cells, there, rover.warnings)
+        rover.left(here)
+
+
+def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
+    live: LiveSwarm, run: RunInfo, tmp_path: Path
+) -> None:
+    grid = GridSpec(run.rows, run.cols, run.resolution_m)
+    path = route_of(live, grid)
+    authenticator = authenticator_of(live.network, run.run_id)
+    with open_bus(live.network, authenticator=authenticator) as bus:
+        lives = LifeFile(tmp_path / "rover")
+        rover = GuestSession("rover", grid, bus, lives)
+        assert not rover.may_enter(path[0])
+        assert rover.enter(path[0], timeout_s=10.0)
+        drive(rover, path[:6])
+    lives.close()  # as if the program had died: it has not left
+    with open_bus(live.network, authenticator=authenticator) as bus:
+        with GuestSession("other", grid, bus, LifeFile(tmp_path / "other")) as other:
+            assert not other.enter(path[5], timeout_s=1.5)  # the rover may stand there
+        with GuestSession("rover", grid, bus, LifeFile(tmp_path / "rover")) as rover:
+            assert rover.enter(path[5], timeout_s=10.0)
+            drive(rover, path[5:])
+            assert rover.leave(timeout_s=10.0)
+            with GuestSession("other", grid, bus, LifeFile(tmp_path / "other2")) as other:
+                assert other.enter(path[-1], timeout_s=10.0)
+
+
+def vehicles_of(live: LiveSwarm, agent: str, within_s: float = 20.0, count: int = 1) -> set[str]:
+    """The vehicles that an agent says it has, once they are so many."""
+    heard: set[str] = set()
+    with client(live.network) as bus:
+        bus.collect(FLEET)
+
+        def enough() -> bool:
+            for each in bus.collected(FLEET):
+                heard.update(id for id in each.message.ids if id.startswith(agent))  # type: ignore[attr-defined]
+            return len(heard) >= count
+
+        eventually(enough, within_s, f"{count} vehicles of {agent}")
+    return heard
+
+
+def add(live: LiveSwarm, *options: object) -> subprocess.Popen[str]:
+    command = [*SWARM, "vehicle", "add", live.path, "--runs", live.runs, "--group", "all", *options]
+    return subprocess.Popen(list(map(str, command)), stderr=subprocess.PIPE, text=True)
+
+
+def test_vehicles_are_added_and_removed_while_the_swarm_runs(live: LiveSwarm, run: RunInfo) -> None:
+    where = ("--connect", live.endpoint, "--namespace", live.network.namespace)
+    added = add(live, "--count", 3, "--id", "extra")
+    try:
+        assert vehicles_of(live, "extra", count=3) == {"extra-00", "extra-01", "extra-02"}
+        done = swarm("vehicle", "remove", "extra-01", "a0-02", *where)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "extra-01: left" in done.stdout
+        assert "a0-02: left" in done.stdout
+        refused = swarm("vehicle", "gone", "extra", *where)
+        assert refused.returncode == 2
+        assert "extra is alive" in refused.stderr
+        assert swarm("vehicle", "remove", "extra", *where).returncode == 0
+        assert added.wait(10) == 0
+    finally:
+        added.kill()
+
+
+def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_that_they_are_gone(
+    live: LiveSwarm, run: RunInfo
+) -> None:
+    where = ("--connect", live.endpoint, "--namespace", live.network.namespace)
+    for again in range(2):
+        added = add(live, "--count", 2, "--id", "more", "--at", "40,60")
+        try:
+            assert len(vehicles_of(live, "more", count=2)) == 2, again
+        finally:
+            added.send_signal(signal.SIGKILL)
+            added.wait(10)
+    time.sleep(live.network.lease_s + 0.5)
+    gone = swarm("vehicle", "gone", "more", *where)
+    assert (gone.returncode, gone.stderr) == (0, ""), gone
+    unknown = swarm("vehicle", "gone", "nobody", *where)
+    assert unknown.returncode == 2
+    assert "no agent has ever heard of a guest 'nobody'" in unknown.stderr
+    for options, sentence in (
+        (("--group", "none"), "has no group 'none'"),
+        (("--id", "a0"), "has an agent 'a0' itself"),
+        (("--at", "five"), "expected ROW,COL"),
+        (("--count", 99), "an agent hosts 1 to 6 vehicles"),
+    ):
+        refused = add(live, *options)
+        assert refused.wait(20) == 2
+        assert refused.stderr is not None
+        assert sentence in refused.stderr.read()
+
+
+def test_nobody_has_met_anybody(live: LiveSwarm) -> None:
+    os.killpg(live.process.pid, signal.SIGINT)
+    live.process.wait(60)
+    report = json.loads((live.run_dir / "report.json").read_text())
+    assert report["collisions"] == 0

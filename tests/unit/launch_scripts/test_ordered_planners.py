@@ -1,0 +1,118 @@
+"""Planners of targets that operators add: started where they are missing, ended where their target is removed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from launch_scripts.launcher.local_swarm import Running
+from launch_scripts.launcher.ordered_planners import LEAVES_TO_OTHERS_S, OrderedPlanners, with_target
+from launch_scripts.process_table import ProcessSpec, processes_of
+from swarm.config.load import parse_scenario
+from swarm.errors import ConfigError
+from swarm.order_book import OrderBook
+from swarm.wire.messages.orders import Order
+
+SCENARIO = parse_scenario('[[targets]]\nname = "t"\ncount = 2\n[standbys]\nplanner = 1')
+
+
+class Swarm:
+    """Takes the place of the processes of this machine."""
+
+    def __init__(self, *, refuses: bool = False) -> None:
+        self.running = [Running(spec) for spec in processes_of(SCENARIO, ("planner",))]
+        self.refuses = refuses
+        self.tried = 0
+
+    @property
+    def ids(self) -> list[str]:
+        return sorted(running.spec.id for running in self.running)
+
+    def add(self, spec: ProcessSpec) -> None:
+        self.tried += 1
+        if self.refuses:
+            raise ConfigError("no certificate")
+        self.running.append(Running(spec))
+
+    def dismiss(self, spec: ProcessSpec) -> None:
+        self.running = [running for running in self.running if running.spec.id != spec.id]
+
+
+def planners(
+    swarm: Swarm, *, whole: bool = True, ranks: tuple[int, ...] = (0, 1)
+) -> tuple[OrderedPlanners, list[str]]:
+    said: list[str] = []
+    stands_for: Any = swarm
+    return OrderedPlanners(SCENARIO, stands_for, ranks, whole, said.append), said
+
+
+def book(*orders: tuple[str, int, bool]) -> OrderBook:
+    made = OrderBook()
+    made.merge(
+        [Order(subject="target", name=name, stamp_ns=at, off=off, added=True, cell=3) for name, at, off in orders],
+        100,
+    )
+    return made
+
+
+USUAL = ["t0", "t0.r1", "t1", "t1.r1"]
+
+
+def test_nothing_happens_while_nothing_is_ordered() -> None:
+    swarm = Swarm()
+    ordered, said = planners(swarm)
+    ordered.look(book(), set(), 0.0)
+    assert swarm.ids == USUAL
+    assert said == []
+
+
+def test_an_added_target_gets_its_planner_and_standbys_and_loses_them_again() -> None:
+    swarm = Swarm()
+    ordered, _ = planners(swarm)
+    for now_s in (0.0, 1.0):
+        ordered.look(book(("x", 1, False)), set(), now_s)
+    assert swarm.ids == [*USUAL, "x", "x.r1"]
+    ordered.look(book(("x", 2, True)), set(), 2.0)
+    assert swarm.ids == USUAL
+
+
+def test_a_target_of_the_scenario_that_is_removed_gets_its_planner_back_with_it() -> None:
+    swarm = Swarm()
+    ordered, _ = planners(swarm)
+    ordered.look(book(("t0", 1, True)), set(), 0.0)
+    assert swarm.ids == ["t1", "t1.r1"]
+    ordered.look(book(("t0", 2, False)), set(), 1.0)
+    assert swarm.ids == USUAL
+
+
+def test_a_part_of_a_swarm_leaves_it_to_others_for_a_while() -> None:
+    swarm = Swarm()
+    ordered, _ = planners(swarm, whole=False, ranks=(0,))
+    ordered.look(book(("x", 1, False)), set(), 0.0)
+    assert swarm.ids == USUAL
+    ordered.look(book(("x", 1, False)), {("planner", "x")}, LEAVES_TO_OTHERS_S + 1)
+    assert swarm.ids == USUAL, "another launcher started it"
+    ordered.look(book(("x", 1, False)), set(), 10.0)
+    ordered.look(book(("x", 1, False)), set(), 10.0 + LEAVES_TO_OTHERS_S)
+    assert swarm.ids == [*USUAL, "x"]
+
+
+def test_a_launcher_that_starts_no_planners_starts_none_of_these() -> None:
+    swarm = Swarm()
+    swarm.running = []
+    ordered, _ = planners(swarm, ranks=())
+    ordered.look(book(("x", 1, False)), set(), 0.0)
+    assert swarm.ids == []
+
+
+def test_one_that_cannot_start_is_said_once_and_ends_nothing() -> None:
+    swarm = Swarm(refuses=True)
+    ordered, said = planners(swarm, ranks=(0,))
+    for now_s in (0.0, 1.0, 2.0):
+        ordered.look(book(("x", 1, False)), set(), now_s)
+    assert said == ["planner-x: no certificate"]
+    assert swarm.tried == 1
+
+
+def test_the_process_of_an_added_target_is_told_of_it() -> None:
+    assert with_target(SCENARIO, book(("x", 1, False)), "x").target_ids == ["t0", "t1", "x"]
+    assert with_target(SCENARIO, book(("x", 1, False)), "t0") is SCENARIO
