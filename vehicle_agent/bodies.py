@@ -241,8 +241,8 @@ class Bodies:
 
     @property
     def is_deaf(self) -> bool:
-        """Whether there may be bodies of which nothing has been heard: the process has just begun, or let so much time
-        pass before its last tick that what came meanwhile may not have been read. Nobody drives then."""
+        """Whether there may be bodies of which nothing has been heard: the process has just begun, or let so much
+        time pass before its last tick that what came meanwhile may not have been read. Nobody drives then."""
         return self._ticked_ns is not None and self._ticked_ns < self._listens_ns
 
     def listen_anew(self, now_ns: int) -> None:
