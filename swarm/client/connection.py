@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarm.client.frame import Frame
@@ -14,11 +15,13 @@ from swarm.client.target import Target
 from swarm.client.vehicle import Vehicle
 from swarm.clock import MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError
+from swarm.wire.fields import check_id
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.messages.targets import POSE_LEASE_S
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
+    from swarm.right_of_way.guest_session import GuestSession
     from swarm.runtime.inbox import Inbox
 
 _ASK_S = 1.0
@@ -34,9 +37,17 @@ class Swarm:
     the namespace when the link is back, every call raises RunMismatchError, as cells may mean other places there.
     """
 
-    def __init__(self, session: Session, stop: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        session: Session,
+        stop: Callable[[], None] = lambda: None,
+        open_trusted: Callable[[], Bus] | None = None,
+    ) -> None:
         self._session = session
         self._stop = stop
+        self._open_trusted = open_trusted or (lambda: session.bus)
+        """Opens a bus whose words count in right of way."""
+        self._guests: list[GuestSession] = []
 
     def __enter__(self) -> Swarm:
         return self
@@ -78,6 +89,34 @@ class Swarm:
         """
         return Vehicle(self._session, id, group, radius_m, lease_s)
 
+    def right_of_way(self, id: str, *, file: Path | None = None) -> GuestSession:
+        """Cells of the map that a vehicle has for itself: ask where it stands (`enter`), say where it would go
+        (`want`), drive into a cell while `may_enter`, and say which it has left. No vehicle of the swarm drives
+        into a cell that is granted to another.
+
+        id    of the vehicle, as in `vehicle`
+        file  where the program keeps what its next life needs to go on there; a file of this user's own for each
+              run and id if not given
+
+        Raises ConfigError if the id is none, StoreError if another program has the file.
+        """
+        from swarm.right_of_way.guest_session import GuestSession
+        from swarm.right_of_way.life_file import LifeFile
+        from swarm.runtime.run_secret import state_folder
+
+        try:
+            check_id("id", id)
+        except ValueError as error:
+            raise self._session.refused(str(error)) from error
+        lives = LifeFile(file or state_folder() / "vehicles" / self.run_id / id)
+        try:
+            guest = GuestSession(id, self.frame.grid, self._open_trusted(), lives)
+        except BaseException:
+            lives.close()
+            raise
+        self._guests.append(guest)
+        return guest
+
     def target(self, id: str, *, tracker: str | None = None, lease_s: float = POSE_LEASE_S) -> Target:
         """A target of the scenario that this program tracks: its walk there is `external`.
 
@@ -102,6 +141,8 @@ class Swarm:
 
     def close(self) -> None:
         """Take away all vehicles and targets of this program, and leave. May be repeated."""
+        for guest in self._guests:
+            guest.close()
         self._stop()
         self._session.close()
 
@@ -158,7 +199,12 @@ def connect(
         thread.end()
         inbox.close()
 
-    return Swarm(session, stop)
+    def open_trusted() -> Bus:
+        from swarm.runtime.run_secret import authenticator_of
+
+        return open_bus(network, authenticator=authenticator_of(network, session.run.run_id))
+
+    return Swarm(session, stop, open_trusted)
 
 
 def _run(bus: Bus, inbox: Inbox, until_s: float, where: str) -> RunInfo:
