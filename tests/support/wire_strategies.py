@@ -227,7 +227,10 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     Stored: st.builds(Stored, plot=plots, agent=ids, epoch=naturals, seq=naturals),
     Claim: st.builds(Claim, epoch=naturals),
     KnownRequest: st.builds(KnownRequest, agent=ids, disk=naturals),
-    Known: st.builds(Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(plots, max_size=3)),
+    Known: st.builds(
+        Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(plots, max_size=3),
+        agents=st.lists(ids, max_size=3), lives=st.lists(naturals, max_size=3),
+    ),
     Followed: st.builds(
         Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite_costs,
         lower_bound_s=finite_costs,
@@ -358,7 +361,9 @@ EXAMPLES: tuple[Message, ...] = (
     Stored(plot=0, agent="a2", epoch=3, seq=17),
     Claim(epoch=4),
     KnownRequest(agent="a0", disk=77),
-    Known(agent="a1", disk=77, life=1 << 32, plots=[0, 3]),
+    Known(agent="a1", disk=77, life=1 << 32, plots=[0, 3], agents=["a0", "a1"], lives=[1 << 32]),
+    RemoveVehicles(vehicles=["a0-00"]),
+    Removed(agent="a0", left=["a0-00"], unknown=["a0-99"], held=1),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
     Sighted(
