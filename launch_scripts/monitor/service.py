@@ -260,7 +260,7 @@ class MonitorService:
             if trails_due:
                 self._drawing.trails("vehicles", self._vehicle_trails.advance(points.ids, points.positions))
             self._draw_routes(now_ns, vehicles)
-        if now_ns >= self._targets_due_ns and (lost := self.recorder.trackings.lost(now_ns)) != self._lost:
+        if now_ns >= self._targets_due_ns and (lost := self.recorder.tracked.lost(now_ns)) != self._lost:
             self._lost, self._targets_new = lost, True
         if self._targets_new and (trails_due or now_ns >= self._targets_due_ns):
             self._targets_new, self._targets_due_ns = False, now_ns + _TARGETS_NS

@@ -15,6 +15,7 @@ import numpy as np
 
 from launch_scripts.report.latest_state import MarkedCells, Observed
 from launch_scripts.report.samples import Sample, Samples, messages_per_s
+from launch_scripts.report.tracked_targets import TrackedTargets
 from launch_scripts.report.tracks import TrackKey, Tracks
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
@@ -24,12 +25,11 @@ from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.ranks import ranked_id
 from swarm.runtime.stats import Histogram
-from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.messages.vehicles import Fleet, VehicleState
 from swarm.wire.topics import FLEET, LEAD, MARKS, NOTE, POSE, STATS, STATUS, Topic
 
 TRACK_S = 0.5
@@ -115,7 +115,7 @@ class Recorder:
         self.scenario = scenario
         self.grid = grid
         self.observed = Observed(grid)
-        self.trackings = Trackings(grid)
+        self.tracked = TrackedTargets(grid, self.observed.status)
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.ready_ns: int | None = None
@@ -140,11 +140,13 @@ class Recorder:
         self._touch(now_ns)
         match message:
             case TargetPose():
-                counts = self.trackings.hear(message, now_ns)
+                counts = self.tracked.hear(message, now_ns)
                 if counts is None:
                     return
                 message = counts
                 self._capture(counts, now_ns)
+            case Fleet():
+                self.tracked.something_moved(now_ns)
             case PlannerStatus(gap_max=float(gap)):
                 self._gap_max = max(gap, self._gap_max or 0.0)
             case Note():
@@ -161,11 +163,6 @@ class Recorder:
     def seconds(self, now_ns: int) -> float:
         """Seconds since the first message."""
         return 0.0 if self.first_ns is None else (now_ns - self.first_ns) / NS_PER_S
-
-    def lost_targets(self, now_ns: int) -> set[str]:
-        """The targets that nobody tracks now; of those without a tracker as their planners tell."""
-        told = {id for id, status in self.observed.status.items() if status.tracker_lost}
-        return self.trackings.lost(now_ns) | (told - self.observed.poses.keys())
 
     def missing(self) -> list[str]:
         """Processes of the scenario which are not alive now, as `role id`."""
@@ -241,7 +238,7 @@ class Recorder:
         observed = self.observed
         vehicles = observed.vehicles()
         rates = messages_per_s(self.samples.newest)
-        lost = self.lost_targets(now_ns)
+        lost = self.tracked.lost(now_ns)
         lines = (self._target_line(id, vehicles, now_ns) for id in self.scenario.target_ids)
         return LiveSummary(
             elapsed_s=self.seconds(now_ns),
@@ -273,15 +270,8 @@ class Recorder:
             growth_ms=None if status is None else status.growth_ms,
             gap=None if status is None else status.gap_mean,
             captures=self.captures_of[id],
-            pose_age_s=self._pose_age_s(id, now_ns),
+            pose_age_s=self.tracked.age_s(id, now_ns),
         )
-
-    def _pose_age_s(self, target: str, now_ns: int) -> float | None:
-        tracking, status = self.trackings.of(target), self.observed.status.get(target)
-        if tracking is None:
-            return None if status is None else status.pose_age_s
-        age_ns = tracking.age_ns(now_ns)
-        return None if age_ns is None else age_ns / NS_PER_S
 
     def report(
         self,
@@ -312,11 +302,7 @@ class Recorder:
             "captures": total("captures"),
             "collisions": total("collisions"),
             "lethal_entries": total("lethal_entries"),
-            "tracking": {
-                "lost": total("trackers_lost"),
-                "lost_at_end": sorted(self.lost_targets(self.last_ns or 0)),
-                **{name: total(name) for name in ODD_POSES},
-            },
+            "tracking": self.tracked.report(observed),
             "driven_into": total("driven_into"),
             "hit_by_bodies": total("hit_by_bodies"),
             "stranded": _whole(observed.gauge("stranded")),
@@ -375,8 +361,6 @@ class Recorder:
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
 
 
-ODD_POSES = ("poses_refused", "poses_outside", "poses_teleported", "tracker_clocks_off")
-"""What planners count of poses that do not count, or look wrong."""
 TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 

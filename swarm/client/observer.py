@@ -10,7 +10,7 @@ from swarm.bus.bus import Event, Heard, LinkChanged, Replied
 from swarm.client.stream import Stream
 from swarm.clock import NS_PER_S
 from swarm.grid import TILE_CELLS, GridSpec, walk
-from swarm.runtime.tracking import Trackings, Verdict
+from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.marks import MarkSet, MarksRequest
 from swarm.wire.messages.processes import Note
@@ -88,7 +88,7 @@ class Observer:
         self._fleets: dict[tuple[str, int], tuple[Fleet, int]] = {}
         """(author, region) -> its newest message, and when it came."""
         self._bodies: dict[str, tuple[Body, int]] = {}
-        self._trackings = Trackings(session.frame.grid.cells)
+        self._trackings = Trackings(session.frame.grid)
         self._targets: dict[str, None] = {}
         """Ids of targets that were heard of, in order."""
         self._routes: dict[str, Followed] = {}
@@ -151,7 +151,7 @@ class Observer:
     def marks(self) -> Mapping[int, Mark]:
         """What is marked now, by cell: of several statements about a cell the newest."""
         with self._session.lock:
-            return marked(self._sets.values(), self._session.frame.grid, self._session.now_ns())
+            return marked(self._sets.values(), self._session.frame.grid, self._session.swarm_now_ns())
 
     def on_note(self, callback: Callable[[Note], None]) -> None:
         """Call with every note, on the connection's thread."""
@@ -168,7 +168,7 @@ class Observer:
             case Heard(message=Body() as body):
                 self._bodies[body.id] = body, now_ns
             case Heard(topic=topic, message=TargetPose() as pose) if topic is POSE:
-                if self._trackings.hear(pose, now_ns) is Verdict.COUNTS:
+                if self._trackings.hear(pose, now_ns) is not None:
                     self._targets[pose.target] = None
             case Heard(message=Followed() as followed):
                 self._hear_followed(followed)

@@ -44,7 +44,7 @@ class Target:
         self.lease_s = lease_s
         self.incarnation = session.now_ns()
         self._session = session
-        self._tracking = Tracking(session.frame.grid.cells)
+        self._tracking = Tracking(session.frame.grid)
         self._pose: TargetPose | None = None
         """What was said last; None before the first `at`."""
         self._seq = 0

@@ -118,7 +118,7 @@ def kinds(simulation: Simulation) -> list[str]:
 
 def receivers(simulation: Simulation) -> dict[str, Tracking | None]:
     """What everybody who hears poses knows of the trackers of x."""
-    found: dict[str, Tracking | None] = {"recorder": simulation.recorder.trackings.of("x")}
+    found: dict[str, Tracking | None] = {"recorder": simulation.recorder.tracked._trackings.of("x")}
     for node in simulation.nodes.values():
         service: Any = node.service
         match service:
@@ -209,6 +209,15 @@ def test_a_second_tracker_is_refused_by_everybody_until_the_first_is_dead(seed: 
     assert {"tracker-changed", "tracker-lost"} & set(kinds(simulation))
     report = simulation.report(19)["tracking"]
     assert report["poses_refused"] > 30
+
+
+def test_a_second_tracker_that_always_speaks_last_hides_no_word_of_the_first() -> None:
+    simulation = Simulation(seeded(3, EXTERNAL))
+    OutsideTracker(simulation, "m", 20, 3, 15)
+    OutsideTracker(simulation, "a", 30, 6.001, 15)
+    for second in range(7, 15):
+        simulation.run_until(second)
+        assert owners(simulation) == {"m"}
 
 
 def test_a_handover_is_at_once_and_nobody_is_lost() -> None:

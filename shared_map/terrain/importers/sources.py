@@ -397,9 +397,15 @@ def _with_photo(source: Source, path: Path, config: TerrainConfig, progress: Pro
 
 def _classified(source: Source, config: TerrainConfig, seed: int, progress: Progress) -> Source:
     from shared_map.terrain.importers.classify import by_rules, learnt
+    from shared_map.terrain.importers.true_colour import why_not_true_colour
 
     assert source.photo is not None
     inputs = (source.photo, source.elevation_m, source.grid.resolution_m)
+    seen = np.ones(source.classes.shape, np.bool_) if source.seen is None else source.seen
+    other = why_not_true_colour(source.photo, seen)
+    if config.labels is None and other is not None:
+        note = f"the photo is {other}; no classes are read from it: give a true-colour one, or terrain.labels"
+        return replace(source, notes=(*source.notes, note))
     if config.labels is None:
         classes = by_rules(*inputs, source.seen, progress)
         note = "classes from the photo, by rules"

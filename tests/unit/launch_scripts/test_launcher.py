@@ -95,9 +95,9 @@ def test_a_part_of_a_swarm_that_has_no_process_is_refused_in_a_sentence(tmp_path
         run_swarm(options)
 
 
-def test_targets_that_somebody_else_tracks_need_no_driver() -> None:
+def test_the_referee_watches_also_where_somebody_else_tracks_all_targets() -> None:
     scenario = Scenario(targets=(TargetConfig(walk="external"),))
-    assert "targets-0" not in [spec.name for spec in processes_of(scenario)]
+    assert "targets-0" in [spec.name for spec in processes_of(scenario)]
 
 
 def test_the_router_starts_first_and_ends_last() -> None:
@@ -168,6 +168,17 @@ def test_a_process_killed_from_outside_is_restarted(swarms: list[LocalSwarm], tm
     assert ending.sentence == "killed by SIGKILL"
     eventually(lambda: swarm.poll() or swarm.running[0].alive, 5)
     assert swarm.restarts == 1
+
+
+def test_a_process_whose_plugin_hangs_in_native_code_is_named_and_restarted(
+    swarms: list[LocalSwarm], tmp_path: Path
+) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "hang_in_native_code"))
+    swarm.start()
+    (ending,) = endings_within(swarm, 20)
+    assert ending.sentence == "a plug-in did not come back from native code; its log says where"
+    assert ending.restart_in_s == 0.2
+    assert "in hang_in_native_code" in (tmp_path / "agent-a0.log").read_text()
 
 
 def test_a_process_that_leaves_without_being_asked_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:

@@ -324,8 +324,12 @@ def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_i
     assert (second.title, second.lost, second.pose_age_s) == ("t1", False, 1.0)
     assert plain_line(recorder.summary(10 * NS_PER_S), {}, 0).endswith("; lost targets: t0")
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
-    hear(recorder, pose("t0", 100.0, 100.0, 2), at_s=10.0)
-    assert [line.lost for line in recorder.summary(10 * NS_PER_S).targets] == [False, False]
+    hear(recorder, status("t0", 1.0), at_s=60.0)  # the last words of a run that takes long to end
+    assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
+    hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}), at_s=60.0)
+    assert recorder.report()["tracking"]["lost_at_end"] == ["t0", "t1"]
+    hear(recorder, pose("t0", 100.0, 100.0, 2), pose("t1", 100.0, 100.0, 2), at_s=61.0)
+    assert [line.lost for line in recorder.summary(61 * NS_PER_S).targets] == [False, False]
     assert recorder.report()["tracking"]["lost_at_end"] == []
 
 
