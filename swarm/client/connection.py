@@ -90,7 +90,7 @@ class Swarm:
         radius_m  around its place, which others keep clear
         lease_s   others avoid its last place for so long after they hear nothing more
         right_of_way  a file of this vehicle's own, the same at each start: it may reserve cells, which nobody else
-                      enters then. Needs the user of the swarm, or with certificates the name `agent.GROUP.ID`
+                      enters then. Needs the user of the swarm, or with certificates the name `rover.GROUP.ID`
         """
         way = (
             None if right_of_way is None else RightOfWay(self._open_way(), id, self.frame.grid, Path(right_of_way))
