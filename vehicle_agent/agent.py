@@ -193,8 +193,8 @@ class Agent:
     def begin_drive(self, now_ns: int) -> None:
         """Give every vehicle the time that has passed since it was last driven."""
         elapsed_s = 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / NS_PER_S
-        if self.bodies.any and self.bodies.was_deaf(elapsed_s):
-            elapsed_s = 0.0  # what bodies have said meanwhile may not have been read yet
+        if self.bodies.is_deaf:
+            elapsed_s = 0.0
         self._driven_ns = now_ns
         seconds = min(elapsed_s, _LONGEST_STEP_S) * self._time_scale
         self._left_s = dict.fromkeys(self.vehicles, seconds)

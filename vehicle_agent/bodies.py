@@ -35,7 +35,9 @@ _FURTHEST_CELLS = 64
 """Cells ahead of a body that are closed, at most: whoever is quicker must look out."""
 _LONGEST_PAUSE_NS = NS_PER_S // 4
 """Time between two ticks that counts for leases. A process that was stopped has not listened meanwhile."""
-_DEAF_S = 0.5
+_DEAF_NS = NS_PER_S // 2
+LISTEN_NS = NS_PER_S
+"""Each body says where it is at least so often, so that whoever has just begun to listen knows it."""
 _GHOSTS = 3
 """Places that a body has leapt from and that are still closed, at most."""
 _MOST_TOLD = 1000
@@ -60,12 +62,14 @@ def capsule_of(report: Body, grid: GridSpec, ahead_m: float, margin_m: float = 0
 class _Known:
     """What one report says.
 
+    heard_ns  when it was heard; later where the process has not listened meanwhile, `came_ns` never
     cells     closed now; `ahead_m` is the length of the way to which they belong
     charge    cells of the box that holds all that it can ever close
     since_ns  since when the body has been near `anchor`
     """
 
     report: Body
+    came_ns: int
     heard_ns: int
     until_ns: int
     charge: int
@@ -105,6 +109,8 @@ class Bodies:
         self._standing: set[int] | None = set()
         self._changed: list[Window] = []
         self._ticked_ns: int | None = None
+        self._listens_ns = 0
+        """From when on all bodies are known."""
 
     @property
     def closed(self) -> Container[int]:
@@ -133,7 +139,7 @@ class Bodies:
             if known is not None:
                 self._forget(key)
             return
-        leaps = known is not None and self._leaps(known.report, report, now_ns - known.heard_ns)
+        leaps = known is not None and self._leaps(known.report, report, now_ns - known.came_ns)
         charge, wrong = self._charge(report)
         if wrong is None:
             wrong = self._crowded(known, leaps, charge)
@@ -143,7 +149,8 @@ class Bodies:
         self._meet_namesake(report, known)
         x_m, y_m = report.x_m, report.y_m
         self._standing = None
-        made = _Known(report, now_ns, now_ns + int(report.lease_s * NS_PER_S), charge, (x_m, y_m), now_ns)
+        until_ns = now_ns + int(report.lease_s * NS_PER_S)
+        made = _Known(report, now_ns, now_ns, until_ns, charge, (x_m, y_m), now_ns)
         self._charged += charge
         self._known[key] = made
         self._cover(made, now_ns)
@@ -214,6 +221,8 @@ class Bodies:
     def tick(self, now_ns: int) -> None:
         """End leases, and let what moves go on."""
         passed_ns = 0 if self._ticked_ns is None else now_ns - self._ticked_ns
+        if passed_ns > _DEAF_NS and self._known:
+            self._listens_ns = max(self._listens_ns, now_ns + 1)  # this tick
         self._ticked_ns = now_ns
         deaf_ns = max(passed_ns - _LONGEST_PAUSE_NS, 0)
         self._standing = None
@@ -230,10 +239,15 @@ class Bodies:
             elif known.report.speed_m_per_s > 0.0:
                 self._cover(known, now_ns)
 
-    @staticmethod
-    def was_deaf(pause_s: float) -> bool:
-        """Whether a process that let so much time pass between two ticks may not have heard what came meanwhile."""
-        return pause_s > _DEAF_S
+    @property
+    def is_deaf(self) -> bool:
+        """Whether there may be bodies of which nothing has been heard: the process has just begun, or let so much
+        time pass before its last tick that what came meanwhile may not have been read. Nobody drives then."""
+        return self._ticked_ns is not None and self._ticked_ns < self._listens_ns
+
+    def listen_anew(self, now_ns: int) -> None:
+        """Nothing was heard before now: for a second, in which every body says where it is, nobody drives."""
+        self._listens_ns = now_ns + LISTEN_NS
 
     def _forget(self, key: tuple[str, int]) -> None:
         self._standing = None

@@ -15,7 +15,7 @@ from shared_map.replication.interest import Interest
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain, load_homes
-from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.errors import ConfigError
@@ -170,6 +170,7 @@ class AgentService:
         self._obedience.start(now_ns)
         self._bus.collect(POSE)
         self._bus.collect(BODY)
+        self._agent.bodies.listen_anew(now_ns)
         if self._untracked.targets:
             self._bus.collect(TRUE_POSE)
             for target in sorted(self._untracked.targets):
@@ -179,6 +180,8 @@ class AgentService:
         self._bus.serve(LEAVE, self._post, agent=self._setup.id)
 
     def handle(self, event: Event, now_ns: int) -> None:
+        if isinstance(event, LinkChanged) and event.up:
+            self._agent.bodies.listen_anew(now_ns)
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         if self._right_of_way.handle(event, now_ns) or self._obedience.handle(event, now_ns):

@@ -45,7 +45,8 @@ class BodyLaw:
         self._grid = simulation.terrain.grid
         self._delivered: dict[str, dict[tuple[str, int], _Delivered]] = {}
         self._looked_ns: dict[str, int] = {}
-        self._cells: dict[str, int] = {}
+        self._cells: dict[tuple[str, str], int] = {}
+        """(node, vehicle) -> its cell: two lives of an agent each have their own idea of it."""
         inner = simulation.network.trace
 
         def trace(now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
@@ -60,6 +61,7 @@ class BodyLaw:
 
     def _boot(self, node: Node) -> None:
         self._delivered.pop(node.name, None)
+        self._cells = {key: cell for key, cell in self._cells.items() if key[0] != node.name}
         self._looked_ns.pop(node.name, None)
 
     def _deliver(self, body: Body, agent: str, now_ns: int) -> None:
@@ -76,7 +78,7 @@ class BodyLaw:
         looked_ns = self._looked_ns.get(node.name, now_ns)
         self._looked_ns[node.name] = now_ns
         for id, vehicle in node.service.agent.vehicles.items():
-            before, self._cells[id] = self._cells.get(id), vehicle.cell
+            before, self._cells[node.name, id] = self._cells.get((node.name, id)), vehicle.cell
             if before is None or before == vehicle.cell:
                 continue
             self.entered += 1

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from itertools import pairwise
@@ -16,11 +17,10 @@ import pytest
 from support.live_swarm import SWARM, LiveSwarm, ask, client, swarm
 from support.processes import eventually
 
-from swarm.bus.zenoh_bus import open_bus
+from swarm.client import connect
+from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.right_of_way.guest_session import GuestSession
-from swarm.right_of_way.life_file import LifeFile
-from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.messages.processes import RunInfo
@@ -69,28 +69,50 @@ def drive(rover: GuestSession, path: list[int]) -> None:
         rover.left(here)
 
 
+ROVER = """
+import sys, time
+from pathlib import Path
+from swarm.client import connect
+
+endpoint, file, *cells = sys.argv[1:]
+path = [int(cell) for cell in cells]
+with connect(endpoint) as swarm:
+    rover = swarm.right_of_way("rover", file=Path(file))
+    assert rover.enter(path[0], timeout_s=10.0)
+    rover.want(path)
+    for here, there in zip(path, path[1:]):
+        assert rover.may_enter(there, timeout_s=20.0)
+        rover.left(here)
+    print("there", flush=True)
+    time.sleep(60)
+"""
+
+
 def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
     live: LiveSwarm, run: RunInfo, tmp_path: Path
 ) -> None:
-    grid = GridSpec(run.rows, run.cols, run.resolution_m)
-    path = route_of(live, grid)
-    authenticator = authenticator_of(live.network, run.run_id)
-    with open_bus(live.network, authenticator=authenticator) as bus:
-        lives = LifeFile(tmp_path / "rover")
-        rover = GuestSession("rover", grid, bus, lives)
-        assert not rover.may_enter(path[0])
-        assert rover.enter(path[0], timeout_s=10.0)
-        drive(rover, path[:6])
-    lives.close()  # as if the program had died: it has not left
-    with open_bus(live.network, authenticator=authenticator) as bus:
-        with GuestSession("other", grid, bus, LifeFile(tmp_path / "other")) as other:
-            assert not other.enter(path[5], timeout_s=1.5)  # the rover may stand there
-        with GuestSession("rover", grid, bus, LifeFile(tmp_path / "rover")) as rover:
-            assert rover.enter(path[5], timeout_s=10.0)
-            drive(rover, path[5:])
-            assert rover.leave(timeout_s=10.0)
-            with GuestSession("other", grid, bus, LifeFile(tmp_path / "other2")) as other:
-                assert other.enter(path[-1], timeout_s=10.0)
+    path = route_of(live, GridSpec(run.rows, run.cols, run.resolution_m))
+    command = [sys.executable, "-c", ROVER, live.endpoint, tmp_path / "rover", *path[:6]]
+    program = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)
+    assert program.stdout is not None
+    assert program.stdout.readline() == "there\n"
+    program.kill()
+    program.wait(10)
+    with connect(live.endpoint, namespace=live.network.namespace) as swarm:
+        other = swarm.right_of_way("other", file=tmp_path / "other")
+        assert not other.may_enter(path[5])
+        assert not other.enter(path[5], timeout_s=1.5)  # the rover stands there
+        rover = swarm.right_of_way("rover", file=tmp_path / "rover")
+        with pytest.raises(StoreError, match="is in use"):
+            swarm.right_of_way("rover", file=tmp_path / "rover")
+        assert rover.enter(path[5], timeout_s=10.0)
+        drive(rover, path[5:])
+        assert other.may_enter(path[5], timeout_s=10.0)  # what it has asked for all the time
+        assert rover.leave(timeout_s=10.0)
+        assert other.leave(timeout_s=10.0)
+        assert other.enter(path[-1], timeout_s=10.0)
+    with connect(live.endpoint, namespace=live.network.namespace) as swarm:
+        assert swarm.right_of_way("third", file=tmp_path / "third").enter(path[-1], timeout_s=10.0)  # it has left
 
 
 def vehicles_of(live: LiveSwarm, agent: str, within_s: float = 20.0, count: int = 1) -> set[str]:

@@ -19,7 +19,7 @@ def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() ->
     world.start_all()
     took_s = world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=30)
     # 9 cells of 10 m at 0.1 s/m to come within 10 m of the target, and at most a second to get going.
-    assert 8.5 <= took_s <= 10.5
+    assert 8.5 <= took_s <= 11.5  # with a second in which it listens for bodies
     assert world.where() == {"a0-00": (10, 11)}
     world.assert_lawful()
 

@@ -153,8 +153,19 @@ def test_a_stopped_process_forgets_no_body_in_the_time_in_which_it_did_not_liste
     bodies.hear(body(5.5, 5.5, lease_s=1.0), NOW)
     bodies.tick(NOW + 60 * NS_PER_S)
     assert closed(bodies) == {(5, 5)}
-    assert bodies.was_deaf(60.0)
-    assert not bodies.was_deaf(0.2)
+    assert bodies.is_deaf, "what came meanwhile may not have been read: nobody drives in this tick"
+    bodies.tick(NOW + 60 * NS_PER_S + TICK)
+    assert not bodies.is_deaf
+
+
+def test_whoever_has_just_begun_to_listen_drives_when_every_body_has_had_time_to_speak(bodies: Bodies) -> None:
+    assert not bodies.is_deaf
+    bodies.listen_anew(NOW)
+    for tick in range(10):
+        bodies.tick(NOW + tick * TICK)
+        assert bodies.is_deaf
+    bodies.tick(NOW + 10 * TICK)
+    assert not bodies.is_deaf
 
 
 # --- what vehicles make of it -------------------------------------------------------------------------------
