@@ -88,7 +88,7 @@ class Swarm:
         group: str = "all",
         radius_m: float = 1.0,
         lease_s: float = 2.0,
-        right_of_way: bool | Path = False,
+        right_of_way: bool | str | Path = False,
     ) -> Vehicle:
         """A vehicle that is not the swarm's own. It exists for others from the first `Vehicle.at` on.
 
@@ -96,30 +96,22 @@ class Swarm:
         group     whose it is
         radius_m  around its place, which others keep clear
         lease_s   others avoid its last place for so long after they hear nothing more
-        right_of_way  it may reserve cells, which nobody else enters then (`Vehicle.reserve`); a path says where to
-                      keep what its next life needs, as in `right_of_way`
+        right_of_way  it may reserve cells, which nobody else enters then (`Vehicle.reserve`). Needs the user of the
+                      swarm, or with certificates the name `rover.GROUP.ID`. What its next life needs is kept in the
+                      file of this path; if True, in one of this user's own for each run and id
         """
         vehicle = Vehicle(self._session, id, group, radius_m, lease_s)
         if right_of_way:
-            file = right_of_way if isinstance(right_of_way, Path) else None
+            file = None if right_of_way is True else Path(right_of_way)
             try:
-                vehicle.give_way(RightOfWay(self.right_of_way(id, file=file)))
+                vehicle.give_way(RightOfWay(self._guest(id, file)))
             except BaseException:
                 vehicle.leave()
                 raise
         return vehicle
 
-    def right_of_way(self, id: str, *, file: Path | None = None) -> GuestSession:
-        """Cells of the map that a vehicle has for itself: ask where it stands (`enter`), say where it would go
-        (`want`), drive into a cell while `may_enter`, and say which it has left. No vehicle of the swarm drives
-        into a cell that is granted to another. A `vehicle` made with `right_of_way` does this by its places.
-
-        id    of the vehicle, as in `vehicle`
-        file  where the program keeps what its next life needs to go on there; a file of this user's own for each
-              run and id if not given
-
-        Raises ConfigError if the id is none, StoreError if another program has the file.
-        """
+    def _guest(self, id: str, file: Path | None) -> GuestSession:
+        """Raises ConfigError if the id is none, StoreError if another program has the file."""
         from swarm.right_of_way.guest_session import GuestSession
         from swarm.right_of_way.life_file import LifeFile
         from swarm.runtime.run_secret import state_folder
