@@ -70,7 +70,8 @@ class PlannerService:
         self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters
         self._cost_map = CostMap(terrain)
-        filter = MarkFilter(terrain.grid, readable_for_target(scenario, self._target))
+        self._heard_groups = readable_for_target(scenario, self._target)
+        filter = MarkFilter(terrain.grid, self._heard_groups)
         self._untracked = self._target in scenario.untracked
         self._sightings = Sightings(filter)
         self._replica = MapReplica(terrain.grid, self._cost_map, filter=filter)
@@ -196,6 +197,11 @@ class PlannerService:
             return
         self._obeyed_version = book.version
         self._removed = self._target not in book.targets(scenario)
+        if any(order.subject in ("group", "target") for order in book):
+            heard = readable_for_target(scenario, self._target, lambda group: book.targets_of(group, scenario))
+            if heard != self._heard_groups:
+                self._heard_groups = heard
+                self._replica.hear(heard)
         self._planner.set_pace(
             book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
             book.setting("planner.push_s", scenario.planner.push_s),

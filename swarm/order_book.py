@@ -69,6 +69,12 @@ class OrderBook:
         held = self._orders.get((subject, name))
         return now_ns if held is None else max(now_ns, held.stamp_ns + 1)
 
+    @property
+    def standing(self) -> list[str]:
+        """In words, what is ordered and not taken back."""
+        stands = (order for order in self if not order.off or (order.subject == "target" and not order.added))
+        return [described(order) for order in stands]
+
     # --- what they say --------------------------------------------------------------------------------------
 
     @property
@@ -197,6 +203,8 @@ def _of_group(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: I
 def _of_target(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:
     targets = book.targets(scenario)
     there = given.name in targets
+    if given.new and not any(target.is_simulated for target in scenario.targets):
+        return f"target {given.name!r}: no process of this run moves targets, as all of its scenario have trackers"
     if given.new and there:
         return f"target {given.name!r} is there already: move it, or choose another name"
     if not given.new and not there:

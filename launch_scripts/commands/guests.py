@@ -97,6 +97,7 @@ def gone(
     """Say that vehicles of a dead process are not on the map any more, so that others may drive there.
 
     Only a person can know: a robot whose program has died stands where it stands. Never say it of one that does.
+    Between machines it takes the guest's own certificate.
     """
     from swarm.errors import BusError
     from swarm.grid import GridSpec

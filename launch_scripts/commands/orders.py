@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import Annotated
 
 import typer
@@ -99,7 +100,7 @@ def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     import msgspec
 
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.order_book import described
+    from swarm.order_book import OrderBook
     from swarm.orders import Operator
 
     with open_bus(where.network(tls)) as bus:
@@ -107,8 +108,7 @@ def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     if as_json:
         typer.echo(json.dumps([msgspec.to_builtins(order) for order in book.orders], indent=2))
         return
-    stands = [order for order in book.orders if not order.off or (order.subject == "target" and not order.added)]
-    for order in stands:
-        typer.echo(described(order))
-    if not stands:
-        typer.echo("no orders")
+    known = OrderBook()
+    known.merge(book.orders, time.time_ns())
+    for ordered in known.standing or ["no orders"]:
+        typer.echo(ordered)

@@ -211,12 +211,15 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     from swarm.bus.bus import Heard
     from swarm.bus.zenoh_bus import open_bus
     from swarm.errors import BusError
+    from swarm.order_book import OrderBook
     from swarm.runtime.inbox import Inbox
+    from swarm.wire.messages.orders import Orders
     from swarm.wire.messages.planning import PlannerStatus
     from swarm.wire.messages.processes import Beat, Stats
-    from swarm.wire.topics import LEAD, STATS, STATUS
+    from swarm.wire.topics import LEAD, ORDERS, STATS, STATUS
 
     inbox = Inbox()
+    book = OrderBook()
     stats: dict[tuple[str, str], Stats] = {}
     planners: dict[str, PlannerStatus] = {}
     leads: dict[tuple[str, str], bool] = {}
@@ -224,6 +227,7 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
         bus.subscribe(STATS, inbox.post)
         bus.subscribe(STATUS, inbox.post)
         bus.subscribe(LEAD, inbox.post)
+        bus.subscribe(ORDERS, inbox.post, role="keeper")
         until_s = time.monotonic() + _STATUS_LISTEN_S
         found = ask_run(bus, routers=True)
         while (left_s := until_s - time.monotonic()) > 0:
@@ -234,6 +238,8 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
                     planners[message.target] = message
                 case Heard(message=Beat() as message):
                     leads[message.role, message.id] = message.leads
+                case Heard(message=Orders() as message):
+                    book.merge(message.orders, time.time_ns())
     if not found:
         admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
         raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
@@ -245,10 +251,13 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     members = [info for info in found if info not in strangers]
     if as_json:
         fields = _status_fields(members, stats, planners, leads)
+        fields["orders"] = book.standing
         fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
         typer.echo(json.dumps(fields, indent=2))
     else:
         _print_status(members, stats, planners, leads)
+        for ordered in book.standing:
+            typer.secho(f"ordered: {ordered}", fg="yellow")
         for info in strangers:
             typer.secho(
                 f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}",

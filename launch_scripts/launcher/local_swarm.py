@@ -19,6 +19,7 @@ from pathlib import Path
 from launch_scripts.launcher.child import ExitReason, run_child
 from launch_scripts.process_table import EXPENDABLE, STOP_ORDER, ProcessSpec
 from swarm.errors import StoreError, SwarmError
+from swarm.plugins.deadline import KILLED_BY
 from swarm.runtime.role import RoleSetup
 
 log = logging.getLogger(__name__)
@@ -243,6 +244,8 @@ class LocalSwarm:
                 reason = running.pipe.recv()
                 assert isinstance(reason, ExitReason)
                 return reason
+        if code == -KILLED_BY:
+            return ExitReason("a plug-in did not come back from native code; its log says where", 1, refused=False)
         if code < 0:
             return ExitReason(f"killed by {signal.Signals(-code).name}", 1, refused=False)
         how = "ended by itself" if code == 0 else f"ended with exit code {code}"

@@ -6,7 +6,7 @@ can enforce the policy, and of a digest, which names only authors, nothing is as
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from shared_map.replication.tiles import region_tiles
 from swarm.config.scenario import RESERVED_GROUP, Scenario
@@ -34,16 +34,21 @@ def readable_groups(scenario: Scenario, group: str) -> frozenset[str] | None:
     return None if heard == groups.keys() else frozenset(heard)
 
 
-def readable_for_target(scenario: Scenario, target: str) -> frozenset[str] | None:
+def readable_for_target(
+    scenario: Scenario, target: str, chased_by: Callable[[str], Collection[str]] | None = None
+) -> frozenset[str] | None:
     """The groups whose marks the planner of a target takes in: all that any group reads which chases the target.
     None if that is all groups.
 
     So the least informed of these groups gets routes as good as the best informed one, but not the marks behind
     them. Groups which must not learn even that much have to chase targets of their own.
+
+    chased_by  the targets of a group, where operators may have ordered others than the scenario says
     """
     heard: set[str] = set()
     for group in scenario.groups:
-        if not group.targets or target in group.targets:
+        targets = group.targets if chased_by is None else chased_by(group.name)
+        if target in targets or (chased_by is None and not targets):
             readable = readable_groups(scenario, group.name)
             if readable is None:
                 return None
@@ -64,11 +69,15 @@ class MarkFilter:
     """
 
     def __init__(self, grid: GridSpec, groups: frozenset[str] | None = None) -> None:
-        self.groups = None if groups is None else groups | {RESERVED_GROUP}
         self.regions: frozenset[int] | None = None
         self._grid = grid
-        self._prefixes = None if self.groups is None else tuple(f"{group}." for group in sorted(self.groups))
         self._tiles: frozenset[int] | None = None  # those of `regions`
+        self.hear(groups)
+
+    def hear(self, groups: frozenset[str] | None) -> None:
+        """From now on accept the sets of these groups only; of all if None."""
+        self.groups = None if groups is None else groups | {RESERVED_GROUP}
+        self._prefixes = None if self.groups is None else tuple(f"{group}." for group in sorted(self.groups))
 
     def limit_to(self, regions: frozenset[int]) -> None:
         """From now on accept only sets about these regions."""

@@ -219,13 +219,24 @@ class MapReplica:
         """Hold only sets about these regions from now on, besides our own. Cells elsewhere get back what the prior
         map and we ourselves state."""
         self.filter.limit_to(regions)
+        self._drop_unwanted()
+
+    def hear(self, groups: frozenset[str] | None) -> None:
+        """Hold only sets of these groups from now on, besides our own; of all if None. Digests show what is missing
+        of those that were not heard before."""
+        self.filter.hear(groups)
+        self._drop_unwanted()
+
+    def _drop_unwanted(self) -> None:
+        """Forget the sets of others that the filter does not let in any more."""
+        wanted = self.filter
         before: dict[int, list[MarkSet]] = {}
         for tile in self.held.tiles:
-            if not self.filter.accepts_tile(tile):
-                before[tile] = self.held.of_tile(tile)
-                for each in before[tile]:
-                    if each.author != self.author:
-                        self.held.remove(each)
+            near = wanted.accepts_tile(tile)
+            for each in self.held.of_tile(tile):
+                if each.author != self.author and not (near and wanted.accepts_author(each.author, each.group)):
+                    before.setdefault(tile, self.held.of_tile(tile))
+                    self.held.remove(each)
         self.zones_version += 1
         self._settle(before, self._now_ns, False)
 

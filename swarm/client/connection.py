@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarm.client.frame import Frame
 from swarm.client.observer import Observer
 from swarm.client.orders import Orders
+from swarm.client.right_of_way import RightOfWay
 from swarm.client.session import Session, SwarmThread
 from swarm.client.target import Target
 from swarm.client.vehicle import Vehicle
-from swarm.clock import MonotonicClock
+from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.messages.targets import POSE_LEASE_S
@@ -34,9 +37,12 @@ class Swarm:
     the namespace when the link is back, every call raises RunMismatchError, as cells may mean other places there.
     """
 
-    def __init__(self, session: Session, stop: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self, session: Session, stop: Callable[[], None] = lambda: None, open_way: Callable[[], Bus] | None = None
+    ) -> None:
         self._session = session
         self._stop = stop
+        self._opens = open_way
 
     def __enter__(self) -> Swarm:
         return self
@@ -68,15 +74,33 @@ class Swarm:
         """What was refused, missed and reported since the connection began, and what the bus counts."""
         return {**self._session.bus.counts, **self._session.counts}
 
-    def vehicle(self, id: str, *, group: str = "all", radius_m: float = 1.0, lease_s: float = 2.0) -> Vehicle:
+    def vehicle(
+        self,
+        id: str,
+        *,
+        group: str = "all",
+        radius_m: float = 1.0,
+        lease_s: float = 2.0,
+        right_of_way: str | Path | None = None,
+    ) -> Vehicle:
         """A vehicle that is not the swarm's own. It exists for others from the first `Vehicle.at` on.
 
         id        letters, digits, '_' and '.'; not of any other vehicle
         group     whose it is
         radius_m  around its place, which others keep clear
         lease_s   others avoid its last place for so long after they hear nothing more
+        right_of_way  a file of this vehicle's own, the same at each start: it may reserve cells, which nobody else
+                      enters then. Needs the user of the swarm, or with certificates the name `rover.GROUP.ID`
         """
-        return Vehicle(self._session, id, group, radius_m, lease_s)
+        way = (
+            None if right_of_way is None else RightOfWay(self._open_way(), id, self.frame.grid, Path(right_of_way))
+        )
+        try:
+            return Vehicle(self._session, id, group, radius_m, lease_s, way)
+        except BaseException:
+            if way is not None:
+                way.close()
+            raise
 
     def target(self, id: str, *, tracker: str | None = None, lease_s: float = POSE_LEASE_S) -> Target:
         """A target of the scenario that this program tracks: its walk there is `external`.
@@ -99,6 +123,11 @@ class Swarm:
         """Call with a sentence when something goes wrong that no call can raise: another process uses one of our
         ids, a planner does not answer. Each is told once a minute, logged, and counted in `counts`."""
         self._session.on_problem(callback)
+
+    def _open_way(self) -> Bus:
+        if self._opens is None:
+            raise ConfigError("this connection cannot give right of way")
+        return self._opens()
 
     def close(self) -> None:
         """Take away all vehicles and targets of this program, and leave. May be repeated."""
@@ -131,6 +160,7 @@ def connect(
     from swarm.config.load import check_endpoint
     from swarm.config.scenario import NetworkConfig, TlsConfig
     from swarm.runtime.inbox import Inbox
+    from swarm.runtime.run_secret import authenticator_of
 
     files = (ca, certificate, key)
     if any(files) and not all(files):
@@ -146,9 +176,9 @@ def connect(
     began_s = time.monotonic()
     bus, inbox = open_bus(network), Inbox()
     try:
-        session = Session(
-            bus, _run(bus, inbox, began_s + timeout_s, f"{namespace!r} at {endpoint}"), MonotonicClock(), inbox.post
-        )
+        clock = MonotonicClock()
+        run, ahead_ns = _run(bus, inbox, began_s + timeout_s, f"{namespace!r} at {endpoint}", clock)
+        session = Session(bus, run, clock, inbox.post, ahead_ns)
     except BaseException:
         bus.close()
         raise
@@ -158,28 +188,54 @@ def connect(
         thread.end()
         inbox.close()
 
-    return Swarm(session, stop)
+    def open_way() -> Bus:
+        return open_bus(network, authenticator=authenticator_of(network, session.run.run_id))
+
+    return Swarm(session, stop, open_way)
 
 
-def _run(bus: Bus, inbox: Inbox, until_s: float, where: str) -> RunInfo:
-    """The run of a namespace, as a process with a grid describes it. Raises BusError, RunMismatchError."""
+def _run(bus: Bus, inbox: Inbox, until_s: float, where: str, clock: Clock) -> tuple[RunInfo, int]:
+    """The run of a namespace, as a process with a grid describes it, and by how many ns the clocks of its processes
+    are ahead of ours. Raises BusError, RunMismatchError."""
     from swarm.bus.bus import AskEnded, Replied
     from swarm.wire.messages.base import Nothing
     from swarm.wire.topics import RUN
 
     while True:
-        found: dict[str, RunInfo] = {}
+        answers: list[tuple[RunInfo, int]] = []
         bus.ask(RUN, Nothing(), inbox.post, tag="run", timeout_s=_ASK_S)
         while not isinstance(event := inbox.take(_ASK_S), AskEnded):
             match event:
-                case Replied(message=RunInfo() as info) if info.run_id and info.rows and info.cols:
-                    found[info.run_id] = info
+                case Replied(message=RunInfo() as info):
+                    answers.append((info, clock.now_ns()))
                 case None if time.monotonic() > until_s:
                     break
-        if len(found) > 1:
-            raise RunMismatchError(f"two runs, {' and '.join(sorted(found))}, are in namespace {where}: end one")
-        if found:
-            return next(iter(found.values()))
+        if (found := agreed(answers, where)) is not None:
+            return found
         if time.monotonic() > until_s:
             raise BusError(f"no process of a swarm answers in namespace {where}: is one running there?")
         time.sleep(0.1)
+
+
+def agreed(answers: Sequence[tuple[RunInfo, int]], where: str) -> tuple[RunInfo, int] | None:
+    """What most processes say: the run to which they belong, and how far their clocks are ahead. So a stranger
+    among them decides nothing. None without any that has a grid.
+
+    answers  with the time at which each came, by our clock
+
+    Raises RunMismatchError if two runs have as many processes.
+    """
+    with_grid = [(info, came_ns) for info, came_ns in answers if info.run_id and info.rows and info.cols]
+    if not with_grid:
+        return None
+    (run, many), *others = Counter(_grid_of(info) for info, _ in with_grid).most_common()
+    if others and others[0][1] == many:
+        runs = " and ".join(sorted({run[0], others[0][0][0]}))
+        raise RunMismatchError(f"two runs, or two descriptions of one, {runs}, are in namespace {where}: end one")
+    of_run = [(info, came_ns) for info, came_ns in with_grid if _grid_of(info) == run]
+    ahead_ns = sorted(info.now_ns - came_ns for info, came_ns in of_run if info.now_ns)
+    return of_run[0][0], ahead_ns[len(ahead_ns) // 2] if ahead_ns else 0
+
+
+def _grid_of(info: RunInfo) -> tuple[str, int, int, float, float, float, str]:
+    return info.run_id, info.rows, info.cols, info.resolution_m, info.west_m, info.north_m, info.crs

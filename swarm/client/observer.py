@@ -151,7 +151,7 @@ class Observer:
     def marks(self) -> Mapping[int, Mark]:
         """What is marked now, by cell: of several statements about a cell the newest."""
         with self._session.lock:
-            return marked(self._sets.values(), self._session.frame.grid, self._session.now_ns())
+            return marked(self._sets.values(), self._session.frame.grid, self._session.swarm_now_ns())
 
     def on_note(self, callback: Callable[[Note], None]) -> None:
         """Call with every note, on the connection's thread."""

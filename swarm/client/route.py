@@ -69,6 +69,17 @@ class Route:
         """Of its points."""
         return sum(math.dist(a, b) for a, b in pairwise(self.points_m))
 
+    def is_rest_of(self, before: Route) -> bool:
+        """Whether it says no more than the rest of the one before, of which the vehicle has driven a part."""
+        if (self.status, self.arrived, self.tracker_lost) != (before.status, before.arrived, before.tracker_lost):
+            return False
+        if not self.ok or self.cells == before.cells:
+            return True
+        if self.cells[0] not in before.cells:
+            return False
+        rest = before.cells[before.cells.index(self.cells[0]) :]
+        return rest == self.cells and (self.remaining_s == 0) == (before.remaining_s == 0)
+
     def ahead(self, x_m: float, y_m: float, distance_m: float) -> tuple[float, float, float]:
         """Where one is after driving `distance_m` along the route from the point of it that is nearest to a place:
         (x_m, y_m, heading_rad), the heading clockwise from north. At its end it stays there; without a way the

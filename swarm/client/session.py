@@ -25,6 +25,8 @@ log = logging.getLogger(__name__)
 TICK_S = 0.05
 _RUN_TIMEOUT_S = 2.0
 _SAY_AGAIN_NS = 60 * NS_PER_S
+_SAME_CLOCK_NS = NS_PER_S
+"""Clocks that differ by less are not corrected: an answer is as old as a tick."""
 _MOST_SAID = 1024
 
 
@@ -44,9 +46,10 @@ class Session:
     frame   the terrain
     run     what a process of the run said of it
     counts  what was refused, lost and reported since the connection began
+    ahead_ns  by how much the swarm's clocks are ahead of ours; what we stamp is corrected by it
     """
 
-    def __init__(self, bus: Bus, run: RunInfo, clock: Clock, post: Post | None = None) -> None:
+    def __init__(self, bus: Bus, run: RunInfo, clock: Clock, post: Post | None = None, ahead_ns: int = 0) -> None:
         self.bus = bus
         self.run = run
         self.frame = Frame.of(run)
@@ -59,6 +62,7 @@ class Session:
         self.ended: SwarmError | None = None
         """Why nothing can be said any more: closed, or the run is another one."""
         self._clock = clock
+        self._ahead_ns = ahead_ns if abs(ahead_ns) > _SAME_CLOCK_NS else 0
         self._parts: list[Part] = []
         self._asked: dict[str, tuple[Future[list[Any]], list[Any]]] = {}
         """Tag -> who waits for the answers, and those that came."""
@@ -74,6 +78,10 @@ class Session:
 
     def now_ns(self) -> int:
         return self._clock.now_ns()
+
+    def swarm_now_ns(self) -> int:
+        """The time by the swarm's clocks, which marks are stamped with: of two about a cell the later counts."""
+        return max(self.now_ns() + self._ahead_ns, 0)
 
     # --- for parts ----------------------------------------------------------------------------------------------
 

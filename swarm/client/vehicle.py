@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from typing import Any
 
@@ -12,6 +12,7 @@ import msgspec
 from swarm.bus.bus import Asked, Event, Heard, LinkChanged
 from swarm.client.frame import checked_cells
 from swarm.client.own_marks import OwnMarks
+from swarm.client.right_of_way import RightOfWay
 from swarm.client.route import Route
 from swarm.client.session import Session
 from swarm.client.stream import Stream
@@ -42,7 +43,9 @@ class Vehicle:
     incarnation  when it joined, in ns: tells it from an earlier life under the same id
     """
 
-    def __init__(self, session: Session, id: str, group: str, radius_m: float, lease_s: float) -> None:
+    def __init__(
+        self, session: Session, id: str, group: str, radius_m: float, lease_s: float, way: RightOfWay | None = None
+    ) -> None:
         for name, value in (("id", id), ("group", group)):
             try:
                 check_id(name, value)
@@ -72,6 +75,7 @@ class Vehicle:
         self._on_route: list[Callable[[Route], None]] = []
         self._marks = OwnMarks(f"{group}.{id}.{self.incarnation:x}", group, session.frame.grid)
         self._digest_due_ns = 0
+        self._way = way
         session.add(self)
         session.bus.subscribe(BODY, session.post, id=id)
 
@@ -115,6 +119,9 @@ class Vehicle:
             self._body = session.publish(BODY, body, id=self.id)
             self._seq += 1
             self._repeat_due_ns = body.stamp_ns + self._repeat_ns
+            cell = self.cell
+        if self._way is not None and not self._way.stands(cell):
+            session.problem("unreserved", f"vehicle {self.id} is in cell {cell}, into which it was not let: stop")
 
     @property
     def cell(self) -> int:
@@ -127,6 +134,34 @@ class Vehicle:
     @property
     def _repeat_ns(self) -> int:
         return int(self.lease_s * NS_PER_S / 4)
+
+    # --- right of way -------------------------------------------------------------------------------------------
+
+    def reserve(self, cells: Sequence[int], timeout_s: float = 0.0) -> list[int]:
+        """Say into which cells the vehicle would drive next, in driving order, such as the next ones of a route,
+        and wait until it may enter the first. Returns those that it may enter now: nobody else does, before the
+        vehicle has left them by its `at`. What was reserved before and is not in `cells` is given back.
+
+        Raises ConfigError where cells leap, and unless the vehicle was made with `right_of_way`.
+        """
+        way, here = self._has_way(), self.cell
+        path = [here, *(cells[1:] if cells and cells[0] == here else cells)]
+        try:
+            return way.reserve(path, timeout_s)
+        except ValueError as error:
+            raise self._session.refused(f"vehicle {self.id}: {error}") from error
+
+    def may_enter(self, cell: int, timeout_s: float = 0.0) -> bool:
+        """Whether the vehicle may drive into a cell now, after waiting for it for so long. Raises ConfigError
+        unless it was made with `right_of_way`."""
+        return self._has_way().may_enter(cell, timeout_s)
+
+    def _has_way(self) -> RightOfWay:
+        if self._way is None:
+            raise ConfigError(
+                f"vehicle {self.id} has no right of way: make it with swarm.vehicle({self.id!r}, right_of_way=FILE)"
+            )
+        return self._way
 
     # --- routes -------------------------------------------------------------------------------------------------
 
@@ -221,7 +256,7 @@ class Vehicle:
         except (ValueError, IndexError) as error:
             self._session.problem("routes_refused", f"the planner of {reply.target} answers nonsense: {error}")
             return
-        if self._route is not None and _is_rest(route, self._route):
+        if self._route is not None and route.is_rest_of(self._route):
             return
         self._route = route
         for stream in self._streams:
@@ -264,13 +299,13 @@ class Vehicle:
                 once = checked_cells(session.frame, cells)
             except ConfigError as error:
                 raise session.refused(str(error)) from None
-            now_ns = session.now_ns()
+            now_ns = session.swarm_now_ns()
             until_ns = FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
             if not self._marks.any:
                 session.bus.serve(MARKS, session.post, author=self._marks.author)
                 session.bus.subscribe(MARKS, session.post, author=self._marks.author)
             self._put_marks(self._marks.state(once, kind, pace_s_per_m or 0.0, now_ns, until_ns))
-            self._digest_due_ns = now_ns
+            self._digest_due_ns = 0
         return len(once)
 
     def _put_marks(self, sets: Iterable[MarkSet]) -> None:
@@ -294,7 +329,7 @@ class Vehicle:
             ):
                 self._take(pushed)
             case Heard(message=MarkSet() as marks) if marks.author == self._marks.author:
-                self._put_marks(self._marks.heard(marks, now_ns))
+                self._put_marks(self._marks.heard(marks, self._session.swarm_now_ns()))
             case Asked(topic=topic, request=MarksRequest() as request, fields=fields) if topic is MARKS and fields[
                 "author"
             ] in ("*", self._marks.author):
@@ -336,6 +371,9 @@ class Vehicle:
                 )
                 session.bus.publish(BODY, gone, id=self.id)
             self._body = None
+            if self._way is not None:
+                self._way.close()
+                self._way = None
             session.bus.unsubscribe(BODY, id=self.id)
             if self._marks.any:
                 session.bus.unserve(MARKS, author=self._marks.author)
@@ -348,15 +386,3 @@ def _check_target(session: Session, target: str) -> None:
         check_id("target", target)
     except ValueError as error:
         raise session.refused(str(error)) from error
-
-
-def _is_rest(new: Route, old: Route) -> bool:
-    """Whether a route says no more than the rest of the one before, of which the vehicle has driven a part."""
-    if (new.status, new.arrived, new.tracker_lost) != (old.status, old.arrived, old.tracker_lost):
-        return False
-    if not new.ok or new.cells == old.cells:
-        return True
-    if new.cells[0] not in old.cells:
-        return False
-    rest = old.cells[old.cells.index(new.cells[0]) :]
-    return rest == new.cells and (new.remaining_s == 0) == (old.remaining_s == 0)

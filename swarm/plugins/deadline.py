@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import faulthandler
+import functools
 import signal
 import threading
 import time
@@ -11,6 +13,10 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
+KILLED_BY = signal.SIGVTALRM
+"""What ends a process whose call cannot be broken off."""
+_KILL_FACTOR = 5
+
 
 class Hangs(BaseException):
     """A call has taken longer than it may. No `Exception`, so that code which catches those does not swallow it."""
@@ -19,14 +25,17 @@ class Hangs(BaseException):
 def call_within(seconds: float, call: Callable[[], T]) -> T:
     """What `call` returns. Raises `Hangs` in it once so many seconds have passed, and again as often.
 
-    An alarm of the operating system ends loops, sleeps and waits alike. Native code that never comes back to the
-    interpreter cannot be ended so. On another thread than the main one there is no alarm.
+    An alarm of the operating system ends loops, sleeps and waits alike. It does not reach native code that never
+    comes back to the interpreter: once that has used five times as much processor time, the process is killed, and
+    the line that it hangs in is on its standard error. On another thread than the main one there is neither.
     """
     if threading.current_thread() is not threading.main_thread():
         return call()
+    _tell_line()
     before = signal.signal(signal.SIGALRM, _ring)
     began_s = time.monotonic()
     left_s, every_s = signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
+    signal.setitimer(signal.ITIMER_VIRTUAL, _KILL_FACTOR * seconds)
     try:
         try:
             return call()
@@ -35,6 +44,7 @@ def call_within(seconds: float, call: Callable[[], T]) -> T:
     finally:
         # Again: the alarm may have rung after the call, before it was put off.
         signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
         signal.signal(signal.SIGALRM, before)
         if left_s:  # somebody else's alarm, such as a test's
             signal.setitimer(signal.ITIMER_REAL, max(left_s - (time.monotonic() - began_s), 1e-3), every_s)
@@ -42,3 +52,9 @@ def call_within(seconds: float, call: Callable[[], T]) -> T:
 
 def _ring(signum: int, frame: FrameType | None) -> None:
     raise Hangs
+
+
+@functools.cache
+def _tell_line() -> None:
+    # Written by the signal's handler itself, which needs no interpreter; then the signal kills.
+    faulthandler.register(KILLED_BY, file=2, all_threads=False, chain=True)

@@ -22,13 +22,14 @@ from swarm.wire.topics import GRANTED, KNOWN, STANDING
 _ANSWERS_S = 0.3
 """A new life waits so long for the agents' answers before it begins."""
 _ASK_AGAIN_NS = NS_PER_S
+_ROLE = "rover"
 
 
 class GuestService:
     """Right of way of one vehicle that is not in the scenario, on a bus that may carry other things, too.
 
     `handle` and `tick` are called by one thread, `tick` some ten times a second. The bus needs the run's secret, or
-    a certificate of the role agent with the guest's name.
+    a certificate of the guest, `rover.GROUP.NAME`.
 
     name         of the guest, as in its certificate; no agent of the scenario has it
     incarnation  nanosecond of this process's start, which tells its liveliness token from that of another
@@ -69,9 +70,9 @@ class GuestService:
         """Where to enter, once there is a guest."""
 
     def start(self, now_ns: int) -> None:
-        self._bus.watch_alive(self._post, role="agent")
+        self._bus.watch_alive(self._post, role=_ROLE)
         self._bus.subscribe(GRANTED, self._post, host=self.name)
-        self._bus.declare_alive(Peer("agent", self.name, self._incarnation))
+        self._bus.declare_alive(Peer(_ROLE, self.name, self._incarnation))
         self._ask(now_ns)
 
     def stop(self) -> None:
@@ -109,9 +110,9 @@ class GuestService:
                 if self.guest is not None:
                     self._perform(self.guest.begin(self._chance(now_ns)), now_ns)
                     self.tell(now_ns)
-            case Appeared(peer=Peer(role="agent", id=self.name) as peer):
+            case Appeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
                 self._hear_token(peer, up=True)
-            case Disappeared(peer=Peer(role="agent", id=self.name) as peer):
+            case Disappeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
                 self._hear_token(peer, up=False)
             case _:
                 return False

@@ -37,8 +37,8 @@ class GuestSession:
 
     name   of the vehicle, unlike all agents of the scenario
     grid   of the run's map
-    bus    opened with the run's secret, or with a certificate of `agent.NAME`; this session does not close it
-    lives  the vehicle's file
+    bus    opened with the run's secret, or with the vehicle's certificate, `rover.GROUP.NAME`
+    lives  the vehicle's file; closed with this session, as the bus is
     """
 
     def __init__(self, name: str, grid: GridSpec, bus: Bus, lives: Lives, clock: Clock | None = None) -> None:
@@ -47,6 +47,8 @@ class GuestSession:
         self._changed = threading.Condition(threading.RLock())
         """Guards the service; notified whenever it may have come to hold other cells."""
         self._closed = threading.Event()
+        self._bus = bus
+        self._lives = lives
         self._failure: BaseException | None = None
         self.warnings: list[str] = []
         """Sentences about why it waits, or what cannot be true."""
@@ -135,6 +137,8 @@ class GuestSession:
                 self._service.stop()
             self._inbox.close()
             self._thread.join(2 * _TICK_S + 1.0)
+            self._bus.close()
+            self._lives.close()
 
     # --- its thread -----------------------------------------------------------------------------------------
 

@@ -20,6 +20,8 @@ class Lives(Protocol):
 
     def save(self, lives: Sequence[int]) -> None: ...
 
+    def close(self) -> None: ...
+
 
 class MemoryLives:
     """Survives a simulated process, not this one. What was granted to a life that is forgotten stays shut until an
@@ -30,6 +32,9 @@ class MemoryLives:
 
     def save(self, lives: Sequence[int]) -> None:
         self.lives = list(lives)
+
+    def close(self) -> None:
+        """Let another process have it."""
 
 
 class LifeFile(MemoryLives):
@@ -65,5 +70,6 @@ class LifeFile(MemoryLives):
             raise StoreError(f"cannot write {draft}: {error.strerror}") from error
 
     def close(self) -> None:
-        """Let another process have the file."""
-        os.close(self._lock)
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1

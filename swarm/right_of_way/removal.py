@@ -21,7 +21,7 @@ _TICK_S = 0.1
 def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
     """Say that a guest is gone, and wait until its cells are free. Returns whether they are within the timeout.
 
-    bus  opened with the run's secret, or an operator's certificate
+    bus  opened with the run's secret, or the guest's own certificate
 
     Raises ConfigError where no such guest is known, or it is no guest, or its program still runs.
     """

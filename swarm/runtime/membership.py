@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 
+import msgspec
+
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.errors import RunMismatchError
@@ -41,6 +43,7 @@ class Member:
         self._bus = bus
         self._post = post
         self._stats_due_ns = 0
+        self._now_ns = 0  # of the last tick
         # Whether another process of this run has ever answered: from then on no answer ends this one.
         self._confirmed = info.run_id == NO_RUN
         # What the round of answers that is coming in has told: the first that differs, in words.
@@ -71,7 +74,7 @@ class Member:
         """Whether the event was about membership only and is done with. Raises RunMismatchError."""
         match event:
             case Asked(topic=topic) if topic is RUN:
-                event.answer(self.info)
+                event.answer(msgspec.structs.replace(self.info, now_ns=self._now_ns))
                 event.end()
                 return True
             case Replied(tag=tag, message=RunInfo() as other) if tag == _TAG:
@@ -94,6 +97,7 @@ class Member:
 
     def tick(self, now_ns: int) -> None:
         """Name new strangers; publish the counters once a second."""
+        self._now_ns = now_ns
         for sentence in self._to_name:
             self.note(now_ns, "stranger", sentence)
         self._to_name.clear()

@@ -22,10 +22,15 @@ def authenticator_of(network: NetworkConfig, run_id: str) -> Authenticator | Non
     return None if network.tls is not None else Authenticator(_secret(_path()), run_id)
 
 
-def _path() -> Path:
+def state_folder() -> Path:
+    """Where this user's swarms keep what survives runs."""
     state = os.environ.get("XDG_STATE_HOME", "")
     base = Path(state) if os.path.isabs(state) else Path.home() / ".local" / "state"
-    return base / "terrain-swarm" / "secret"
+    return base / "terrain-swarm"
+
+
+def _path() -> Path:
+    return state_folder() / "secret"
 
 
 def _secret(path: Path) -> bytes:

@@ -196,9 +196,8 @@ CHASERS = Topic(
 STANDING = Topic(
     "standing", "standing/{plot}/{member}/{agent}", Standing,
     "where a host's vehicles are in a plot and where they would go; for its warden, or all of its members where "
-    "none is heard; each counts, as two lives of a host must not hide each other's words; by it an operator says "
-    "that a guest is gone", "on change, else 5 Hz",
-    access(put="agent:agent operator", hear="agent:member"), newest=False, trusted=True,
+    "none is heard; each counts, as two lives of a host must not hide each other's words", "on change, else 5 Hz",
+    access(put="agent:agent rover:agent", hear="agent:member"), newest=False, trusted=True,
     priority=Priority.INTERACTIVE,
 )  # fmt: skip
 TABLE = Topic(
@@ -211,7 +210,7 @@ TABLE = Topic(
 GRANTED = Topic(
     "granted", "granted/{plot}/{host}/{agent}", Granted,
     "which cells of a plot its warden has granted to one host, on file with its members", "on change, else 5 Hz",
-    access(put="agent:agent", hear="agent:host"), trusted=True, priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent:host rover:host"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STORED = Topic(
     "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file",
@@ -219,8 +218,8 @@ STORED = Topic(
     access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(
-    "known", "known/{agent}", Known, "what an agent has on file about another, for a new life of that",
-    "asked at a start", access(serve="agent:agent", ask="agent"), request=KnownRequest, published=False,
+    "known", "known/{agent}", Known, "what an agent has on file about another, or a guest, for a new life of that",
+    "asked at a start", access(serve="agent:agent", ask="agent rover"), request=KnownRequest, published=False,
     trusted=True, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 LEAVE = Topic(

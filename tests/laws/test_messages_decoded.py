@@ -215,9 +215,13 @@ def columns_of(kind: type[Any]) -> dict[str, Column]:
     return {name: note for name, each in notes.items() for note in each if isinstance(note, Column)}
 
 
+def dtype_of(rule: Column) -> np.dtype[Any]:
+    return np.dtype(rule.dtype if isinstance(rule.dtype, str) else list(rule.dtype))
+
+
 def beyond(rule: Column) -> list[Any]:
     """Values of the column's dtype which are just outside its bounds."""
-    dtype = np.dtype(rule.dtype)
+    dtype = dtype_of(rule)
     if dtype.kind == "f":
         limits = [(rule.least, -np.inf), (rule.most, np.inf)]
         return [math.nan, *(np.nextafter(dtype.type(at), dtype.type(to)) for at, to in limits if at != to)]
@@ -233,7 +237,7 @@ COLUMNS = [(kind, name) for kind in (*TYPES, Routes) for name in columns_of(kind
 def test_a_column_of_another_length_or_beyond_its_bounds_is_refused(kind, name):
     """Whether its type checks it or, as for the statements of marks, other code does."""
     message, rule = BY_TYPE[RouteReply if kind is Routes else kind], columns_of(kind)[name]
-    honest, dtype = getattr(message.routes if kind is Routes else message, name), np.dtype(rule.dtype)
+    honest, dtype = getattr(message.routes if kind is Routes else message, name), dtype_of(rule)
     honest = honest or bytes(dtype.itemsize)
     wrong = [honest[:-1]] if dtype.itemsize > 1 or rule.per else []
     for value in beyond(rule):

@@ -9,13 +9,14 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from support.live_swarm import LiveSwarm
 from support.processes import eventually
 
-from swarm.client import BusError, ConfigError, Route, Swarm, connect
+from swarm.client import BusError, ConfigError, Route, Swarm, SwarmError, connect
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -136,3 +137,48 @@ def test_a_vehicle_in_rust_asks_and_puts_json(live: LiveSwarm, swarm: Swarm) -> 
         assert watching.vehicles["rusty"].x_m == 1805.0
         said, _ = run.communicate(timeout=30)
         assert re.fullmatch(r"[0-9.]+ s to t0\n", said), said
+
+
+def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell(
+    live: LiveSwarm, swarm: Swarm, tmp_path: Path
+) -> None:
+    file = tmp_path / "guest.lives"
+    problems: list[str] = []
+    swarm.on_problem(problems.append)
+    with swarm.vehicle("guest", radius_m=3.0, right_of_way=file) as guest:
+        with pytest.raises(SwarmError, match="in use"):
+            swarm.vehicle("guest", right_of_way=file)
+        guest.at(*swarm.frame.centre_m(swarm.frame.grid.cell(40, 60)))
+        cells = list(guest.route("t0").cells)
+        for here, there in pairwise(cells[:12]):
+            reserved = guest.reserve(cells[cells.index(here) + 1 :][:4], timeout_s=20.0)
+            assert there in reserved, f"not let into {there}: {problems}"
+            assert guest.may_enter(there)
+            guest.at(*swarm.frame.centre_m(there))
+        assert not guest.may_enter(cells[0]), "it has been given back"
+        with pytest.raises(ConfigError, match="guest: cell 0 of the path is not next to cell"):
+            guest.reserve([0])
+        guest.at(*swarm.frame.centre_m(swarm.frame.grid.cell(2, 2)))
+        eventually(lambda: problems, 2, "a word about driving where it was not let in")
+    assert problems == [f"vehicle guest is in cell {swarm.frame.grid.cell(2, 2)}, into which it was not let: stop"]
+    with swarm.vehicle("other") as other:
+        other.at(*swarm.frame.centre_m(5))
+        with pytest.raises(ConfigError, match="has no right of way: make it with"):
+            other.may_enter(5)
+
+
+def test_orders_of_a_program_are_obeyed_and_taken_back(swarm: Swarm) -> None:
+    orders = swarm.orders()
+    assert not orders.pause().silent
+    assert [order.subject for order in orders.given()] == ["pause"]
+    assert not orders.resume().silent
+    x_m, y_m = swarm.frame.centre_m(swarm.frame.grid.cell(80, 110))
+    corners = [(x_m, y_m), (x_m + 90, y_m), (x_m + 90, y_m - 90), (x_m, y_m - 90)]
+    name, acknowledged = orders.add_zone(corners, name="works", for_s=600.0)
+    assert (name, acknowledged.silent) == ("works", [])
+    with swarm.observer() as watching:
+        eventually(lambda: sum(mark.lethal for mark in watching.marks.values()) >= 4, 5, "the zone in the map")
+    assert [zone.name for zone in orders.zones()] == ["works"]
+    assert not orders.remove_zone("works").silent
+    with pytest.raises(ConfigError, match="the order is not possible"):
+        orders.add_zone(corners[:2])

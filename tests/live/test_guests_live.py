@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from itertools import pairwise
@@ -69,28 +70,50 @@ def drive(rover: GuestSession, path: list[int]) -> None:
         rover.left(here)
 
 
+ROVER = """
+import sys, time
+from pathlib import Path
+from swarm.client import connect
+
+endpoint, file, *cells = sys.argv[1:]
+path = [int(cell) for cell in cells]
+with connect(endpoint) as swarm:
+    rover = swarm.vehicle("rover", right_of_way=Path(file))
+    for here, there in zip(path, path[1:]):
+        rover.at(*swarm.frame.centre_m(here))
+        rover.reserve(path[path.index(here) + 1:], timeout_s=20.0)
+        assert rover.may_enter(there), there
+    rover.at(*swarm.frame.centre_m(path[-1]))
+    print("there", flush=True)
+    time.sleep(60)
+"""
+
+
+def session_of(live: LiveSwarm, run: RunInfo, name: str, file: Path) -> GuestSession:
+    bus = open_bus(live.network, authenticator=authenticator_of(live.network, run.run_id))
+    return GuestSession(name, GridSpec(run.rows, run.cols, run.resolution_m), bus, LifeFile(file))
+
+
 def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
     live: LiveSwarm, run: RunInfo, tmp_path: Path
 ) -> None:
-    grid = GridSpec(run.rows, run.cols, run.resolution_m)
-    path = route_of(live, grid)
-    authenticator = authenticator_of(live.network, run.run_id)
-    with open_bus(live.network, authenticator=authenticator) as bus:
-        lives = LifeFile(tmp_path / "rover")
-        rover = GuestSession("rover", grid, bus, lives)
-        assert not rover.may_enter(path[0])
-        assert rover.enter(path[0], timeout_s=10.0)
-        drive(rover, path[:6])
-    lives.close()  # as if the program had died: it has not left
-    with open_bus(live.network, authenticator=authenticator) as bus:
-        with GuestSession("other", grid, bus, LifeFile(tmp_path / "other")) as other:
-            assert not other.enter(path[5], timeout_s=1.5)  # the rover may stand there
-        with GuestSession("rover", grid, bus, LifeFile(tmp_path / "rover")) as rover:
+    path = route_of(live, GridSpec(run.rows, run.cols, run.resolution_m))
+    command = [sys.executable, "-c", ROVER, live.endpoint, tmp_path / "rover", *path[:6]]
+    program = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)
+    assert program.stdout is not None
+    assert program.stdout.readline() == "there\n"
+    program.kill()
+    program.wait(10)
+    with session_of(live, run, "other", tmp_path / "other") as other:
+        assert not other.enter(path[5], timeout_s=4.0)  # the rover stands there, though its lease as a body is over
+        with session_of(live, run, "rover", tmp_path / "rover") as rover:
             assert rover.enter(path[5], timeout_s=10.0)
             drive(rover, path[5:])
-            assert rover.leave(timeout_s=10.0)
-            with GuestSession("other", grid, bus, LifeFile(tmp_path / "other2")) as other:
-                assert other.enter(path[-1], timeout_s=10.0)
+            assert other.may_enter(path[5], timeout_s=10.0)  # what it has asked for all the time
+        assert other.leave(timeout_s=10.0)
+        assert other.enter(path[-1], timeout_s=10.0)  # the rover has left
+    with session_of(live, run, "third", tmp_path / "third") as third:
+        assert third.enter(path[-1], timeout_s=10.0)
 
 
 def vehicles_of(live: LiveSwarm, agent: str, within_s: float = 20.0, count: int = 1) -> set[str]:

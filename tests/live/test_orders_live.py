@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 from support.live_swarm import LiveSwarm, client, swarm
 from support.processes import eventually
 
@@ -93,6 +94,25 @@ def test_an_added_target_gets_a_planner_and_is_chased(running: LiveSwarm) -> Non
     assert removed["given"]["off"]
     order(running, "group", "all", "--as-scenario")
     eventually(lambda: "planner-x" not in swarm("status", "--connect", running.endpoint).stdout, 20, "its end")
+
+
+def test_a_person_gives_an_order_by_a_selector_and_reads_json(running: LiveSwarm) -> None:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([running.endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+
+        def get(selector: str) -> list[Any]:
+            replies = session.get(f"swarm/{selector};format=json", timeout=5.0)
+            return [json.loads(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+
+        (paused,) = get("order/0/give?subject=pause")
+        assert paused["given"]["subject"] == "pause"
+        (resumed,) = get("order/0/give?subject=pause;off=true")
+        assert resumed["given"]["off"] is True
+        (zones,) = get("order/0/zones?action=list")
+        assert zones["zones"] == []
 
 
 @pytest.mark.parametrize(

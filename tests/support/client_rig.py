@@ -7,7 +7,7 @@ from support.swarm_model import SwarmModel
 from swarm.bus.bus import Event
 from swarm.client.connection import Swarm
 from swarm.client.session import TICK_S, Session
-from swarm.clock import NS_PER_S
+from swarm.clock import NS_PER_S, Clock
 from swarm.grid import GridSpec
 from swarm.wire.messages.processes import RunInfo
 
@@ -20,13 +20,27 @@ def run_info(grid: GridSpec, run_id: str = "run") -> RunInfo:
     )  # fmt: skip
 
 
-class Program:
-    """What a program sees (`swarm`), and the session behind it."""
+class SlowClock:
+    """A clock that is behind another."""
 
-    def __init__(self, world: SwarmModel, node: str = "program") -> None:
+    def __init__(self, clock: Clock, behind_ns: int) -> None:
+        self._clock, self._behind_ns = clock, behind_ns
+
+    def now_ns(self) -> int:
+        return self._clock.now_ns() - self._behind_ns
+
+
+class Program:
+    """What a program sees (`swarm`), and the session behind it.
+
+    slow_ns  its clock is behind that of all others by so much, which it learned when it connected
+    """
+
+    def __init__(self, world: SwarmModel, node: str = "program", slow_ns: int = 0) -> None:
         self.world = world
         self.bus = world.bus(node)
-        self.session = Session(self.bus, run_info(world.terrain.grid), world.scheduler.clock, self._post)
+        clock = SlowClock(world.scheduler.clock, slow_ns)
+        self.session = Session(self.bus, run_info(world.terrain.grid), clock, self._post, ahead_ns=slow_ns)
         self.swarm = Swarm(self.session)
         self.problems: list[str] = []
         self.swarm.on_problem(self.problems.append)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import sys
 import threading
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from swarm.bus.bus import Event
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
+from swarm.plugins.deadline import call_within
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
@@ -65,6 +67,10 @@ class Idle:
 
 def lose_a_thread(setup: RoleSetup, stop_when: StopWhen) -> None:
     Process(Idle(), Inbox(), MonotonicClock(), tick_hz=20.0).run()
+
+
+def hang_in_native_code(setup: RoleSetup, stop_when: StopWhen) -> None:
+    call_within(0.1, lambda: sum(itertools.repeat(0)))
 
 
 def refuse(setup: RoleSetup, stop_when: StopWhen) -> None:

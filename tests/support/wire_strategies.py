@@ -13,6 +13,7 @@ from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET, pack_column
 from swarm.wire.messages.base import Message, Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile
 from swarm.wire.messages.bodies import LONGEST_LEASE_S, Body
+from swarm.wire.messages.guests import Removed, RemoveVehicles
 from swarm.wire.messages.marks import DIGEST_ROW, Digest, MarkSet, MarkSets, MarksRequest
 from swarm.wire.messages.orders import GiveOrder, Obey, Obeyed, Order, Orders, Zone, ZoneOrder, Zones
 from swarm.wire.messages.planning import (
@@ -183,7 +184,8 @@ orders = st.builds(
 MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     RunInfo: st.builds(
         RunInfo, run_id=texts, role=ids, id=ids, incarnation=naturals, scenario=texts, terrain=texts, rows=sides,
-        cols=sides, resolution_m=st.floats(0, 1e9), started_ns=naturals,
+        cols=sides, resolution_m=st.floats(0, 1e9), started_ns=naturals, west_m=metres, north_m=metres, crs=texts,
+        now_ns=naturals,
     ),
     Nothing: st.just(Nothing()),
     MarkSet: mark_sets(),
@@ -221,7 +223,10 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
     Stored: st.builds(Stored, plot=plots, agent=ids, epoch=naturals, seq=naturals),
     Claim: st.builds(Claim, epoch=naturals),
     KnownRequest: st.builds(KnownRequest, agent=ids, disk=naturals),
-    Known: st.builds(Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(plots, max_size=3)),
+    Known: st.builds(
+        Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(plots, max_size=3),
+        agents=st.lists(ids, max_size=3), lives=st.lists(naturals, max_size=3),
+    ),
     Followed: st.builds(
         Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite_costs,
         lower_bound_s=finite_costs,
@@ -309,6 +314,8 @@ EXAMPLES: tuple[Message, ...] = (
         cols=403, resolution_m=90.0, started_ns=5,
     ),
     Nothing(),
+    RemoveVehicles(vehicles=["a0-00"]),
+    Removed(agent="a0", left=["a0-00"], unknown=["a0-07"], held=1),
     MarkSet(
         author="a0.7", group="all", tile=3, epoch=7, seq=2, cells=pack_column([5, 1023], "<u2"),
         kinds=bytes([0, 1]), paces=pack_column([0.5, math.inf], "<f4"), stamps_ns=pack_column([10, 20], "<i8"),
@@ -350,7 +357,7 @@ EXAMPLES: tuple[Message, ...] = (
     Stored(plot=0, agent="a2", epoch=3, seq=17),
     Claim(epoch=4),
     KnownRequest(agent="a0", disk=77),
-    Known(agent="a1", disk=77, life=1 << 32, plots=[0, 3]),
+    Known(agent="a1", disk=77, life=1 << 32, plots=[0, 3], agents=["a0", "a1"], lives=[1 << 32]),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
     Sighted(

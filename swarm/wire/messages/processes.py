@@ -31,6 +31,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
 
     rows, cols, resolution_m    of the grid; 0 of a router, which has none
     west_m, north_m, crs        where its north-west corner is, and in which coordinate system
+    now_ns                      its clock when it answered, as of its last tick; 0 before the first
     """
 
     run_id: Word
@@ -46,6 +47,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     west_m: Metres = 0.0
     north_m: Metres = 0.0
     crs: LongText = "local"
+    now_ns: StampNs = 0
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):

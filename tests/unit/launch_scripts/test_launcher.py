@@ -170,6 +170,17 @@ def test_a_process_killed_from_outside_is_restarted(swarms: list[LocalSwarm], tm
     assert swarm.restarts == 1
 
 
+def test_a_process_whose_plugin_hangs_in_native_code_is_named_and_restarted(
+    swarms: list[LocalSwarm], tmp_path: Path
+) -> None:
+    swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "hang_in_native_code"))
+    swarm.start()
+    (ending,) = endings_within(swarm, 20)
+    assert ending.sentence == "a plug-in did not come back from native code; its log says where"
+    assert ending.restart_in_s == 0.2
+    assert "in hang_in_native_code" in (tmp_path / "agent-a0.log").read_text()
+
+
 def test_a_process_that_leaves_without_being_asked_is_restarted(swarms: list[LocalSwarm], tmp_path: Path) -> None:
     swarm = swarm_of(swarms, tmp_path, ("planner", "t0", "leave_early"))
     swarm.start()

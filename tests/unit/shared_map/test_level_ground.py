@@ -3,49 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from support.height_models import SIDE, hills, is_water, load, written
 
-from shared_map.arrays import Floats
 from shared_map.terrain.importers.level_ground import level_ground, undeclared_voids
-from shared_map.terrain.importers.sources import Source, load_source
-from shared_map.terrain.layers import TerrainClass
-from swarm.config.scenario import TerrainConfig
-from swarm.errors import TerrainError
-
-SIDE = 200
-
-
-def hills(seed: int, relief_m: float, smooth_cells: float = 12.0) -> Floats:
-    """Heights of rounded hills, `relief_m` from the lowest to the highest."""
-    rough = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=(SIDE, SIDE)), smooth_cells)
-    rough -= rough.min()
-    return np.asarray(rough / rough.max() * relief_m, np.float32)
-
-
-def written(path: Path, heights: Any, dtype: str = "float32", **profile: Any) -> Path:
-    import rasterio
-    from rasterio.transform import from_origin
-
-    place = {"crs": "EPSG:32632", "transform": from_origin(500_000, 5_000_000, 20, 20), **profile}
-    rows, cols = heights.shape
-    with rasterio.open(path, "w", driver="GTiff", height=rows, width=cols, count=1, dtype=dtype, **place) as file:
-        file.write(heights.astype(dtype), 1)
-    return path
-
-
-def load(path: Path, **keys: Any) -> Source:
-    return load_source(TerrainConfig(source=str(path), **keys), seed=1)
-
-
-def is_water(source: Source) -> Any:
-    return source.classes == TerrainClass.WATER
-
 
 # --- level ground -------------------------------------------------------------------------------------------
 
@@ -180,109 +146,3 @@ def test_a_text_grid_is_looked_at_alike(tmp_path: Path) -> None:
     source = load(tmp_path / "a.asc", resolution_m=30.0)
     assert np.isnan(source.elevation_m[0]).all()
     assert is_water(source).mean() == pytest.approx((ground == 0).mean(), abs=0.03)
-
-
-# --- what else must not be silently wrong -------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("system", "step"),
-    [
-        ("+proj=longlat +R=1737400 +no_defs", 0.01),
-        ("+proj=stere +lat_0=-90 +lon_0=0 +R=3376200 +units=m +no_defs", 300.0),
-        ("IAU_2015:30100", 0.01),
-    ],
-)
-def test_other_planets_have_metres_of_their_own(tmp_path: Path, system: str, step: float) -> None:
-    from rasterio.transform import from_origin
-
-    path = written(tmp_path / "moon.tif", hills(1, 500), crs=system, transform=from_origin(0, 1, step, step))
-    source = load(path)
-    expected_m = step if step > 1 else step * np.pi / 180 * 1_737_400
-    assert source.grid.resolution_m == pytest.approx(expected_m, rel=0.02)
-    assert not np.isnan(source.elevation_m).any()
-
-
-def test_a_local_system_in_metres_is_as_good_as_any(tmp_path: Path) -> None:
-    source = load(written(tmp_path / "site.tif", hills(1, 50), crs='LOCAL_CS["site",UNIT["metre",1]]'))
-    assert (source.grid.crs, source.grid.resolution_m) == ("local", 20.0)
-
-
-def test_a_map_whose_metres_are_not_true_is_put_on_true_ones(tmp_path: Path) -> None:
-    from rasterio.transform import from_origin
-
-    place = from_origin(0, 6_700_000, 100, 100)  # latitude 60: a metre of the map to the east is half a true one
-    system = "+proj=eqc +lat_ts=0 +lon_0=0 +datum=WGS84 +units=m"
-    source = load(written(tmp_path / "a.tif", hills(1, 500), crs=system, transform=place))
-    assert source.grid.cols * source.grid.resolution_m == pytest.approx(SIDE * 50, rel=0.03)
-
-
-def test_pixels_that_are_square_but_for_a_rounding_are_not_resampled(tmp_path: Path) -> None:
-    from rasterio.transform import Affine
-
-    ground = hills(2, 500)
-    place = Affine(20, 0, 500_000, 0, -20.00001, 5_000_000)
-    source = load(written(tmp_path / "a.tif", ground, transform=place))
-    np.testing.assert_array_equal(source.elevation_m, ground)
-
-
-def test_heights_in_centimetres_and_what_a_map_in_feet_does_not_say(tmp_path: Path) -> None:
-    import rasterio
-
-    path = written(tmp_path / "cm.tif", hills(2, 500) * 100)
-    with rasterio.open(path, "r+") as file:
-        file.units = ("cm",)
-    assert load(path).elevation_m.max() == pytest.approx(500, rel=1e-3)
-    notes = load(written(tmp_path / "ft.tif", hills(2, 500), crs="EPSG:2264")).notes
-    assert any("terrain.height_scale = 0.3048" in note for note in notes)
-
-
-# --- kinds of files -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "driver", "dtype"),
-    [
-        ("a.img", "HFA", "float32"),
-        ("a.bil", "EHdr", "int16"),
-        ("a.flt", "EHdr", "float32"),
-        ("a.anything", "GTiff", "float32"),
-        ("without_ending", "GTiff", "int16"),
-        ("a.nc", "netCDF", "float32"),
-        ("a.sdat", "SAGA", "float32"),
-    ],
-)
-def test_rasters_of_many_kinds_are_read(tmp_path: Path, name: str, driver: str, dtype: str) -> None:
-    import rasterio
-    from rasterio.shutil import copy
-
-    plain = written(tmp_path / "plain.tif", np.round(hills(1, 500)), dtype)
-    copy(plain, tmp_path / name, driver=driver)
-    keys = {} if driver != "SAGA" else {"crs": "EPSG:32632"}
-    source = load(tmp_path / name, **keys)
-    np.testing.assert_allclose(source.elevation_m, load(plain).elevation_m)
-    assert rasterio.open(tmp_path / name).shape == (SIDE, SIDE)
-
-
-def test_a_raster_in_a_zip_is_read_and_a_bad_zip_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    import zipfile
-
-    plain = written(tmp_path / "plain.tif", hills(1, 500))
-    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.write(plain, "inside/dem.tif")
-        archive.writestr("readme.txt", "heights")
-    np.testing.assert_array_equal(load(tmp_path / "a.zip").elevation_m, load(plain).elevation_m)
-    with zipfile.ZipFile(tmp_path / "two.zip", "w") as archive:
-        archive.write(plain, "a.tif")
-        archive.write(plain, "b.tif")
-    with pytest.raises(TerrainError, match="holds 2 rasters"):
-        load(tmp_path / "two.zip")
-    (tmp_path / "no.zip").write_bytes(b"PK no")
-    with pytest.raises(TerrainError, match=r"damaged or no \.zip"):
-        load(tmp_path / "no.zip")
-    (tmp_path / "cut.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-40000])
-    with pytest.raises(TerrainError, match=r"damaged or no \.zip"):
-        load(tmp_path / "cut.zip")
-    (tmp_path / "text").write_text("hello")
-    with pytest.raises(TerrainError, match="a file without ending is unknown"):
-        load(tmp_path / "text")

@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.map_strategies import held_winners
+from support.map_strategies import held_winners, set_of
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.store import KeeperStore
 from shared_map.keeper.zones import _crossing, rows_of
+from shared_map.replication.filter import readable_for_target
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.load import parse_scenario
-from swarm.wire.messages.orders import Zone, ZoneOrder, Zones
+from swarm.order_book import OrderBook
+from swarm.wire.messages.orders import Order, Zone, ZoneOrder, Zones
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import ZONES
 
@@ -310,6 +312,49 @@ def test_the_map_has_exactly_the_zones_that_were_ordered_and_not_taken_back(scri
     world.run(1.5)
     composite: Any = late.replica._cost_map
     assert set(np.flatnonzero(composite.kinds == MarkKind.LETHAL).tolist()) == set().union(*stands.values())
+
+
+def test_who_hears_other_groups_forgets_those_it_does_not_hear_any_more_and_keeps_zones() -> None:
+    world = ZoneWorld()
+    replica = world.planner.replica
+    world.add()
+    for group in ("red", "blue"):
+        world.planner.replica.merge(
+            [set_of(f"{group}.a1.1", 0, 1, {0: (MarkKind.LETHAL, 0.0, 5)}, group=group)], measured=False
+        )
+    replica.hear(frozenset({"blue"}))
+    assert replica.held.ledger.authors == ["blue.a1.1", "operator.z"]
+    assert world.lethal() == SQUARE_CELLS | {0}
+    replica.hear(frozenset({"grey"}))
+    assert world.lethal() == SQUARE_CELLS
+    replica.hear(None)
+    replica.merge([set_of("red.a1.1", 0, 1, {0: (MarkKind.LETHAL, 0.0, 5)}, group="red")])
+    assert world.lethal() == SQUARE_CELLS | {0}
+
+
+def test_the_planner_of_a_target_hears_the_groups_that_were_ordered_to_chase_it() -> None:
+    scenario = parse_scenario("""
+[[targets]]
+name = "t"
+count = 2
+[[groups]]
+name = "red"
+writes = []
+targets = ["t0"]
+[[groups]]
+name = "blue"
+reads = []
+targets = ["t1"]
+""")
+    book = OrderBook()
+
+    def heard(target: str) -> frozenset[str] | None:
+        return readable_for_target(scenario, target, lambda group: book.targets_of(group, scenario))
+
+    assert heard("t1") == readable_for_target(scenario, "t1") == {"blue"}
+    book.merge([Order(subject="group", name="red", stamp_ns=1, targets=["t1"])], 1)
+    assert heard("t1") is None, "that is all groups"
+    assert heard("t0") == set()
 
 
 def test_rows_of_no_sets_are_none() -> None:

@@ -8,6 +8,7 @@ import threading
 from itertools import pairwise
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,12 +23,14 @@ from shared_map.keeper.store import KeeperStore
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import Heard
 from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream
+from swarm.client.connection import agreed
 from swarm.client.observer import marked
 from swarm.client.own_marks import OwnMarks
+from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.processes import Note
+from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.routes import Route as WireRoute
 from swarm.wire.routes import RouteStatus
 from swarm.wire.statements import FOREVER, MarkKind
@@ -257,6 +260,43 @@ def test_marks_reach_every_replica_though_messages_are_lost_and_repeated(seed: i
     for ear in ears[1:]:
         held = {tile: ear.replica.held.of_tile(tile) for tile in expected._sets}
         assert held == {tile: [each] for tile, each in expected._sets.items()}
+
+
+@pytest.mark.parametrize("slow_s", [3600, -3600, 0.3])
+def test_marks_of_a_program_whose_clock_is_an_hour_off_count_and_end_as_those_of_others(slow_s: float) -> None:
+    world = SwarmModel(start_ns=10_000 * NS_PER_S)
+    ear, author = world.listener("ear"), world.writer("a0.1")
+    rover = Program(world, slow_ns=int(slow_s * NS_PER_S)).swarm.vehicle("rover")
+    world.run(1.0)
+    author.sync.publish(author.replica.write([3, 4], LETHAL, 0.0, world.now_ns))
+    world.run(1.0)
+    rover.mark([3, 9], pace_s_per_m=0.5, for_s=5.0)
+    world.run(1.0)
+    kinds = ear.replica._cost_map.kinds
+    assert [kinds[cell] for cell in (3, 4, 9)] == [PACE, LETHAL, PACE], "said later, so it counts"
+    author.sync.publish(author.replica.write([9], LETHAL, 0.0, world.now_ns))
+    world.run(1.0)
+    assert kinds[9] == LETHAL, "said later still"
+    world.run(5.0)
+    assert [kinds[cell] for cell in (3, 4, 9)] == [LETHAL, LETHAL, LETHAL], "the rover's have ended"
+
+
+def test_most_processes_say_which_run_it_is_and_what_time() -> None:
+    ours, other = run_info(GRID), run_info(GRID, "other")
+    router = msgspec.structs.replace(ours, role="router", run_id="", rows=0, cols=0)
+
+    def at(info: RunInfo, ahead_s: float) -> tuple[RunInfo, int]:
+        return msgspec.structs.replace(info, now_ns=int((100 + ahead_s) * NS_PER_S)), 100 * NS_PER_S
+
+    assert agreed([], "here") is None
+    assert agreed([at(router, 0)], "here") is None
+    answers = [at(ours, 3600), at(ours, 3600.1), at(ours, -1e9 / NS_PER_S), at(other, 5), at(router, 7)]
+    run, ahead_ns = agreed(answers, "here") or (None, 0)
+    assert run is not None
+    assert (run.run_id, ahead_ns) == ("run", 3600 * NS_PER_S)
+    assert agreed([(ours, 5)], "here") == (ours, 0), "who has no clock yet says nothing about ours"
+    with pytest.raises(RunMismatchError, match=r"two runs, .* other and run, are in namespace here: end one"):
+        agreed([at(ours, 0), at(other, 0)], "here")
 
 
 @pytest.mark.parametrize(

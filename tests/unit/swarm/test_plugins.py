@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -21,7 +22,7 @@ from support.plugin_modules import forgotten_afterwards
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.errors import ConfigError
-from swarm.plugins.deadline import Hangs, call_within
+from swarm.plugins.deadline import KILLED_BY, Hangs, call_within
 from swarm.plugins.door import Door, Nonsense
 from swarm.plugins.find import Plugin, check_plugins, find_plugin, named_plugin
 
@@ -240,6 +241,20 @@ def test_an_alarm_leaves_that_of_others_as_it_was() -> None:
     finally:
         signal.signal(signal.SIGALRM, before)
         signal.setitimer(signal.ITIMER_REAL, *old)
+
+
+def test_native_code_that_does_not_come_back_kills_the_process_and_leaves_its_line(tmp_path: Path) -> None:
+    script = tmp_path / "hung_plugin.py"
+    script.write_text(
+        "import itertools\n"
+        "from swarm.plugins.deadline import call_within\n"
+        "def look():\n"
+        "    return sum(itertools.repeat(0))\n"
+        "call_within(0.1, look)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == -KILLED_BY
+    assert 'hung_plugin.py", line 4 in look' in done.stderr
 
 
 def test_on_another_thread_a_call_is_made_without_an_alarm() -> None:
