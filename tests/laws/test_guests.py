@@ -10,7 +10,6 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import pytest
 from support.guest_world import GuestProcess, GuestWorld
@@ -96,12 +95,8 @@ def test_cells_of_a_guest_that_is_gone_are_free_again() -> None:
     for seed in range(4):
         world = world_of(seed, twins=False)
         world.run(QUIET_S)
-        for robot in [each for each in world.processes if isinstance(each, GuestProcess)]:
-            world.gone.add(robot.agent)
-            robot.alive = False
-            world.processes.remove(robot)
-            world.at(0, partial(world.carry_away, robot, back=False))
-        world.run(10.0)
+        world.end_robots()
+        world.run(12.0)
         for process in world.processes:
             for member in process.rights._members.values():
                 if member.warden is not None:

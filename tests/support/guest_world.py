@@ -4,6 +4,7 @@ operators who say that a robot is gone. All under the same faults."""
 from __future__ import annotations
 
 import random
+from functools import partial
 
 from support.traffic_world import MS, NS_PER_S, TICK_NS, Disk, Faults, Process, TrafficWorld
 
@@ -196,6 +197,9 @@ class GuestWorld(TrafficWorld):
         self.robots = [f"r{k}" for k in range(robots)]
         self.added = {f"g{k}": [f"g{k}-00", f"g{k}-01"] for k in range(added)}
         self.gone: set[str] = set()
+        """Robots that are dead now, and"""
+        self.never_back: set[str] = set()
+        """those that will never be back."""
         self.guest_chance = random.Random(f"guests/{seed}")
         for vehicles in self.added.values():
             for vehicle in vehicles:
@@ -224,7 +228,7 @@ class GuestWorld(TrafficWorld):
         ]
 
     def restart(self, process: Process) -> None:
-        if process.agent not in self.gone and not isinstance(process, OperatorProcess):
+        if process.agent not in self.gone | self.never_back and not isinstance(process, OperatorProcess):
             super().restart(process)
 
     def disturb_guests(self) -> None:
@@ -257,6 +261,18 @@ class GuestWorld(TrafficWorld):
         if back:
             self.at(self.guest_chance.randrange(4 * NS_PER_S), lambda: self.bring_back(process))
 
+    def end_robots(self) -> None:
+        """All robots die for good. Once no word of theirs is under way any more, they are carried away."""
+        self.never_back.update(self.robots)
+        for robot in [each for each in self.processes if isinstance(each, GuestProcess)]:
+            robot.alive = False
+            self.processes.remove(robot)
+        for name in self.robots:
+            robot = GuestProcess(self, name, self.disks[name][0])
+            self.at(6 * NS_PER_S, partial(self.carry_away, robot, back=False))
+
     def bring_back(self, process: GuestProcess) -> None:
+        if process.agent in self.never_back:
+            return
         self.gone.discard(process.agent)
         self.restart(process)

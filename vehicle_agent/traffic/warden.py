@@ -119,10 +119,9 @@ class Warden:
             return
         known = self._hosts.setdefault(host, _Host(now_ns))
         known.spoke_ns = now_ns
-        if host in self._fleets:
-            self._open(standing)
         life, seq = self._lives.get(host, (0, 0))
         if standing.ended:
+            self._open(standing)
             self._ended(host, standing.life, life)
             return
         if (standing.life, standing.seq) <= (life, seq):
@@ -139,11 +138,10 @@ class Warden:
         for vehicle in self._granted_to(host):
             self._free(vehicle, holds.get(vehicle, []), standing.knows)
         known.standing, known.heard_ns = standing, now_ns
-        if host not in self._fleets:
-            # Only now: a life that is itself replaced must not open cells on which its vehicle stands.
-            self._enter_again(standing, self._open(standing))
-            if standing.life in standing.dead:
-                self._shut[host, standing.life] = []  # nobody drives by it: its successor need not wait
+        # Only now: a life that is itself replaced, and has not stopped, must not open cells on which a vehicle stands.
+        self._enter_again(standing, self._open(standing))
+        if standing.life in standing.dead:
+            self._shut[host, standing.life] = []  # nobody drives by it: its successor need not wait
 
     def _open(self, standing: Standing) -> set[int]:
         """Open what is shut for lives that are proved to have ended. Returns the cells."""
@@ -159,11 +157,17 @@ class Warden:
         """A guest that stands on a cell which was shut for an earlier life of it gets it before all others."""
         if not opened:
             return
-        held = {cell for cells, _ in self._grants.values() for cell in cells}
-        held.update(cell for cells in self._shut.values() for cell in cells)
+        opened.difference_update(cell for cells, _ in self._grants.values() for cell in cells)
+        for (host, _), cells in self._shut.items():
+            if host != standing.agent:
+                opened.difference_update(cells)
         for stand in standing.vehicles:
-            if _is_entering(stand) and self._is_of(stand.vehicle, standing.agent) and stand.cell in opened:
-                self._grant(stand, [stand.cell], held, {})
+            before = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+            ours = self._is_of(stand.vehicle, standing.agent)
+            if ours and _is_entering(stand) and stand.cell in opened and len(before) < _MOST_CELLS:
+                self._grants[stand.vehicle] = ([*before, stand.cell], self._next_stamp)
+                self._count_guest(stand.vehicle, len(before) + 1)
+                self._granted = True
 
     def _is_welcome(self, host: str) -> bool:
         """Whether there is room for this host: for each of the scenario, and for so many guests."""

@@ -288,6 +288,15 @@ def hear(holdings: Holdings, table: Table, now_ns: int = 0) -> None:
     holdings.hear_granted(granted_of(table), lambda vehicle, cells: cells[0], now_ns)
 
 
+def test_a_life_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_late() -> None:
+    holdings = holdings_of()
+    younger = msgspec.structs.replace(granted_of(table_of(1, 1, a0=[9])), life=2)
+    holdings.hear_granted(younger, lambda vehicle, cells: cells[0], S)
+    assert holdings.replaced
+    hear(holdings, table_of(1, 2, a0=[9]), S)
+    assert list(holdings.path("a0-00")) == []
+
+
 def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() -> None:
     fleets = {"a0": ["a0-00"], "a1": ["a1-00"]}
     member = Member(PLOTS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0)
