@@ -28,7 +28,11 @@ _BY_TYPE: dict[Any, Any] = {int: 1, float: 1.0, str: "word", bool: True, list: [
 
 def put_from_outside() -> list[Topic]:
     """The topics that programs which no launcher starts may put on, by the table of topics."""
-    return [topic for topic in TOPICS if any(grant.role in OUTSIDE_ROLES for grant in topic.access.put)]
+    return [
+        topic
+        for topic in TOPICS
+        if not topic.trusted and any(grant.role in OUTSIDE_ROLES for grant in topic.access.put)
+    ]
 
 
 def key_fields(topic: Topic) -> dict[str, str]:

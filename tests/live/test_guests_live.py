@@ -17,10 +17,11 @@ import pytest
 from support.live_swarm import SWARM, LiveSwarm, ask, client, swarm
 from support.processes import eventually
 
-from swarm.client import connect
-from swarm.errors import StoreError
+from swarm.bus.zenoh_bus import open_bus
 from swarm.grid import GridSpec
 from swarm.right_of_way.guest_session import GuestSession
+from swarm.right_of_way.life_file import LifeFile
+from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import RouteRequest
 from swarm.wire.messages.processes import RunInfo
@@ -77,15 +78,20 @@ from swarm.client import connect
 endpoint, file, *cells = sys.argv[1:]
 path = [int(cell) for cell in cells]
 with connect(endpoint) as swarm:
-    rover = swarm.right_of_way("rover", file=Path(file))
-    assert rover.enter(path[0], timeout_s=10.0)
-    rover.want(path)
+    rover = swarm.vehicle("rover", right_of_way=Path(file))
     for here, there in zip(path, path[1:]):
-        assert rover.may_enter(there, timeout_s=20.0)
-        rover.left(here)
+        rover.at(*swarm.frame.centre_m(here))
+        rover.reserve(path[path.index(here) + 1:], timeout_s=20.0)
+        assert rover.may_enter(there), there
+    rover.at(*swarm.frame.centre_m(path[-1]))
     print("there", flush=True)
     time.sleep(60)
 """
+
+
+def session_of(live: LiveSwarm, run: RunInfo, name: str, file: Path) -> GuestSession:
+    bus = open_bus(live.network, authenticator=authenticator_of(live.network, run.run_id))
+    return GuestSession(name, GridSpec(run.rows, run.cols, run.resolution_m), bus, LifeFile(file))
 
 
 def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
@@ -98,21 +104,16 @@ def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
     assert program.stdout.readline() == "there\n"
     program.kill()
     program.wait(10)
-    with connect(live.endpoint, namespace=live.network.namespace) as swarm:
-        other = swarm.right_of_way("other", file=tmp_path / "other")
-        assert not other.may_enter(path[5])
-        assert not other.enter(path[5], timeout_s=1.5)  # the rover stands there
-        rover = swarm.right_of_way("rover", file=tmp_path / "rover")
-        with pytest.raises(StoreError, match="is in use"):
-            swarm.right_of_way("rover", file=tmp_path / "rover")
-        assert rover.enter(path[5], timeout_s=10.0)
-        drive(rover, path[5:])
-        assert other.may_enter(path[5], timeout_s=10.0)  # what it has asked for all the time
-        assert rover.leave(timeout_s=10.0)
+    with session_of(live, run, "other", tmp_path / "other") as other:
+        assert not other.enter(path[5], timeout_s=4.0)  # the rover stands there, though its lease as a body is over
+        with session_of(live, run, "rover", tmp_path / "rover") as rover:
+            assert rover.enter(path[5], timeout_s=10.0)
+            drive(rover, path[5:])
+            assert other.may_enter(path[5], timeout_s=10.0)  # what it has asked for all the time
         assert other.leave(timeout_s=10.0)
-        assert other.enter(path[-1], timeout_s=10.0)
-    with connect(live.endpoint, namespace=live.network.namespace) as swarm:
-        assert swarm.right_of_way("third", file=tmp_path / "third").enter(path[-1], timeout_s=10.0)  # it has left
+        assert other.enter(path[-1], timeout_s=10.0)  # the rover has left
+    with session_of(live, run, "third", tmp_path / "third") as third:
+        assert third.enter(path[-1], timeout_s=10.0)
 
 
 def vehicles_of(live: LiveSwarm, agent: str, within_s: float = 20.0, count: int = 1) -> set[str]:

@@ -188,10 +188,6 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         now_ns=naturals,
     ),
     Nothing: st.just(Nothing()),
-    RemoveVehicles: st.builds(RemoveVehicles, vehicles=st.lists(ids, max_size=3)),
-    Removed: st.builds(
-        Removed, agent=ids, left=st.lists(ids, max_size=3), unknown=st.lists(ids, max_size=3), held=counts
-    ),
     MarkSet: mark_sets(),
     MarkSets: bulks(),
     Digest: digests(),
@@ -362,8 +358,6 @@ EXAMPLES: tuple[Message, ...] = (
     Claim(epoch=4),
     KnownRequest(agent="a0", disk=77),
     Known(agent="a1", disk=77, life=1 << 32, plots=[0, 3], agents=["a0", "a1"], lives=[1 << 32]),
-    RemoveVehicles(vehicles=["a0-00"]),
-    Removed(agent="a0", left=["a0-00"], unknown=["a0-99"], held=1),
     Followed(vehicle="a0-00", target="t0", start=4, directions=bytes([2, 2, 3]), cost_s=30.0, lower_bound_s=29.5),
     TargetPose(target="t0", incarnation=7, seq=3, stamp_ns=10, cell=9, x_m=1.5, y_m=-2.5, captures=1, jumps=1),
     Sighted(
