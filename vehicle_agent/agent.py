@@ -7,16 +7,14 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan
 from swarm.config.scenario import Scenario
-from swarm.grid import GridSpec, Window, walk
+from swarm.grid import Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracking import Trackings
 from swarm.wire.messages.planning import PushedRoute, RouteReply
@@ -24,8 +22,10 @@ from swarm.wire.messages.targets import TargetPose
 from swarm.wire.routes import Route, RouteStatus
 from vehicle_agent.assignment import AskCosts, Assigner, Assignment, Spread
 from vehicle_agent.bodies import Bodies
+from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
+from vehicle_agent.local_map import LocalMap, meet
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
@@ -51,25 +51,6 @@ class AskRoutes:
 
 
 AgentAction = AskRoutes | AskCosts
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LocalMap:
-    """The map of an agent: float32 (rows, cols) in s/m, inf is lethal. Their owners change them in place.
-
-    pace     cost of a cell, with marks and inflation
-    ground   as pace, before inflation
-    prior    as ground, without marks
-    physics  the pace at which vehicles really drive
-    climb    factor of a step's cost by its slope; None if steps cost the same both ways
-    """
-
-    grid: GridSpec
-    pace: NDArray[np.float32]
-    ground: NDArray[np.float32]
-    prior: NDArray[np.float32]
-    physics: NDArray[np.float32]
-    climb: Climb | None = None
 
 
 class Agent:
@@ -112,13 +93,13 @@ class Agent:
         self._map = local_map
         self.bodies = bodies or Bodies(local_map.grid)
         self._sensor = sensor
-        self._dynamics = dynamics
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
         self._steering = Steering(
             grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied, self.bodies
         )
+        self._driver = Driver(local_map, holdings, self._steering.passable, dynamics)
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies)
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
@@ -132,8 +113,6 @@ class Agent:
         self._sight_cells = max(sense_cells, config.reserve_cells + 1)
         """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
         self._driven_ns: int | None = None
-        self._left_s: dict[str, float] = {}
-        self._look_from: dict[int, None] = {}
         self._wished: dict[str, tuple[object, ...]] = {}
         """Vehicle under way -> what its wish was made of."""
 
@@ -148,7 +127,7 @@ class Agent:
         for vehicle in self.vehicles.values():
             if vehicle.target is not None and vehicle.target not in self.targets:
                 vehicle.release()
-                self._stop_soon(vehicle)
+                self._driver.stop_soon(vehicle)
         self._assignment.ask_soon(now_ns)
 
     def set_pace(self, time_scale: float, reassign_s: float) -> None:
@@ -163,14 +142,14 @@ class Agent:
         for id in vehicles:
             cell = self.holdings.path(id)[0]
             self.vehicles[id] = Vehicle(id, self._map.grid, cell)
-            self._look_from[cell] = None
+            self._driver.entered[cell] = None
             self._unassigned = True
 
     def remove(self, vehicles: Sequence[str]) -> None:
         """These leave the map: their cells are given back."""
         for id in vehicles:
             self.holdings.leave(id)
-            for known in (self.vehicles, self.wishes, self._wished, self._left_s):
+            for known in (self.vehicles, self.wishes, self._wished):
                 known.pop(id, None)
 
     def stand_down(self) -> None:
@@ -196,55 +175,17 @@ class Agent:
         if self.bodies.is_deaf:
             elapsed_s = 0.0
         self._driven_ns = now_ns
-        seconds = min(elapsed_s, _LONGEST_STEP_S) * self._time_scale
-        self._left_s = dict.fromkeys(self.vehicles, seconds)
-        if self._dynamics is not None:
-            self._dynamics.begin(seconds)
+        self._driver.begin(self.vehicles, min(elapsed_s, _LONGEST_STEP_S) * self._time_scale)
 
     def drive(self) -> Findings | None:
         """Let vehicles drive until they come to another cell; returns what they find there, to be written into
         the map before they drive on. None when their time is over."""
-        for id in list(self._left_s):
-            vehicle = self.vehicles[id]
-            left_s = self._drive(vehicle, self._left_s[id])
-            if left_s > 0.0:
-                self._left_s[id] = left_s
-            else:
-                del self._left_s[id]
-        if not self._look_from:
+        self._driver.drive(self.vehicles, self.stopped)
+        if not self._driver.entered:
             return None
-        sight = self._sensor.look(list(self._look_from))
-        self._look_from = {}
+        sight = self._sensor.look(list(self._driver.entered))
+        self._driver.entered = {}
         return compare(sight, self._map.ground, self._map.prior)
-
-    def _drive(self, vehicle: Vehicle, left_s: float) -> float:
-        """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
-        motion = vehicle.motion
-        physics = self._map.physics.reshape(-1)
-        while left_s > 0.0:
-            if motion.at_rest:
-                if self.stopped(vehicle.id):
-                    return 0.0
-                path = self.holdings.path(vehicle.id)
-                if len(path) < 2 or not self._steering.passable(path[0], path[1]):
-                    return 0.0
-                motion.set_out(path[1])
-            before = vehicle.cell
-            pace_s_per_m = float(physics[motion.head])
-            if self._map.climb is not None:
-                pace_s_per_m *= self._map.climb.of_step(motion.tail, motion.head)
-            if self._dynamics is None:
-                left_s = motion.advance(left_s, pace_s_per_m)
-            else:
-                path = self.holdings.path(vehicle.id)
-                left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
-            if vehicle.cell != before:
-                self.holdings.moved(vehicle.id, vehicle.cell)
-                vehicle.route.moved(vehicle.cell)
-                self._look_from[vehicle.cell] = None
-                # Even with no time left it has to look before it drives on.
-                return left_s
-        return 0.0
 
     def map_changed(self, changed: Sequence[Window], now_ns: int, *, look: bool = False) -> None:
         """End routes before cells that are lethal now, and paths also before corners that are.
@@ -258,15 +199,15 @@ class Agent:
         cols, sight, pace = self._map.grid.cols, self._sight_cells, self._map.pace.reshape(-1)
         cells = np.array([divmod(vehicle.cell, cols) for vehicle in vehicles], np.int64)
         routes = np.array([vehicle.route.bounds(cols) for vehicle in vehicles], np.int64)
-        for index in np.flatnonzero(_meet(routes, changed, 1) | _meet(np.hstack((cells, cells)), changed, sight)):
+        for index in np.flatnonzero(meet(routes, changed, 1) | meet(np.hstack((cells, cells)), changed, sight)):
             vehicle = vehicles[index]
             ahead = vehicle.route.ahead()
             if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable_steps):
                 vehicle.cut_route(now_ns)
-            self._end_path(vehicle)
+            self._driver.end_path(vehicle)
             self._wished.pop(vehicle.id, None)
             if look:
-                self._look_from[vehicle.cell] = None
+                self._driver.entered[vehicle.cell] = None
 
     def bodies_moved(self) -> None:
         """Let vehicles stop before cells that bodies close, or turn back. Called before they drive: what was
@@ -276,24 +217,10 @@ class Agent:
             return
         vehicles = list(self.vehicles.values())
         for vehicle in vehicles:
-            self._end_path(vehicle)
+            self._driver.end_path(vehicle)
         cells = np.array([divmod(vehicle.cell, self._map.grid.cols) for vehicle in vehicles], np.int64)
-        for index in np.flatnonzero(_meet(np.hstack((cells, cells)), changed, self._sight_cells)):
+        for index in np.flatnonzero(meet(np.hstack((cells, cells)), changed, self._sight_cells)):
             self._wished.pop(vehicles[index].id, None)
-
-    def _end_path(self, vehicle: Vehicle) -> None:
-        """Give back what lies behind a step that the map does not allow any more."""
-        path = self.holdings.path(vehicle.id)
-        for index, (tail, head) in enumerate(pairwise(path), 1):
-            if not self._steering.passable(tail, head):
-                if head == vehicle.motion.entering:
-                    vehicle.motion.turn_back()
-                self.holdings.give_back(vehicle.id, index)
-                return
-
-    def _stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
-        """Give back all but the first cells, and the one that it drives into."""
-        self.holdings.give_back(vehicle.id, max(keep, 1 if vehicle.motion.entering is None else 2))
 
     # --- deciding -------------------------------------------------------------------------------------------
 
@@ -310,7 +237,7 @@ class Agent:
             self._check_reach(vehicle)
             stopped = self.stopped(vehicle.id)
             if stopped:
-                self._stop_soon(vehicle)
+                self._driver.stop_soon(vehicle)
             path = self.holdings.path(vehicle.id)
             ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
@@ -366,7 +293,7 @@ class Agent:
         if near != vehicle.in_reach:
             vehicle.set_in_reach(near)
             if near:
-                self._stop_soon(vehicle)
+                self._driver.stop_soon(vehicle)
 
     # --- what is heard --------------------------------------------------------------------------------------
 
@@ -465,7 +392,7 @@ class Agent:
             vehicle.cut_route(now_ns)
         on_route = set(cells)
         if path[-1] not in on_route:  # it was granted cells along another route
-            self._stop_soon(vehicle, max(index + 1 for index, cell in enumerate(path) if cell in on_route))
+            self._driver.stop_soon(vehicle, max(index + 1 for index, cell in enumerate(path) if cell in on_route))
         return [begun]
 
     # --- which target ---------------------------------------------------------------------------------------
@@ -477,17 +404,3 @@ class Agent:
     def costs_ended(self, request: int, now_ns: int) -> None:
         """No more answers to `AskCosts` will come."""
         self._assignment.costs_ended(request, self.vehicles, self._planners, now_ns)
-
-
-def _meet(boxes: NDArray[np.int64], windows: Sequence[Window], margin: int) -> NDArray[np.bool_]:
-    """Which boxes lie within `margin` cells of any window.
-
-    boxes  int64 (n, 4): the smallest row and column of each, and the greatest
-    """
-    row0, col0, row1, col1 = boxes.T
-    met = np.zeros(len(boxes), np.bool_)
-    for window in windows:
-        rows = (row0 < window.row1 + margin) & (row1 >= window.row0 - margin)
-        met |= rows & (col0 < window.col1 + margin) & (col1 >= window.col0 - margin)
-    met &= row0 <= row1
-    return met

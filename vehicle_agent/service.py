@@ -45,7 +45,7 @@ from swarm.wire.topics import (
     SIGHTED,
     TRUE_POSE,
 )
-from vehicle_agent.agent import Agent, AgentAction, AskRoutes, LocalMap
+from vehicle_agent.agent import Agent, AgentAction, AskRoutes
 from vehicle_agent.assignment import AskCosts, AssignmentWorld, assigner_of
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.chasers import ChasersReport
@@ -54,6 +54,7 @@ from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Follow
 from vehicle_agent.entering import Entering
 from vehicle_agent.fleet import FleetReport, directions_of
+from vehicle_agent.local_map import LocalMap
 from vehicle_agent.placement import entry_cells, spawn_cells
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync

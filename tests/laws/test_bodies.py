@@ -19,9 +19,11 @@ from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.plots import Plots
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.traffic import Granted
-from vehicle_agent.agent import Agent, LocalMap
+from vehicle_agent.agent import Agent
 from vehicle_agent.bodies import REACTION_S, Bodies
 from vehicle_agent.discs import Capsule
+from vehicle_agent.driving.driver import Driver
+from vehicle_agent.local_map import LocalMap
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.traffic.steering import Steering
 
@@ -289,7 +291,7 @@ def test_without_any_one_rule_a_vehicle_drives_into_a_body(rule, monkeypatch) ->
     if rule == "closed":
         monkeypatch.setattr(Steering, "closed", lambda self, cell: False)
     elif rule == "turn back":
-        monkeypatch.setattr(Agent, "_end_path", lambda self, vehicle: None)
+        monkeypatch.setattr(Driver, "end_path", lambda self, vehicle: None)
     elif rule == "reaction":
         monkeypatch.setattr("vehicle_agent.bodies.REACTION_S", 0.0)
     else:

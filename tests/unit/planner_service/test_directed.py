@@ -25,8 +25,9 @@ from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.routes import Route, RouteStatus
-from vehicle_agent.agent import Agent, AskRoutes, LocalMap
+from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.assignment import AskCosts
+from vehicle_agent.local_map import LocalMap
 from vehicle_agent.sensing.sensor import TruthSensor
 
 RES = 10.0

@@ -23,11 +23,12 @@ from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.routes import RouteBatch
-from vehicle_agent.agent import Agent, AskRoutes, LocalMap
+from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.assignment import UNSETTLED, AskCosts, Choice, choose
 from vehicle_agent.driving.places import Places
 from vehicle_agent.driving.vehicle import Vehicle
 from vehicle_agent.fleet import FleetReport
+from vehicle_agent.local_map import LocalMap
 from vehicle_agent.placement import spawn_cells
 from vehicle_agent.sensing.sensor import TruthSensor
 

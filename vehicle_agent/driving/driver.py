@@ -1,0 +1,97 @@
+"""Vehicles along the cells that were granted to them, for the time of a tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from itertools import pairwise
+
+from swarm.right_of_way.holdings import Holdings
+from vehicle_agent.driving.dynamics import PluginDynamics
+from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.local_map import LocalMap
+
+
+class Driver:
+    """Drives vehicles cell by cell, and stops them before what the map, or a body, closes.
+
+    passable  whether the step between two neighbours is allowed now
+    dynamics  how fast vehicles drive; as the ground allows if not given
+
+    entered   cells that vehicles have entered and not looked around from; the owner empties it
+    """
+
+    def __init__(
+        self,
+        local_map: LocalMap,
+        holdings: Holdings,
+        passable: Callable[[int, int], bool],
+        dynamics: PluginDynamics | None,
+    ) -> None:
+        self.entered: dict[int, None] = {}
+        self._map = local_map
+        self._holdings = holdings
+        self._passable = passable
+        self._dynamics = dynamics
+        self._left_s: dict[str, float] = {}
+
+    def begin(self, vehicles: Iterable[str], seconds: float) -> None:
+        """Give each of these so much time."""
+        self._left_s = dict.fromkeys(vehicles, seconds)
+        if self._dynamics is not None:
+            self._dynamics.begin(seconds)
+
+    def drive(self, vehicles: Mapping[str, Vehicle], stopped: Callable[[str], bool]) -> None:
+        """Let each drive until it comes to another cell, or its time is over.
+
+        stopped  whether a vehicle has to stand
+        """
+        for id in list(self._left_s):
+            vehicle = vehicles.get(id)
+            left_s = 0.0 if vehicle is None else self._drive(vehicle, self._left_s[id], stopped)
+            if left_s > 0.0:
+                self._left_s[id] = left_s
+            else:
+                del self._left_s[id]
+
+    def _drive(self, vehicle: Vehicle, left_s: float, stopped: Callable[[str], bool]) -> float:
+        """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
+        motion = vehicle.motion
+        physics = self._map.physics.reshape(-1)
+        while left_s > 0.0:
+            if motion.at_rest:
+                if stopped(vehicle.id):
+                    return 0.0
+                path = self._holdings.path(vehicle.id)
+                if len(path) < 2 or not self._passable(path[0], path[1]):
+                    return 0.0
+                motion.set_out(path[1])
+            before = vehicle.cell
+            pace_s_per_m = float(physics[motion.head])
+            if self._map.climb is not None:
+                pace_s_per_m *= self._map.climb.of_step(motion.tail, motion.head)
+            if self._dynamics is None:
+                left_s = motion.advance(left_s, pace_s_per_m)
+            else:
+                path = self._holdings.path(vehicle.id)
+                left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
+            if vehicle.cell != before:
+                self._holdings.moved(vehicle.id, vehicle.cell)
+                vehicle.route.moved(vehicle.cell)
+                self.entered[vehicle.cell] = None
+                # Even with no time left it has to look before it drives on.
+                return left_s
+        return 0.0
+
+    def end_path(self, vehicle: Vehicle) -> None:
+        """Give back what lies behind a step that the map does not allow any more."""
+        path = self._holdings.path(vehicle.id)
+        for index, (tail, head) in enumerate(pairwise(path), 1):
+            if not self._passable(tail, head):
+                if head == vehicle.motion.entering:
+                    vehicle.motion.turn_back()
+                self._holdings.give_back(vehicle.id, index)
+                return
+
+    def stop_soon(self, vehicle: Vehicle, keep: int = 1) -> None:
+        """Give back all but the first cells, and the one that it drives into."""
+        self._holdings.give_back(vehicle.id, max(keep, 1 if vehicle.motion.entering is None else 2))

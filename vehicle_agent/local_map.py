@@ -1,0 +1,45 @@
+"""The map of an agent, and which places a change of it concerns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared_map.terrain.step_climb import Climb
+from swarm.grid import GridSpec, Window
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalMap:
+    """The map of an agent: float32 (rows, cols) in s/m, inf is lethal. Their owners change them in place.
+
+    pace     cost of a cell, with marks and inflation
+    ground   as pace, before inflation
+    prior    as ground, without marks
+    physics  the pace at which vehicles really drive
+    climb    factor of a step's cost by its slope; None if steps cost the same both ways
+    """
+
+    grid: GridSpec
+    pace: NDArray[np.float32]
+    ground: NDArray[np.float32]
+    prior: NDArray[np.float32]
+    physics: NDArray[np.float32]
+    climb: Climb | None = None
+
+
+def meet(boxes: NDArray[np.int64], windows: Sequence[Window], margin: int) -> NDArray[np.bool_]:
+    """Which boxes lie within `margin` cells of any window.
+
+    boxes  int64 (n, 4): the smallest row and column of each, and the greatest
+    """
+    row0, col0, row1, col1 = boxes.T
+    met = np.zeros(len(boxes), np.bool_)
+    for window in windows:
+        rows = (row0 < window.row1 + margin) & (row1 >= window.row0 - margin)
+        met |= rows & (col0 < window.col1 + margin) & (col1 >= window.col0 - margin)
+    met &= row0 <= row1
+    return met
