@@ -131,7 +131,8 @@ class Vehicle:
 
     @property
     def _repeat_ns(self) -> int:
-        return int(self.lease_s * NS_PER_S / 4)
+        # An agent that has just begun listens for a second before it drives.
+        return min(int(self.lease_s * NS_PER_S / 4), NS_PER_S // 2)
 
     # --- right of way -------------------------------------------------------------------------------------------
 

@@ -258,7 +258,7 @@ BODY = Topic(
     "body", "body/{id}", Body,
     "where something is that vehicles must not drive into, though it speaks no right of way: an outside vehicle, "
     "a person; each counts, as two senders under one id must not hide each other",
-    "10 Hz while it moves, else before its lease ends",
+    "10 Hz while it moves, else once a second at least",
     access(put="rover:id targets", hear="agent rover targets monitor"), newest=False,
     priority=Priority.INTERACTIVE,
 )  # fmt: skip

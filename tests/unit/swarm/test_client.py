@@ -463,7 +463,7 @@ def test_an_observer_sees_vehicles_targets_marks_and_captures(world: Swarm) -> N
 
 def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> None:
     bodies, program = Bodies(world), Program(world)
-    rover = program.swarm.vehicle("rover", lease_s=40.0)
+    rover = program.swarm.vehicle("rover", lease_s=10.0)
     rover.at(5.0, -5.0)
     world.run(0.1)
     world.cut(program.bus)
