@@ -29,6 +29,8 @@ STANDS_NS = NS_PER_S
 """A body that has kept its place for so long is driven around, not waited for."""
 MOST_BODIES = 256
 MOST_RADIUS_M = 100.0
+MOST_M_PER_S = 340.0
+"""What drives quicker than sound is no vehicle, as of marks."""
 MOST_CELLS = 100_000
 """That all bodies together may close: bounds time and memory, and what liars can do."""
 _FURTHEST_CELLS = 64
@@ -175,6 +177,8 @@ class Bodies:
         """How many cells it may close until its lease ends, at most, and why it cannot be taken in."""
         if report.radius_m > MOST_RADIUS_M:
             return 0, f"its radius_m is {report.radius_m:g}, expected at most {MOST_RADIUS_M:g}"
+        if report.speed_m_per_s > MOST_M_PER_S:
+            return 0, f"its speed_m_per_s is {report.speed_m_per_s:g}, expected at most {MOST_M_PER_S:g}"
         window = self._capsule(report, report.speed_m_per_s * (REACTION_S + report.lease_s)).window(self._grid)
         if window.empty:
             grid, place = self._grid, f"x_m {report.x_m:g}, y_m {report.y_m:g}"
@@ -241,8 +245,8 @@ class Bodies:
 
     @property
     def is_deaf(self) -> bool:
-        """Whether there may be bodies of which nothing has been heard: the process has just begun, or let so much time
-        pass before its last tick that what came meanwhile may not have been read. Nobody drives then."""
+        """Whether there may be bodies of which nothing has been heard: the process has just begun, or let so much
+        time pass before its last tick that what came meanwhile may not have been read. Nobody drives then."""
         return self._ticked_ns is not None and self._ticked_ns < self._listens_ns
 
     def listen_anew(self, now_ns: int) -> None:

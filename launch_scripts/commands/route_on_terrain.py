@@ -18,7 +18,7 @@ from planner_service.route_finder import FoundRoute, RouteFinder
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.places import latitudes_of, middles_of, parse_place
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.config.scenario import PlannerConfig
+from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 from swarm.wire.routes import RouteStatus
@@ -81,15 +81,20 @@ def find_route(source: str, start: str, end: str) -> TerrainRoute:
     terrain = build_terrain(scenario)
     grid = terrain.grid
     first, last = parse_place(start, grid, "--from"), parse_place(end, grid, "--to")
-    rules = ("neighbours", "edge", "corner_cutting", "length_weight")
-    planner = {name: getattr(scenario.planner, name) for name in rules}
-    finder = RouteFinder(
-        terrain.pace_s_per_m, grid.row_col(last), resolution_m=grid.resolution_m, climb=terrain.climb, **planner
-    )
+    finder = finder_for(scenario, terrain, last)
     found = finder.route(*grid.row_col(first))
     if found.status is not RouteStatus.OK:
         raise TerrainError(_why_not(found.status, terrain, first, last))
     return _described(scenario.name, terrain, finder, found, scenario.planner)
+
+
+def finder_for(scenario: Scenario, terrain: Terrain, target: int) -> RouteFinder:
+    """Routes to a cell by the scenario's rules."""
+    names = ("neighbours", "edge", "corner_cutting", "length_weight")
+    rules = {name: getattr(scenario.planner, name) for name in names}
+    resolution_m, climb = terrain.grid.resolution_m, terrain.climb
+    target_cell = terrain.grid.row_col(target)
+    return RouteFinder(terrain.pace_s_per_m, target_cell, resolution_m=resolution_m, climb=climb, **rules)
 
 
 def _why_not(status: RouteStatus, terrain: Terrain, first: int, last: int) -> str:

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.commands.terrain_files import write_geotiff
 from launch_scripts.launcher.progress import progress
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass
@@ -185,32 +186,8 @@ def cost(
 
 def _write_cost(terrain: Terrain, path: Path, tell: Tell) -> None:
     pace = terrain.pace_s_per_m
-    _write(path, [np.where(np.isfinite(pace), pace, np.float32(-1))], terrain.grid, nodata=-1.0)
+    write_geotiff(path, [np.where(np.isfinite(pace), pace, np.float32(-1))], terrain.grid, nodata=-1.0)
     tell("writing", 1.0)
-
-
-def _write(path: Path, bands: list[Any], grid: GridSpec, **profile: Any) -> None:
-    """A tiled, compressed GeoTIFF with overviews (its tile pyramid). A terrain without a place gets none."""
-    import rasterio
-    from rasterio.enums import Resampling
-    from rasterio.errors import RasterioError
-    from rasterio.transform import from_origin
-
-    side = {"tiled": True, "blockxsize": 256, "blockysize": 256} if min(grid.rows, grid.cols) >= 256 else {}
-    size = {"height": grid.rows, "width": grid.cols, "count": len(bands), "dtype": bands[0].dtype}
-    crs = None if grid.crs == "local" else grid.crs
-    where = from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
-    try:
-        with rasterio.open(
-            path, "w", driver="GTiff", crs=crs, transform=where, compress="deflate", **side, **size, **profile
-        ) as file:
-            for number, band in enumerate(bands, 1):
-                file.write(band, number)
-            factors = [2**n for n in range(1, 8) if max(grid.rows, grid.cols) // 2**n >= 128]
-            if factors:
-                file.build_overviews(factors, Resampling.nearest)
-    except (RasterioError, OSError) as error:
-        raise TerrainError(f"cannot write {path}: {error}") from error
 
 
 def _draw(terrain: Terrain, path: Path, title: str) -> None:
@@ -267,12 +244,49 @@ def synth(
         except OSError as error:
             raise TerrainError(f"cannot write {out}: {error.strerror or error}") from error
     else:
-        _write(out, [terrain.elevation_m], grid)
+        write_geotiff(out, [terrain.elevation_m], grid)
     if photo is not None:
-        _write(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
+        write_geotiff(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
     if picture is not None:
         _draw(terrain, picture, f"synthetic, seed {seed}")
     console.print(f"{rows} x {cols} cells of {resolution_m:g} m, relief {relief_m:g} m, seed {seed}: {out}")
+
+
+@app.command()
+def reach(
+    terrain: Annotated[str, typer.Argument(help="A terrain file, a scenario file or a built-in scenario.")],
+    to: Annotated[str, typer.Option(help="Where to: LAT,LON, xy:X,Y in metres or cell:ROW,COL.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Write .tif (seconds, -1 where there is no way) or .geojson (areas).")
+    ] = None,
+    every_s: Annotated[
+        float, typer.Option(min=0.001, max=1e9, help="How far apart the areas of a .geojson are, in seconds.")
+    ] = 600.0,
+    as_json: AsJson = False,
+) -> None:
+    """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as GeoJSON.
+
+    swarm terrain reach dem.tif --to 46.78,9.87 --out seconds.tif
+    swarm terrain reach mine.toml --to cell:40,200 --out areas.geojson --every-s 300
+    """
+    from launch_scripts.commands.reach import reach as reach_of
+    from launch_scripts.commands.reach import write_reach
+
+    _check_target(out, "--out", *_TIFF, ".geojson")
+    found = reach_of(terrain, to)
+    if out is not None:
+        write_reach(found, out, every_s)
+    median_s, longest_s = found.quantiles_s()
+    if as_json:
+        facts = {"share": round(found.share, 4), "median_s": round(median_s, 2), "longest_s": round(longest_s, 2)}
+        console.print_json(json.dumps(facts))
+        return
+    console.print(
+        f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {longest_s:.0f} s from"
+        " the furthest",
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 @app.command()
@@ -321,7 +335,7 @@ def classify(
     if labels is not None:
         _compare(terrain, labels)
     if out is not None:
-        _write(out, [terrain.classes], terrain.grid)
+        write_geotiff(out, [terrain.classes], terrain.grid)
     if picture is not None:
         _draw(terrain, picture, f"{photo.name} on {elevation.name}")
     for note in terrain.notes:

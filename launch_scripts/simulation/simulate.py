@@ -220,7 +220,8 @@ class Simulation:
     def step_clock(self, name: str, by_s: float) -> None:
         """Sets the clock of a node's machine; the process that runs there has read it already."""
         self._note("clock", (name,))
-        self.nodes[name].skew_ns += int(by_s * NS_PER_S)
+        if name in self.nodes:  # the planner of a removed target is not there any more
+            self.nodes[name].skew_ns += int(by_s * NS_PER_S)
 
     def _plan_faults(self) -> None:
         plan = self.faults

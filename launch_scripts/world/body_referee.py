@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages.bodies import Body
-from vehicle_agent.bodies import MOST_BODIES, MOST_RADIUS_M, REACTION_S, capsule_of
+from vehicle_agent.bodies import MOST_BODIES, MOST_M_PER_S, MOST_RADIUS_M, REACTION_S, capsule_of
 
 IN_TIME_NS = NS_PER_S // 5
 """Two ticks of an agent: a cell that a body has closed for so long is closed to every vehicle."""
@@ -101,7 +101,7 @@ class BodyReferee:
             record = self._records[key] = _Record()
         elif body.seq <= record.seq and now_ns < record.until_ns:
             return
-        if body.radius_m > MOST_RADIUS_M:
+        if body.radius_m > MOST_RADIUS_M or body.speed_m_per_s > MOST_M_PER_S:
             return
         began_ns = min(now_ns, record.until_ns)
         fresh = now_ns < record.until_ns and body.lease_s > 0.0

@@ -14,6 +14,7 @@ from launch_scripts.world.walks import TrueTerrain
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import RoverConfig, Scenario, ids_of
 from swarm.wire.messages.bodies import Body
+from vehicle_agent.bodies import MOST_M_PER_S
 
 LEASE_S = 2.0
 TURN_S = 0.6
@@ -83,7 +84,7 @@ class Rovers:
         for rover in self.all:
             if time_scale > 0.0:
                 self._move(rover, min(passed_s, _LONGEST_TICK_S))
-            speed = rover.config.speed_m_per_s * self._time_scale if self._goes(rover) else 0.0
+            speed = self._speed(rover) if self._goes(rover) else 0.0
             state = (rover.x_m, rover.y_m, rover.heading_rad, speed)
             if state == rover.told and 0 <= now_ns - rover.told_ns < _TOLD_AGAIN_NS:
                 continue
@@ -106,6 +107,10 @@ class Rovers:
             )
         return said
 
+    def _speed(self, rover: Rover) -> float:
+        """By the wall clock; none is quicker than what vehicles believe."""
+        return min(rover.config.speed_m_per_s * self._time_scale, MOST_M_PER_S)
+
     def _goes(self, rover: Rover) -> bool:
         return rover.turns or rover.rests_s <= 0.0
 
@@ -116,7 +121,7 @@ class Rovers:
                 self._turn(rover)
             return
         rover.turns = False
-        far_m = rover.config.speed_m_per_s * self._time_scale * seconds
+        far_m = self._speed(rover) * seconds
         x_m, y_m = self._ahead(rover, far_m)
         if not self._free(rover, far_m):
             self._turn(rover)
@@ -131,7 +136,7 @@ class Rovers:
     def _turn(self, rover: Rover) -> None:
         """Turn to where the ground is free for a cell at least; stand for a while if there is none."""
         rover.rests_s, rover.turns = TURN_S, True
-        far_m = self._terrain.grid.resolution_m + rover.config.speed_m_per_s * self._time_scale * 0.2
+        far_m = self._terrain.grid.resolution_m + self._speed(rover) * 0.2
         for _ in range(_TRIES):
             rover.heading_rad = rover.chance.uniform(0.0, math.tau)
             if self._free(rover, far_m):

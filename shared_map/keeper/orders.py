@@ -6,11 +6,12 @@ import msgspec
 
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Asked, Bus, Event, Heard, Post, Replied
+from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agents import plan_agents
+from swarm.config.agents import agent_of, plan_agents
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
+from swarm.liveness import Peer
 from swarm.order_book import OrderBook, judged
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.orders import GiveOrder, Order, Orders
@@ -18,6 +19,7 @@ from swarm.wire.topics import GIVE_ORDER, ORDERS
 
 _TELL_NS = NS_PER_S
 _TAG = "orders"
+_MOST_ADDED = 4096
 
 
 class KeptOrders:
@@ -36,12 +38,15 @@ class KeptOrders:
         self._store = store
         self._bus = bus
         self._post = post
+        self._added: set[str] = set()
+        """Agents that have appeared and are not in the scenario: how many vehicles they have is theirs to know."""
         self._tell_due_ns = 0
         self._unsaved: list[Order] = []
         """Orders heard of another keeper that are not on our disk yet."""
 
     def start(self, now_ns: int) -> None:
         self.book.merge(self._store.orders(), now_ns)
+        self._bus.watch_alive(self._post, role="agent")
         self._bus.serve(GIVE_ORDER, self._post, keeper=self._id)
         self._bus.serve(ORDERS, self._post, role="keeper", id=self._id)
         self._bus.subscribe(ORDERS, self._post, role="keeper")
@@ -51,6 +56,12 @@ class KeptOrders:
     def handle(self, event: Event, now_ns: int) -> Order | str | bool:
         """Whether the event was about orders and is done with; if one was given, the order, or why not."""
         match event:
+            case Appeared(peer=Peer(role="agent", id=id)):
+                if len(self._added) < _MOST_ADDED and all(plan.id != id for plan in plan_agents(self._scenario)):
+                    self._added.add(id)
+                return True
+            case Disappeared(peer=Peer(role="agent")):
+                return True
             case Heard(message=Orders() as heard) | Replied(message=Orders() as heard):
                 self._unsaved += self.book.merge(heard.orders, now_ns)
                 return True
@@ -87,7 +98,9 @@ class KeptOrders:
 
     def _take(self, given: GiveOrder, now_ns: int) -> Order | str:
         given = self._placed(given)
-        vehicles = (id for plan in plan_agents(self._scenario) for id in plan.vehicle_ids)
+        vehicles = [id for plan in plan_agents(self._scenario) for id in plan.vehicle_ids]
+        if agent_of(given.name) in self._added:
+            vehicles.append(given.name)
         order = judged(given, self.book, self._scenario, vehicles, now_ns)
         if isinstance(order, str):
             return order

@@ -104,12 +104,12 @@ def test_a_person_gives_an_order_by_a_selector_and_reads_json(running: LiveSwarm
     with zenoh.open(config) as session:
 
         def get(selector: str) -> list[Any]:
-            replies = session.get(f"swarm/{selector}&format=json", timeout=5.0)
+            replies = session.get(f"swarm/{selector};format=json", timeout=5.0)
             return [json.loads(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
 
         (paused,) = get("order/0/give?subject=pause")
         assert paused["given"]["subject"] == "pause"
-        (resumed,) = get("order/0/give?subject=pause&off=true")
+        (resumed,) = get("order/0/give?subject=pause;off=true")
         assert resumed["given"]["off"] is True
         (zones,) = get("order/0/zones?action=list")
         assert zones["zones"] == []

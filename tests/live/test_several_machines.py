@@ -10,15 +10,20 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from support.client_rig import run_info as client_run_info
 from support.live_swarm import Hands, swarm
 from support.processes import eventually
 
 from launch_scripts.launcher.options import as_process, free_ports, tls_of
-from swarm.bus.bus import Event, Heard
+from swarm.bus.bus import Asked, Event, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.client import BusError, connect
 from swarm.config.load import load_scenario
+from swarm.grid import GridSpec
+from swarm.wire.messages.planning import RouteReply
 from swarm.wire.messages.processes import Stats
-from swarm.wire.topics import STATS
+from swarm.wire.routes import Route, RouteBatch, RouteStatus
+from swarm.wire.topics import BODY, MARKS, ROUTE, RUN, STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -121,3 +126,49 @@ def test_a_name_that_is_revoked_is_denied_while_the_router_runs_and_its_successo
             assert says(successor, "a1")
             assert not says(stolen, "a1")
     assert "line 1: 'no name' is no name in a certificate" in hands.logs()
+
+
+def test_a_rover_with_a_certificate_reports_marks_and_asks_under_its_own_name_only(hands: Hands) -> None:
+    hands.path.write_text(hands.path.read_text().replace("[network]", '[network]\nadmit = ["rover.all.r1"]'))
+    certs = issue(hands)
+    endpoint = f"tls/localhost:{free_ports(1)[0]}"
+    hands.start("router", str(hands.path), "--listen", endpoint, *tls(certs))
+    eventually(lambda: swarm("status", "--connect", endpoint, *tls(certs)).returncode == 0, 30, "the router")
+    run = msgspec.structs.replace(client_run_info(GridSpec(96, 128, 30.0)), now_ns=time.time_ns())
+    heard: list[str] = []
+
+    def tell(event: Event) -> None:
+        if isinstance(event, Heard):
+            heard.append("/".join((event.topic.name, event.fields.get("id") or event.fields["author"])))
+
+    def answer(event: Event) -> None:
+        assert isinstance(event, Asked)
+        route = Route(status=RouteStatus.OK, start=0, directions=b"\2", cost_s=3.0, lower_bound_s=3.0)
+        reply = RouteReply(
+            target="t0", incarnation=1, target_cell=1, map_version=0, tree_age_ms=0.0, rows=96, cols=128,
+            routes=RouteBatch.of([route]).columns(),
+        )  # fmt: skip
+        event.answer(run if event.topic is RUN else reply)
+        event.end()
+
+    with (
+        opened(hands, "keeper", "0", certs, endpoint) as keeper,
+        opened(hands, "planner", "t0", certs, endpoint) as planner,
+        opened(hands, "agent", "a0", certs, endpoint) as agent,
+    ):
+        keeper.serve(RUN, answer, role="keeper", id="0")
+        keeper.subscribe(MARKS, tell)
+        planner.serve(ROUTE, answer, target="t0")
+        agent.subscribe(BODY, tell)
+        files = [str(certs / name) for name in ("ca.pem", "rover.all.r1.pem", "rover.all.r1.key")]
+        with connect(endpoint, ca=files[0], certificate=files[1], key=files[2]) as program:
+            other, rover = program.vehicle("r2"), program.vehicle("r1")
+            for vehicle in (other, rover):
+                vehicle.at(15.0, -15.0)
+                vehicle.mark([5], lethal=True)
+            assert rover.route("t0").cost_s == 3.0
+            marks = f"marks/all.r1.{rover.incarnation:x}"
+            eventually(lambda: {"body/r1", marks} <= set(heard), 5, "what is its own")
+            with pytest.raises(BusError, match="no route to 't1'"):
+                rover.route("t1", timeout_s=0.5)
+        assert set(heard) == {"body/r1", marks}, "and nothing of r2"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -24,20 +25,30 @@ walk = "external"
 caught = "stay"
 """
 OUTSIDE = Path(__file__).parents[1] / "support" / "outside_tracker.py"
+PAGE = Path(__file__).parents[2] / "docs" / "operate" / "trackers.md"
 
 
 class Outside:
     """The processes that are not ours."""
 
-    def __init__(self, live: LiveSwarm) -> None:
+    def __init__(self, live: LiveSwarm, page: Path) -> None:
+        """page  where the script of the documentation is written"""
         self._live = live
+        self._page = page
+        (script,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+        page.write_text(script)
         self.started: list[subprocess.Popen[bytes]] = []
 
     def start(self, tracker: str, row: int, col: int) -> subprocess.Popen[bytes]:
-        side_m = 30.0  # as the scenario says; its corner in the north-west is 0, 0
-        place = ((col + 0.5) * side_m, -(row + 0.5) * side_m)
-        command = [sys.executable, OUTSIDE, self._live.endpoint, schema_of("pose"), "x", tracker, *place]
-        process = subprocess.Popen(list(map(str, command)), cwd="/")
+        schema = schema_of("pose")
+        return self._start(OUTSIDE, self._live.endpoint, schema, "x", tracker, *_place_m(row, col))
+
+    def start_page(self, tracker: str, row: int, col: int) -> subprocess.Popen[bytes]:
+        """The program in the documentation, which has nothing of ours either and puts JSON."""
+        return self._start(self._page, self._live.endpoint, "x", tracker, *_place_m(row, col))
+
+    def _start(self, *command: object) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen([sys.executable, *map(str, command)], cwd="/")
         self.started.append(process)
         return process
 
@@ -51,6 +62,11 @@ def live(tmp_path: Path) -> Iterator[LiveSwarm]:
         running.kill()
 
 
+def _place_m(row: int, col: int) -> tuple[float, float]:
+    side_m = 30.0  # as the scenario says; its corner in the north-west is 0, 0
+    return (col + 0.5) * side_m, -(row + 0.5) * side_m
+
+
 def status_of_x(live: LiveSwarm) -> dict[str, Any]:
     told = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)
     return next(dict(each) for each in told["planners"] if each["target"] == "x")
@@ -62,9 +78,11 @@ def route_to_x(live: LiveSwarm, *options: str) -> str:
     ).stdout
 
 
-def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_over(live: LiveSwarm) -> None:
+def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_over(
+    live: LiveSwarm, tmp_path: Path
+) -> None:
     live.wait_until_up()
-    outside = Outside(live)
+    outside = Outside(live, tmp_path / "page.py")
     try:
         assert "no_target" in route_to_x(live)
         assert status_of_x(live)["pose_age_s"] is None
@@ -74,7 +92,7 @@ def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_ove
         assert reply["target_cell"] == 50 * 128 + 60
         assert reply["pose_age_s"] < 2
         assert not reply["tracker_lost"]
-        second = outside.start("camera", 20, 90)
+        second = outside.start_page("camera", 20, 90)
         eventually(lambda: live.said("poses of tracker camera are refused, as tracker radar owns it"), 20, "a note")
         assert status_of_x(live)["target_cell"] == 50 * 128 + 60
         first.kill()

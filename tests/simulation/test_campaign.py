@@ -71,7 +71,7 @@ def test_each_law_has_its_sentence():
 
 
 def test_the_command_prints_figures_and_the_failing_seeds(capsys, monkeypatch):
-    assert simulate_seeds("small", "3:4", 4, 1, as_json=True)
+    assert simulate_seeds("small", "3:4", 8, 1, as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert printed["seeds"] == 1
     assert printed["failing"] == []

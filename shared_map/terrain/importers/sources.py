@@ -5,14 +5,15 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.arrays import Bools, Floats
+from shared_map.terrain.importers.ground_cover import classified, with_photo, with_water, without_voids
 from shared_map.terrain.importers.raster_kinds import is_raster
+from shared_map.terrain.importers.source import Source as Source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.input_files import FileKind, check_bytes
@@ -23,28 +24,6 @@ from swarm.grid import MAX_CELLS, GridSpec
 JACKSBORO_RESOLUTION_M = 75.0
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
 SYNTHETIC_RESOLUTION_M = 30.0
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """Everything known about the ground on one grid.
-
-    elevation_m  float32 (rows, cols), m; NaN is a void
-    classes      uint8 (rows, cols), TerrainClass
-    photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
-    factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
-    level        bool (rows, cols), level ground as the file has it, before any resampling; None if nobody looked
-    notes        where it comes from and what was done to it, for people
-    """
-
-    grid: GridSpec
-    elevation_m: Floats
-    classes: Bytes
-    photo: Bytes | None = None
-    seen: Bools | None = None
-    factor: Floats | None = None
-    level: Bools | None = None
-    notes: tuple[str, ...] = ()
 
 
 def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progress) -> Source:
@@ -80,14 +59,14 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
         source = _jacksboro(config, seed)
     else:
         source = _from_file(Path(config.source), config, progress)
-    source = _without_voids(source, config)
+    source = without_voids(source, config)
     if config.photo is not None:
-        source = _with_photo(source, Path(config.photo), config, progress)
+        source = with_photo(source, Path(config.photo), config, progress)
     if source.photo is not None:
-        source = _classified(source, config, seed, progress)
+        source = classified(source, config, seed, progress)
     elif config.labels is not None:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
-    return _with_water(source, config)
+    return with_water(source, config)
 
 
 # --- built in -----------------------------------------------------------------------------------------------
@@ -349,70 +328,3 @@ def _from_metres(
         return heights, grid, f"{rows} x {cols} cells of {resolution_m:g} m"
     note = f"resampled from {step[1]:.1f} x {step[0]:.1f} m to {resolution_m:g} m"
     return resample(heights, rows, cols, row_step, col_step), grid, note
-
-
-def _without_voids(source: Source, config: TerrainConfig) -> Source:
-    """Voids counted, and filled if asked for; nothing is done in silence."""
-    from shared_map.terrain.importers.voids import fill_voids, voids_of
-
-    elevation_m = source.elevation_m
-    if not elevation_m.flags.writeable:
-        elevation_m = elevation_m.copy()
-    count = voids_of(elevation_m)
-    if count == 0:
-        return replace(source, elevation_m=elevation_m)
-    share = count / elevation_m.size
-    if share == 1.0:
-        raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")
-    if config.nodata == "fill":
-        note = f"{count} voids ({share:.1%}) filled from their surroundings"
-        return replace(source, elevation_m=fill_voids(elevation_m), notes=(*source.notes, note))
-    hint = "; crop the file, or set terrain.nodata = 'fill'" if share > 0.05 else ""
-    note = f"{count} voids ({share:.1%} of the cells) are lethal{hint}"
-    return replace(source, elevation_m=elevation_m, notes=(*source.notes, note))
-
-
-def _with_water(source: Source, config: TerrainConfig) -> Source:
-    """What is level in the file, or lower than the scenario says, is water where nothing else shows what it is."""
-    water = np.zeros(source.classes.shape, np.bool_)
-    if source.level is not None and config.level_is == "water":
-        water |= source.level
-    notes = source.notes
-    if config.water_below_m is not None:
-        with np.errstate(invalid="ignore"):
-            low = source.elevation_m < np.float32(config.water_below_m)
-        water |= low
-        notes = (*notes, f"{low.mean():.1%} of the cells are lower than {config.water_below_m:g} m: water")
-    classes = source.classes.copy()
-    classes[water & (classes == TerrainClass.UNKNOWN)] = TerrainClass.WATER
-    return replace(source, classes=classes, notes=notes)
-
-
-def _with_photo(source: Source, path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.terrain.importers.photos import read_photo
-
-    photo = read_photo(path, source.grid, config.crs, progress)
-    return replace(source, photo=photo.rgb, seen=photo.seen, notes=(*source.notes, str(path), *photo.notes))
-
-
-def _classified(source: Source, config: TerrainConfig, seed: int, progress: Progress) -> Source:
-    from shared_map.terrain.importers.classify import by_rules, learnt
-    from shared_map.terrain.importers.true_colour import why_not_true_colour
-
-    assert source.photo is not None
-    inputs = (source.photo, source.elevation_m, source.grid.resolution_m)
-    seen = np.ones(source.classes.shape, np.bool_) if source.seen is None else source.seen
-    other = why_not_true_colour(source.photo, seen)
-    if config.labels is None and other is not None:
-        note = f"the photo is {other}; no classes are read from it: give a true-colour one, or terrain.labels"
-        return replace(source, notes=(*source.notes, note))
-    if config.labels is None:
-        classes = by_rules(*inputs, source.seen, progress)
-        note = "classes from the photo, by rules"
-    else:
-        from shared_map.terrain.importers.labels import read_labels
-
-        labels = read_labels(Path(config.labels), source.grid)
-        classes = learnt(*inputs, labels.classes, source.seen, seed, progress)
-        note = f"classes from the photo, learnt from {labels.count} labels"
-    return replace(source, classes=classes, notes=(*source.notes, note))

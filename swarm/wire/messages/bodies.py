@@ -10,7 +10,7 @@ from msgspec import Meta
 from swarm.wire.fields import Distance, Id, Incarnation, Metres, Natural, StampNs, VehicleId
 from swarm.wire.messages.base import Message, schema_of
 
-LONGEST_LEASE_S = 60.0
+LONGEST_LEASE_S = 10.0
 Heading = Annotated[float, Meta(ge=-2 * math.tau, le=2 * math.tau)]
 Speed = Annotated[float, Meta(ge=0, le=1e6)]
 

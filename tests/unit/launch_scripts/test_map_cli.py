@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -40,7 +41,7 @@ def test_a_map_comes_out_of_json_as_it_went_in(sets: list[MarkSet]) -> None:
     assert (terrain, grid) == ("t", GRID)
 
     def bare(each: MarkSet) -> MarkSet:  # a pace means something in a PACE mark only
-        return set_of(
+        plain = set_of(
             each.author,
             each.tile,
             each.seq // SEQ_STEP,
@@ -56,6 +57,7 @@ def test_a_map_comes_out_of_json_as_it_went_in(sets: list[MarkSet]) -> None:
             },
             epoch=each.epoch,
         )
+        return msgspec.structs.replace(plain, group=each.group)
 
     assert read == [bare(each) for each in sorted(sets, key=lambda each: (each.tile, each.author))]
 

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.query import app
 from launch_scripts.commands.route_on_terrain import find_route, profile_of
+from launch_scripts.commands.terrain import app as terrain_app
 from shared_map.terrain.places import latitudes_of, middles_of, parse_place
 from swarm.errors import ConfigError, SwarmError
 from swarm.grid import GridSpec
@@ -120,3 +121,27 @@ def test_what_cannot_be_is_said_in_a_sentence(hill: Path, tmp_path: Path) -> Non
         result = CliRunner().invoke(app, ["route", *words])
         assert isinstance(result.exception, SwarmError)
         assert complaint in str(result.exception)
+
+
+def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(hill: Path, tmp_path: Path) -> None:
+    words = [str(hill), "--to", "cell:10,75", "--out"]
+    said = (
+        CliRunner().invoke(terrain_app, ["reach", *words, str(tmp_path / "s.tif")], catch_exceptions=False).output
+    )
+    assert "from 8" in said or "from 9" in said
+    with rasterio.open(tmp_path / "s.tif") as file:
+        seconds = file.read(1)
+        assert (file.crs.to_string(), file.nodata, file.shape) == (SYSTEM, -1.0, (60, 80))
+    assert seconds[10, 5] == pytest.approx(find_route(str(hill), "cell:10,5", "cell:10,75").found.cost_s, rel=1e-5)
+    assert seconds[10, 35] == -1
+    assert seconds[10, 75] == 0
+    areas = [*words, str(tmp_path / "a.geojson"), "--every-s", "60", "--json"]
+    CliRunner().invoke(terrain_app, ["reach", *areas], catch_exceptions=False)
+    features = json.loads((tmp_path / "a.geojson").read_text())["features"]
+    assert max(each["properties"]["to_s"] for each in features) >= seconds.max()
+    lon, lat = features[0]["geometry"]["coordinates"][0][0]
+    assert (lat, lon) == pytest.approx((46.95, 9.0), abs=0.05)
+    with pytest.raises(SwarmError, match="areas, at most 200"):
+        CliRunner().invoke(terrain_app, ["reach", *areas[:-2], "0.001"], catch_exceptions=False)
+    with pytest.raises(SwarmError, match="--to is on lethal ground"):
+        CliRunner().invoke(terrain_app, ["reach", str(hill), "--to", "cell:10,35"], catch_exceptions=False)

@@ -86,6 +86,7 @@ def test_a_body_that_says_that_it_leaves_opens_its_cells_at_once(bodies: Bodies)
     [
         ({"x_m": -500.0}, "outside the grid, whose west is 0 and north 0"),
         ({"y_m": 9e8}, "outside the grid"),
+        ({"speed_m_per_s": 1e6}, "its speed_m_per_s is 1e+06, expected at most 340"),
         ({"radius_m": 1000.0}, "its radius_m is 1000, expected at most 100"),
     ],
 )
@@ -224,7 +225,7 @@ def test_where_there_is_no_way_around_it_is_seldom_looked_for(bodies: Bodies) ->
     pace = np.full((40, 40), 0.1, np.float32)
     pace[:, 20] = np.inf
     pace[20, 20] = 0.1
-    standing(bodies, body(20.5, 20.5, radius_m=2.0, lease_s=60.0))
+    standing(bodies, body(20.5, 20.5, radius_m=2.0, lease_s=9.0))
     vehicle, detours = drive_around(bodies, pace)
     assert detours.found == 0
     assert vehicle.route.left == 29

@@ -1,0 +1,30 @@
+"""What a terrain is built from, whatever file or generator it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from shared_map.arrays import Bools, Bytes, Floats
+from swarm.grid import GridSpec
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Everything known about the ground on one grid.
+
+    elevation_m  float32 (rows, cols), m; NaN is a void
+    classes      uint8 (rows, cols), TerrainClass
+    photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
+    factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
+    level        bool (rows, cols), level ground as the file has it, before any resampling; None if nobody looked
+    notes        where it comes from and what was done to it, for people
+    """
+
+    grid: GridSpec
+    elevation_m: Floats
+    classes: Bytes
+    photo: Bytes | None = None
+    seen: Bools | None = None
+    factor: Floats | None = None
+    level: Bools | None = None
+    notes: tuple[str, ...] = ()
