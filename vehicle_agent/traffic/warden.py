@@ -138,7 +138,7 @@ class Warden:
         for vehicle in self._granted_to(host):
             self._free(vehicle, holds.get(vehicle, []), standing.knows)
         known.standing, known.heard_ns = standing, now_ns
-        # Only now: a life that is itself replaced, and has not stopped, opens no cells on which a vehicle stands.
+        # Only now: a life that is itself replaced and has not stopped must not open what a vehicle may stand on.
         self._enter_again(standing, self._open(standing))
         if standing.life in standing.dead:
             self._shut[host, standing.life] = []  # nobody drives by it: its successor need not wait
