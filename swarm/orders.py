@@ -20,7 +20,7 @@ from swarm.wire.topics import GIVE_ORDER, OBEYED, RUN, ZONES, Topic
 
 _OBEY_ZONES = frozenset({"agent", "planner"})
 _OBEY_ORDERS = frozenset({"agent", "planner", "targets"})
-_FIND_S = 1.0
+_FIND_S = 3.0
 _ORDER_S = 5.0
 _OBEY_S = 3.0
 
