@@ -17,11 +17,13 @@ from swarm.client.target import Target
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, RunMismatchError
+from swarm.wire.fields import check_id
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.messages.targets import POSE_LEASE_S
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
+    from swarm.right_of_way.guest_session import GuestSession
     from swarm.runtime.inbox import Inbox
 
 _ASK_S = 1.0
@@ -38,11 +40,16 @@ class Swarm:
     """
 
     def __init__(
-        self, session: Session, stop: Callable[[], None] = lambda: None, open_way: Callable[[], Bus] | None = None
+        self,
+        session: Session,
+        stop: Callable[[], None] = lambda: None,
+        open_trusted: Callable[[], Bus] | None = None,
     ) -> None:
         self._session = session
         self._stop = stop
-        self._opens = open_way
+        self._open_trusted = open_trusted or (lambda: session.bus)
+        """Opens a bus whose words count in right of way."""
+        self._guests: list[GuestSession] = []
 
     def __enter__(self) -> Swarm:
         return self
@@ -81,7 +88,7 @@ class Swarm:
         group: str = "all",
         radius_m: float = 1.0,
         lease_s: float = 2.0,
-        right_of_way: str | Path | None = None,
+        right_of_way: bool | str | Path = False,
     ) -> Vehicle:
         """A vehicle that is not the swarm's own. It exists for others from the first `Vehicle.at` on.
 
@@ -89,18 +96,38 @@ class Swarm:
         group     whose it is
         radius_m  around its place, which others keep clear
         lease_s   others avoid its last place for so long after they hear nothing more
-        right_of_way  a file of this vehicle's own, the same at each start: it may reserve cells, which nobody else
-                      enters then. Needs the user of the swarm, or with certificates the name `rover.GROUP.ID`
+        right_of_way  it may reserve cells, which nobody else enters then (`Vehicle.reserve`). Needs the user of the
+                      swarm, or with certificates the name `rover.GROUP.ID`. What its next life needs is kept in the
+                      file of this path; if True, in one of this user's own for each run and id
         """
-        way = (
-            None if right_of_way is None else RightOfWay(self._open_way(), id, self.frame.grid, Path(right_of_way))
-        )
+        vehicle = Vehicle(self._session, id, group, radius_m, lease_s)
+        if right_of_way:
+            file = None if right_of_way is True else Path(right_of_way)
+            try:
+                vehicle.give_way(RightOfWay(self._guest(id, file)))
+            except BaseException:
+                vehicle.leave()
+                raise
+        return vehicle
+
+    def _guest(self, id: str, file: Path | None) -> GuestSession:
+        """Raises ConfigError if the id is none, StoreError if another program has the file."""
+        from swarm.right_of_way.guest_session import GuestSession
+        from swarm.right_of_way.life_file import LifeFile
+        from swarm.runtime.run_secret import state_folder
+
         try:
-            return Vehicle(self._session, id, group, radius_m, lease_s, way)
+            check_id("id", id)
+        except ValueError as error:
+            raise self._session.refused(str(error)) from error
+        lives = LifeFile(file or state_folder() / "vehicles" / self.run_id / id)
+        try:
+            guest = GuestSession(id, self.frame.grid, self._open_trusted(), lives)
         except BaseException:
-            if way is not None:
-                way.close()
+            lives.close()
             raise
+        self._guests.append(guest)
+        return guest
 
     def target(self, id: str, *, tracker: str | None = None, lease_s: float = POSE_LEASE_S) -> Target:
         """A target of the scenario that this program tracks: its walk there is `external`.
@@ -124,13 +151,10 @@ class Swarm:
         ids, a planner does not answer. Each is told once a minute, logged, and counted in `counts`."""
         self._session.on_problem(callback)
 
-    def _open_way(self) -> Bus:
-        if self._opens is None:
-            raise ConfigError("this connection cannot give right of way")
-        return self._opens()
-
     def close(self) -> None:
         """Take away all vehicles and targets of this program, and leave. May be repeated."""
+        for guest in self._guests:
+            guest.close()
         self._stop()
         self._session.close()
 
@@ -188,10 +212,10 @@ def connect(
         thread.end()
         inbox.close()
 
-    def open_way() -> Bus:
+    def open_trusted() -> Bus:
         return open_bus(network, authenticator=authenticator_of(network, session.run.run_id))
 
-    return Swarm(session, stop, open_way)
+    return Swarm(session, stop, open_trusted)
 
 
 def _run(bus: Bus, inbox: Inbox, until_s: float, where: str, clock: Clock) -> tuple[RunInfo, int]:

@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from swarm.bus.bus import Bus
-from swarm.grid import GridSpec
-from swarm.right_of_way.guest_session import GuestSession
-from swarm.right_of_way.life_file import LifeFile
+if TYPE_CHECKING:
+    from swarm.right_of_way.guest_session import GuestSession
 
 _ENTER_S = 5.0
 
 
 class RightOfWay:
-    """A `GuestSession` that enters where the vehicle says first that it stands, on a bus of its own.
+    """A guest that enters where its vehicle says first that it stands, and leaves what the vehicle has left."""
 
-    file  the vehicle's own, by which a later start proves that this one has ended
-    """
-
-    def __init__(self, bus: Bus, id: str, grid: GridSpec, file: Path) -> None:
-        self._bus = bus
-        try:
-            self._file = LifeFile(file)
-            self._session = GuestSession(id, grid, bus, self._file)
-        except BaseException:
-            bus.close()
-            raise
+    def __init__(self, guest: GuestSession) -> None:
+        self._guest = guest
         self._entered = False
 
     def stands(self, cell: int) -> bool:
@@ -34,28 +23,24 @@ class RightOfWay:
         asked for, and it may be that somebody else is there."""
         if not self._entered:
             self._entered = True
-            return self._session.enter(cell, _ENTER_S)
-        held = self._session.cells
+            return self._guest.enter(cell, _ENTER_S)
+        held = self._guest.cells
         if cell not in held:
             return False
         for behind in held[: held.index(cell)]:
-            self._session.left(behind)
+            self._guest.left(behind)
         return True
 
     def reserve(self, path: Sequence[int], timeout_s: float) -> list[int]:
         """The cells after the first that may be entered. Raises ValueError on a path that leaps."""
-        self._session.want(path)
+        self._guest.want(path)
         if len(path) > 1:
-            self._session.may_enter(path[1], timeout_s)
-        return list(self._session.cells[1:])
+            self._guest.may_enter(path[1], timeout_s)
+        return list(self._guest.cells[1:])
 
     def may_enter(self, cell: int, timeout_s: float) -> bool:
-        return self._session.may_enter(cell, timeout_s)
+        return self._guest.may_enter(cell, timeout_s)
 
     def close(self) -> None:
         """Leave the map, where that is still possible."""
-        try:
-            self._session.close()
-        finally:
-            self._file.close()
-            self._bus.close()
+        self._guest.close()

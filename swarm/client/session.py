@@ -88,6 +88,9 @@ class Session:
     def add(self, part: Part) -> None:
         with self.lock:
             self.check_open()
+            id = getattr(part, "id", None)
+            if id is not None and any(type(each) is type(part) and each.id == id for each in self._parts):  # type: ignore[attr-defined]
+                raise self.refused(f"{type(part).__name__.lower()} {id} is in use in this program already")
             self._parts.append(part)
 
     def remove(self, part: Part) -> None:

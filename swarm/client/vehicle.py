@@ -43,9 +43,7 @@ class Vehicle:
     incarnation  when it joined, in ns: tells it from an earlier life under the same id
     """
 
-    def __init__(
-        self, session: Session, id: str, group: str, radius_m: float, lease_s: float, way: RightOfWay | None = None
-    ) -> None:
+    def __init__(self, session: Session, id: str, group: str, radius_m: float, lease_s: float) -> None:
         for name, value in (("id", id), ("group", group)):
             try:
                 check_id(name, value)
@@ -75,7 +73,7 @@ class Vehicle:
         self._on_route: list[Callable[[Route], None]] = []
         self._marks = OwnMarks(f"{group}.{id}.{self.incarnation:x}", group, session.frame.grid)
         self._digest_due_ns = 0
-        self._way = way
+        self._way: RightOfWay | None = None
         session.add(self)
         session.bus.subscribe(BODY, session.post, id=id)
 
@@ -137,6 +135,10 @@ class Vehicle:
 
     # --- right of way -------------------------------------------------------------------------------------------
 
+    def give_way(self, way: RightOfWay) -> None:
+        """Let it reserve cells from now on. Called once, before the first `at`."""
+        self._way = way
+
     def reserve(self, cells: Sequence[int], timeout_s: float = 0.0) -> list[int]:
         """Say into which cells the vehicle would drive next, in driving order, such as the next ones of a route,
         and wait until it may enter the first. Returns those that it may enter now: nobody else does, before the
@@ -159,7 +161,7 @@ class Vehicle:
     def _has_way(self) -> RightOfWay:
         if self._way is None:
             raise ConfigError(
-                f"vehicle {self.id} has no right of way: make it with swarm.vehicle({self.id!r}, right_of_way=FILE)"
+                f"vehicle {self.id} has no right of way: make it with swarm.vehicle({self.id!r}, right_of_way=True)"
             )
         return self._way
 

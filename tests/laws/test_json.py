@@ -40,7 +40,9 @@ def as_dict(message: Message) -> dict[str, Any]:
     return fields
 
 
-@pytest.mark.parametrize("kind", {*PUT, *ASKED}, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize(
+    "kind", sorted({*PUT, *ASKED}, key=lambda kind: kind.__name__), ids=lambda kind: kind.__name__
+)
 def test_what_is_shown_as_json_says_the_same_when_it_is_put(kind):
     """Of what is put or asked; answers of planners, which nobody else gives, are shown in more detail. Inf and the
     absence of a value are both null, so what is shown is compared."""

@@ -146,8 +146,8 @@ def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell
     problems: list[str] = []
     swarm.on_problem(problems.append)
     with swarm.vehicle("guest", radius_m=3.0, right_of_way=file) as guest:
-        with pytest.raises(SwarmError, match="in use"):
-            swarm.vehicle("guest", right_of_way=file)
+        with connect(live.endpoint) as again, pytest.raises(SwarmError, match="in use"):
+            again.vehicle("guest", right_of_way=file)
         guest.at(*swarm.frame.centre_m(swarm.frame.grid.cell(40, 60)))
         cells = list(guest.route("t0").cells)
         for here, there in pairwise(cells[:12]):

@@ -114,6 +114,16 @@ def test_a_vehicle_that_cannot_be_is_refused_in_a_sentence(world: Swarm, wrong: 
     assert program.swarm.counts["refused"] == 1
 
 
+def test_one_program_has_each_vehicle_and_target_once_at_a_time(world: Swarm) -> None:
+    program = Program(world)
+    for make in (program.swarm.vehicle, program.swarm.target):
+        first: Any = make("one")
+        with pytest.raises(ConfigError, match="one is in use in this program already"):
+            make("one")
+        first.leave()
+        make("one")
+
+
 def test_wrong_headings_and_speeds_are_refused_by_the_rules_of_the_wire(world: Swarm) -> None:
     rover = Program(world).swarm.vehicle("rover")
     for wrong in ({"heading_rad": 99.0}, {"speed_m_per_s": -1.0}, {"speed_m_per_s": math.nan}):
