@@ -15,7 +15,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.plugin_modules import forgotten_afterwards
 
@@ -265,6 +265,7 @@ def test_on_another_thread_a_call_is_made_without_an_alarm() -> None:
     assert found == [3]
 
 
+@settings(deadline=None)
 @given(st.from_regex(r"[\w.+:-]{0,20}", fullmatch=True))
 def test_whatever_a_scenario_names_is_found_or_refused_in_one_sentence(name: str) -> None:
     if name in PLUGIN_KINDS["sensor"].built_in:

@@ -8,7 +8,7 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarm.config.agents import plan_agents
@@ -246,6 +246,7 @@ def test_no_way_is_certain_only_when_all_live_planners_have_said_so() -> None:
 # --- where they start ---------------------------------------------------------------------------------------
 
 
+@settings(deadline=None)  # the first one imports scipy
 @given(st.integers(0, 1000), st.sampled_from(["spread", "cluster"]), st.integers(0, 25))
 def test_all_vehicles_start_on_different_passable_cells_of_one_part(seed: int, start: str, walls: int) -> None:
     chance = random.Random(seed)

@@ -7,7 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
@@ -98,6 +98,7 @@ def test_a_plugin_is_told_how_far_its_vehicle_may_drive_and_how_it_turns() -> No
 speeds = st.one_of(st.floats(), st.integers(), st.none(), st.booleans(), st.text(max_size=3))
 
 
+@settings(deadline=None)
 @given(st.lists(speeds, min_size=1, max_size=40), st.integers(1, 6))
 def test_whatever_is_said_no_vehicle_is_faster_than_the_ground_or_leaves_its_path(
     said: list[Any], granted: int
