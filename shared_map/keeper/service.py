@@ -23,7 +23,7 @@ from swarm.errors import StoreError
 from swarm.order_book import described
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.marks import Digest, MarkSet
+from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.orders import Order, ZoneOrder, Zones
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.topics import SIGHTED, ZONES
@@ -70,6 +70,7 @@ class KeeperService:
             serves_all=True,
             committed=self._keeper.committed.held,
             on_accepted=self._accepted,
+            on_digest=lambda author, now_ns: self._plan.heard(author, now_ns),
         )
         config = setup.scenario.map
         self._compact_after_ns = int(config.compact_after_s * NS_PER_S)
@@ -111,8 +112,6 @@ class KeeperService:
             elif isinstance(ordered, str):
                 self.counters.count("orders_refused")
             return
-        if isinstance(event, Heard) and isinstance(event.message, Digest):
-            self._plan.heard(event.message.author, now_ns)
         if not self._member.handle(event):
             self._sync.handle(event, now_ns)
 

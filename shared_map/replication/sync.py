@@ -57,6 +57,7 @@ class MapSync:
     serves_all   answer for all authors
     committed    what whole digests tell; default: the replica's own sets
     on_accepted  called with every set that is merged
+    on_digest    called with the author of every digest that is heard, and when
     near         hold only regions that `enter` names, instead of the whole map
     at_ticks     merge what others put at the next tick, all at once: for a service that uses the map at ticks only
     joined       the late join is over: an answer came, or every try failed
@@ -74,6 +75,7 @@ class MapSync:
         serves_all: bool = False,
         committed: Callable[[], dict[str, bytes]] | None = None,
         on_accepted: Callable[[MarkSet], None] = lambda mark_set: None,
+        on_digest: Callable[[str, int], None] = lambda author, now_ns: None,
         near: bool = False,
         at_ticks: bool = False,
     ) -> None:
@@ -86,6 +88,7 @@ class MapSync:
         self._serves_all = serves_all
         self._committed = committed or replica.own_digest
         self._on_accepted = on_accepted
+        self._on_digest = on_digest
         self._regions: frozenset[int] | None = frozenset() if near else None
         self._quota = Quota(config.author_marks_per_s, config.total_marks_per_s)
         self._warned_ns: dict[str, int] = {}  # author -> when a warning named it last
@@ -166,6 +169,7 @@ class MapSync:
         """Publish what is due, compare the digests that have waited long enough, ask for what is missing."""
         for digest in self._bus.collected(DIGEST):
             assert isinstance(digest.message, Digest)
+            self._on_digest(digest.message.author, now_ns)
             self._hear_digest(digest.message, now_ns)
         if self._heard:
             heard, self._heard = self._heard, []

@@ -12,6 +12,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.keeper.store import Keeper, KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.scenario import MapConfig, Scenario
 from swarm.errors import StoreError
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.statements import MarkKind
@@ -226,6 +227,20 @@ def test_two_keepers_agree_though_each_missed_what_the_other_heard() -> None:
     assert (
         first.replica.held.fingerprint() == second.replica.held.fingerprint() == author.replica.held.fingerprint()
     )
+
+
+def test_an_author_that_lives_is_never_taken_for_dead() -> None:
+    swarm = SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5)))
+    store = KeeperStore(":memory:")
+    keeper, author, other = swarm.keeper("k", store), swarm.writer("a1.1"), swarm.writer("a2.1")
+    for each in (author, other):  # what the second says of the cell overrules the first, for good
+        swarm.run(1)
+        each.sync.publish(each.replica.write([0], MarkKind.LETHAL, 0.0, swarm.now_ns))
+    swarm.run(30)
+    own = author.replica.held.get(0, "a1.1")
+    assert own is not None
+    assert (own.epoch, len(own.cells)) == (1, 2)
+    assert keeper.counters.counts["sets_folded"] == 0
 
 
 def test_a_keeper_refuses_the_store_of_another_terrain() -> None:
