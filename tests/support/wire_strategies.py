@@ -227,6 +227,10 @@ MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
         Known, agent=ids, disk=naturals, life=naturals, plots=st.lists(plots, max_size=3),
         agents=st.lists(ids, max_size=3), lives=st.lists(naturals, max_size=3),
     ),
+    RemoveVehicles: st.builds(RemoveVehicles, vehicles=st.lists(ids, max_size=3)),
+    Removed: st.builds(
+        Removed, agent=ids, left=st.lists(ids, max_size=3), unknown=st.lists(ids, max_size=3), held=counts
+    ),
     Followed: st.builds(
         Followed, vehicle=ids, target=ids, start=cells, directions=directions, cost_s=finite_costs,
         lower_bound_s=finite_costs,

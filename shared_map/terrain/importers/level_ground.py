@@ -29,8 +29,8 @@ _FINE_M = 0.25
 """Heights in smaller steps than this are equal by levelling only. In whole metres gentle ground is level, too."""
 _LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 9, 40
 _MOST_LOWER = 0.1
-"""Water has its shore above it, but for an outlet. Level ground beside lower ground is a terrace, or a rounded
-slope."""
+"""Water has a shore, above it but for an outlet. Level ground beside lower ground is a terrace, or a rounded slope; a
+model that is level as a whole is a plain."""
 _SEA_M = 0.5
 """Level ground at the border so near to zero is the sea, however gentle the coast is."""
 _AROUND_CELLS, _MOST_TERRACES = 15, 0.1

@@ -64,6 +64,13 @@ def test_nothing_level_is_nothing() -> None:
     assert level_ground(np.full((3, 3), np.nan, np.float32)).patches == ()
 
 
+def test_a_model_that_is_level_as_a_whole_is_a_plain() -> None:
+    plain = np.zeros((50, 50), np.float32)
+    assert not level_ground(plain).mask.any()
+    plain[:10] = np.nan
+    assert not level_ground(plain).mask.any()
+
+
 # --- undeclared voids ---------------------------------------------------------------------------------------
 
 
