@@ -29,8 +29,8 @@ _FINE_M = 0.25
 """Heights in smaller steps than this are equal by levelling only. In whole metres gentle ground is level, too."""
 _LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 9, 40
 _MOST_LOWER = 0.1
-"""Water has a shore, above it but for an outlet. Level ground beside lower ground is a terrace, or a rounded slope; a
-model that is level as a whole is a plain."""
+"""Water has a shore, above it but for an outlet. Level ground beside lower ground is a terrace, or a rounded slope;
+a model that is level as a whole is a plain."""
 _SEA_M = 0.5
 """Level ground at the border so near to zero is the sea, however gentle the coast is."""
 _AROUND_CELLS, _MOST_TERRACES = 15, 0.1
@@ -123,9 +123,8 @@ def level_ground(elevation_m: Floats) -> LevelGround:
             differ += np.bincount(patch[out], np.abs(above_m) > 2 * _SAME_M, count + 1)
     inner_cells = np.bincount(flat, minlength=count + 1)
     coarse = _step_m(elevation_m) >= _FINE_M
-    water = (inner_cells >= (_LEAST_CELLS_COARSE if coarse else _LEAST_CELLS_FINE)) & (
-        lower <= _MOST_LOWER * differ
-    )
+    least = _LEAST_CELLS_COARSE if coarse else _LEAST_CELLS_FINE
+    water = (inner_cells >= least) & (differ > 0) & (lower <= _MOST_LOWER * differ)
     water[0] = False
     unsure = np.zeros_like(water)
     if coarse:
