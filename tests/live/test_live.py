@@ -78,7 +78,7 @@ def test_a_person_asks_for_a_route_and_for_the_status(live: LiveSwarm, bus: Zeno
     assert "\n1 steps, " in told.stdout or "\n0 steps, " in told.stdout  # there already
     told = swarm("route", *place, "--cost")
     assert told.stdout.startswith(f"from row {row}, col {col} to t0 in ")
-    assert told.stdout.count("\n") == 1
+    assert told.stdout.count("\n") == 2  # the age of the pose, too
     told = swarm("route", "--target", "t0", "--row", 4000, "--col", 1, "--connect", live.endpoint)
     assert told.stdout.startswith("outside: ")
     told = swarm("route", "--target", "t7", "--row", row, "--col", col, "--connect", live.endpoint)

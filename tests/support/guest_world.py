@@ -82,6 +82,8 @@ class GuestProcess(Process):
             self.leaving = False
         elif not self.leaving and world.now_ns - self.asked_ns > _ANOTHER_CELL_NS:
             self.try_to_enter()
+            if guest.needs_life:  # the last one ended while it was away
+                world.begin(self)
         self.do(guest.tick(self.now_ns))
 
     def drive_on(self) -> None:
