@@ -102,6 +102,11 @@ def opened(path: Path, what: str) -> Iterator[Any]:
 
 def _check_size(dataset: Any, what: str) -> None:
     """Refuse what would not fit, before a pixel is read: a file of a megabyte can promise any number of them."""
+    if dataset.count == 0:
+        held = [name.rsplit(":", 1)[-1][:40] for name in dataset.subdatasets[:8]]
+        raise TerrainError(
+            f"{what} holds several rasters ({', '.join(held)}), expected one: gdal_translate takes one out"
+        )
     rows, cols = dataset.height, dataset.width
     most = _MAX_PIXELS if dataset.driver in _BY_ROWS else MAX_CELLS
     if rows * cols > most:
@@ -214,7 +219,7 @@ def _sampled(dataset: Any) -> Floats:
     shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
     known = dataset.read_masks(1, out_shape=shape, resampling=Resampling.nearest) > 0
     sample: Floats = dataset.read(1, out_shape=shape, resampling=Resampling.nearest).astype(np.float32)
-    sample[~known] = np.nan
+    sample[~(known & np.isfinite(sample))] = np.nan
     return sample
 
 
