@@ -100,3 +100,6 @@ def test_a_map_in_metres_may_lie_across_180_degrees(tmp_path: Path) -> None:
     raster = read_elevation(path, TerrainConfig(source=str(path)))
     assert raster.grid.rows in range(37, 42)
     assert raster.grid.cols in range(37, 42)
+    path = written(tmp_path / "edge.tif", crs="EPSG:3857", where=(20_037_000.0, -1_800_000.0))
+    with pytest.raises(TerrainError, match="beyond the edge of EPSG:3857"):
+        read_elevation(path, TerrainConfig(source=str(path)))
