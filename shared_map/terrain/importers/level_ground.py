@@ -17,6 +17,8 @@ from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.voids import HIGHEST_M
 from swarm.config.scenario import TerrainConfig
 
+MOST_SAMPLED = 1 << 24
+"""Cells of a file in which level ground is looked for, and in rasters voids: of larger ones in every second, ..."""
 _CODES = (-32768.0, -32767.0, -99999.0, -9999.0, -9998.0, -999.0, -500.0, 9999.0, 32767.0, 65535.0)
 """What programs write where they know no height."""
 _CODE_GAP_M = 100.0
