@@ -178,6 +178,25 @@ def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any, what:
     return min(xs), min(ys), max(xs), max(ys)
 
 
+def _around_180(transform: Any, rows: int, cols: int, crs: Any, degrees: Any, what: str) -> tuple[float, float]:
+    """(west, east) of a raster of metres with 180 degrees counted on from there: 179 to 181, not -180 to 180.
+
+    Raises TerrainError if it reaches beyond the edge of its system's map, where a place has other metres.
+    """
+    from rasterio.warp import transform as to_crs
+
+    xs, ys = _border(transform, rows, cols)
+    found = to_crs(crs, degrees, xs, ys)
+    back = to_crs(degrees, crs, found[0], found[1])
+    if not np.allclose(back[0], xs, rtol=0, atol=abs(transform.a) + abs(transform.b)):
+        raise TerrainError(
+            f"{what} reaches across 180 degrees, beyond the edge of {crs_name(crs)}; gdalwarp -t_srs EPSG:3832"
+            " brings it onto one map"
+        )
+    lon = np.asarray(found[0]) % 360
+    return float(lon.min()), float(lon.max())
+
+
 def _pixel_m(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tuple[float, float]:
     """Width and height in metres of the pixel in the middle."""
     from rasterio.warp import transform as to_crs
@@ -228,6 +247,8 @@ def plan_grid(
         )
     degrees = crs if is_local(crs) else degrees_of(crs)
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees, what)
+    if not is_local(crs) and east - west > 180 and not crs.is_geographic:
+        west, east = _around_180(transform, rows, cols, crs, degrees, what)
     if crs.is_geographic and not -90.000001 <= south <= north <= 90.000001:
         raise TerrainError(f"{what} reaches from latitude {south:.4g} to {north:.4g}; its georeference is damaged")
     if crs.is_geographic and not abs(south + north) / 2 < HIGHEST_DEG:

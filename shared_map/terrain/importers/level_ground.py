@@ -14,8 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
+from shared_map.terrain.importers.voids import HIGHEST_M
 from swarm.config.scenario import TerrainConfig
 
+MOST_SAMPLED = 1 << 24
+"""Cells of a file in which level ground is looked for, and in rasters voids: of larger ones in every second, ..."""
 _CODES = (-32768.0, -32767.0, -99999.0, -9999.0, -9998.0, -999.0, -500.0, 9999.0, 32767.0, 65535.0)
 """What programs write where they know no height."""
 _CODE_GAP_M = 100.0
@@ -25,12 +28,16 @@ _ALONE = 3.0
 other heights: real ground is never alone in its height."""
 _SAME_M = 0.005
 """Levelled water differs by rounding, or by what a resampling before ours left."""
+_STILL_M = 0.05
+"""From its highest to its lowest cell, a patch of still water differs by no more."""
 _FINE_M = 0.25
 """Heights in smaller steps than this are equal by levelling only. In whole metres gentle ground is level, too."""
 _LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 9, 40
-_MOST_LOWER = 0.1
-"""Water has a shore, above it but for an outlet. Level ground beside lower ground is a terrace, or a rounded slope;
-a model that is level as a whole is a plain."""
+_MOST_LOWER = 0.25
+"""Water has a shore, above it but for an outlet: wide rivers are levelled in steps, each with a lower one behind it.
+Level ground beside much lower ground is a terrace, or a rounded slope."""
+_LEAST_SHORE = 0.2
+"""So much of its border is at another height than the patch, as far as one can see."""
 _SEA_M = 0.5
 """Level ground at the border so near to zero is the sea, however gentle the coast is."""
 _AROUND_CELLS, _MOST_TERRACES = 15, 0.1
@@ -68,8 +75,11 @@ def undeclared_voids(heights: NDArray[np.floating] | NDArray[np.integer]) -> tup
     known = heights[np.isfinite(heights)]
     gaps_m = {**dict.fromkeys(_CODES, _CODE_GAP_M), 0.0: _ZERO_GAP_M}
     is_code = np.isin(known, np.array(list(gaps_m), known.dtype))
-    if not is_code.any() or is_code.all():
+    if not is_code.any():
         return ()
+    if is_code.all():
+        # Nothing but the sea is a map; nothing but -9999 is none.
+        return tuple(code for code in np.unique(known.astype(np.float64)).tolist() if code != 0)
     rest = np.unique(known[~is_code].astype(np.float64))
     widest = np.diff(rest).max(initial=0.0)
     found = []
@@ -96,6 +106,10 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     from scipy import ndimage
 
     around = np.ones((3, 3), np.int8)
+    with np.errstate(invalid="ignore"):
+        known = np.abs(elevation_m) <= np.float32(HIGHEST_M)
+    if not known.all():
+        elevation_m = np.where(known, elevation_m, np.float32(np.nan))
     rows, cols = elevation_m.shape
     padded = np.pad(elevation_m, 1, mode="edge")
     inner = np.ones((rows, cols), np.bool_)
@@ -110,8 +124,12 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     first[flat[at][::-1]] = at[::-1]
     height_m = elevation_m.reshape(-1)[first]
     height_m[0] = np.nan
+    # Where every step is too small to see, a gentle slope is no lake: its far end is at another height.
+    spread_m = np.zeros(count + 1, np.float32)
+    np.maximum.at(spread_m, flat[at], np.abs(elevation_m.reshape(-1)[at] - height_m[flat[at]]))
+    still = spread_m <= _STILL_M
     with_shore = ndimage.grey_dilation(labels, footprint=around)
-    lower, differ = np.zeros(count + 1), np.zeros(count + 1)
+    lower, differ, edge = (np.zeros(count + 1) for _ in range(3))
     for axis in (0, 1):
         for this, that in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
             here = (this, slice(None)) if axis == 0 else (slice(None), this)
@@ -119,12 +137,15 @@ def level_ground(elevation_m: Floats) -> LevelGround:
             patch = with_shore[here]
             out = (patch > 0) & (with_shore[there] != patch)
             above_m = elevation_m[there][out] - height_m[patch[out]]
+            edge += np.bincount(patch[out], minlength=count + 1)
             lower += np.bincount(patch[out], above_m < -2 * _SAME_M, count + 1)
             differ += np.bincount(patch[out], np.abs(above_m) > 2 * _SAME_M, count + 1)
     inner_cells = np.bincount(flat, minlength=count + 1)
     coarse = _step_m(elevation_m) >= _FINE_M
     least = _LEAST_CELLS_COARSE if coarse else _LEAST_CELLS_FINE
-    water = (inner_cells >= least) & (differ > 0) & (lower <= _MOST_LOWER * differ)
+    # Without any shore to see, it is a floor, or a part of a slope.
+    shore = (differ > _LEAST_SHORE * edge) & (lower <= _MOST_LOWER * differ)
+    water = (inner_cells >= least) & still & shore
     water[0] = False
     unsure = np.zeros_like(water)
     if coarse:

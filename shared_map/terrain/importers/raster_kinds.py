@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import lzma
+import stat
 import zipfile
+import zlib
 from pathlib import Path
+from xml.etree import ElementTree
 
 from swarm.config.input_files import FileKind, check_bytes, size
 from swarm.errors import TerrainError
@@ -66,6 +70,7 @@ def kind_of(path: Path, what: str) -> tuple[str | Path, str]:
         driver = _driver(file.read(16), path.suffix.lower(), f"{what} {path}")
     if driver == "VRT":
         check_bytes(path, FileKind.VIRTUAL_RASTER)
+        _check_named(path, f"{what} {path}")
     header = path.with_suffix(".hdr")
     if driver == "EHdr" and header.is_file() and header.read_bytes()[:4] == b"ENVI":
         driver = "ENVI"
@@ -79,6 +84,27 @@ def _driver(head: bytes, ending: str, what: str) -> str:
         known = ", ".join(dict.fromkeys(_DRIVERS.values()))
         raise TerrainError(f"{what} is no raster: it begins with {head[:8]!r}, as none of {known} does")
     return found
+
+
+def _check_named(path: Path, what: str) -> None:
+    """A .vrt names other files: each must be an ordinary one on this machine. GDAL would ask a web server, and wait
+    at a pipe for ever."""
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise TerrainError(f"{what} is truncated or no raster: {str(error)[:_LONGEST_REASON]}") from error
+    for node in root.iter():
+        if not node.tag.endswith(("SourceFilename", "SourceDataset")):
+            continue
+        name = (node.text or "").strip()
+        try:
+            ordinary = not name.startswith("/vsi") and stat.S_ISREG((path.parent / name).stat().st_mode)
+        except (OSError, ValueError):
+            ordinary = False
+        if not ordinary:
+            raise TerrainError(
+                f"{what} names {name[:_LONGEST_REASON]!r}; expected a file that lies on this machine"
+            )
 
 
 def _in_archive(path: Path, what: str) -> tuple[str, str]:
@@ -97,7 +123,15 @@ def _in_archive(path: Path, what: str) -> tuple[str, str]:
                 )
             with archive.open(member) as file:
                 head = file.read(16)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        lzma.LZMAError,
+        NotImplementedError,
+        RuntimeError,
+        EOFError,
+        ValueError,
+    ) as error:
         raise TerrainError(f"{what} {path} is damaged or no .zip: {str(error)[:_LONGEST_REASON]}") from error
     driver = _driver(head, Path(member.filename).suffix.lower(), f"{what} {path}: {member.filename}")
     if driver == "VRT":

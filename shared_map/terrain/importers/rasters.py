@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.georeference import crs_of, plan_grid, resampling
-from shared_map.terrain.importers.level_ground import level_ground, notes_of_level, notes_of_voids, undeclared_voids
+from shared_map.terrain.importers.level_ground import (
+    MOST_SAMPLED,
+    level_ground,
+    notes_of_level,
+    notes_of_voids,
+    undeclared_voids,
+)
 from shared_map.terrain.importers.raster_kinds import kind_of
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.config.input_files import size
@@ -44,8 +50,6 @@ _UNITS_M = {
 }
 """What a file may call the unit of its heights, in metres."""
 _READ_ROWS = 512
-_MOST_SAMPLED = 1 << 24
-"""Cells of a file in which voids and level ground are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +106,11 @@ def opened(path: Path, what: str) -> Iterator[Any]:
 
 def _check_size(dataset: Any, what: str) -> None:
     """Refuse what would not fit, before a pixel is read: a file of a megabyte can promise any number of them."""
+    if dataset.count == 0:
+        held = [name.rsplit(":", 1)[-1][:40] for name in dataset.subdatasets[:8]]
+        raise TerrainError(
+            f"{what} holds several rasters ({', '.join(held)}), expected one: gdal_translate takes one out"
+        )
     rows, cols = dataset.height, dataset.width
     most = _MAX_PIXELS if dataset.driver in _BY_ROWS else MAX_CELLS
     if rows * cols > most:
@@ -210,11 +219,11 @@ def _sampled(dataset: Any) -> Floats:
     declared."""
     from rasterio.enums import Resampling
 
-    every = math.sqrt(max(dataset.height * dataset.width / _MOST_SAMPLED, 1.0))
+    every = math.sqrt(max(dataset.height * dataset.width / MOST_SAMPLED, 1.0))
     shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
     known = dataset.read_masks(1, out_shape=shape, resampling=Resampling.nearest) > 0
     sample: Floats = dataset.read(1, out_shape=shape, resampling=Resampling.nearest).astype(np.float32)
-    sample[~known] = np.nan
+    sample[~(known & np.isfinite(sample))] = np.nan
     return sample
 
 

@@ -168,6 +168,7 @@ def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
     """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
     from shared_map.terrain.importers.level_ground import (
+        MOST_SAMPLED,
         level_ground,
         notes_of_level,
         notes_of_voids,
@@ -179,8 +180,11 @@ def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Flo
     voids = undeclared_voids(heights)
     heights[np.isin(heights, np.array(voids, np.float32))] = np.nan
     heights *= np.float32(scale)
-    found = level_ground(heights)
-    return heights, found.mask, [*notes_of_voids(voids), *notes_of_level(found, config)]
+    rows, cols = heights.shape
+    every = math.ceil(math.sqrt(max(heights.size / MOST_SAMPLED, 1.0)))
+    found = level_ground(heights[::every, ::every])
+    level = found.mask.repeat(every, axis=0)[:rows].repeat(every, axis=1)[:, :cols]
+    return heights, level, [*notes_of_voids(voids), *notes_of_level(found, config)]
 
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:

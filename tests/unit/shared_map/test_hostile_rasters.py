@@ -1,0 +1,117 @@
+"""Rasters that would have ended in a traceback, at a web server, in a wait for ever, or as a lake that is none."""
+
+from __future__ import annotations
+
+import os
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import from_origin
+
+from shared_map.terrain.importers.level_ground import level_ground, undeclared_voids
+from shared_map.terrain.importers.rasters import read_elevation
+from swarm.config.scenario import TerrainConfig
+from swarm.errors import TerrainError
+
+HEIGHTS = np.add.outer(np.arange(40) * 2.0, np.arange(40) * 1.0).astype(np.float32)
+VRT = (
+    '<VRTDataset rasterXSize="40" rasterYSize="40"><SRS>EPSG:32632</SRS>'
+    "<GeoTransform>500000,30,0,5000000,0,-30</GeoTransform>"
+    '<VRTRasterBand dataType="Float32" band="1"><SimpleSource><SourceFilename relativeToVRT="1">{}</SourceFilename>'
+    "<SourceBand>1</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"
+)
+
+
+def written(path: Path, heights=HEIGHTS, crs="EPSG:32632", where=(500_000.0, 5_000_000.0)) -> Path:
+    shape = {"height": heights.shape[0], "width": heights.shape[1], "count": 1, "dtype": "float32"}
+    with rasterio.open(path, "w", driver="GTiff", crs=crs, transform=from_origin(*where, 30, 30), **shape) as file:
+        file.write(heights, 1)
+    return path
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_a_zip_with_damaged_bytes_is_refused_in_one_sentence(tmp_path: Path, method: int) -> None:
+    path = tmp_path / "dem.zip"
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.write(written(tmp_path / "dem.tif"), "dem.tif")
+    whole = bytearray(path.read_bytes())
+    whole[40:140] = bytes(7 * n % 256 for n in range(100))
+    path.write_bytes(bytes(whole))
+    with pytest.raises(TerrainError, match=r"dem\.zip") as refused:
+        read_elevation(path, TerrainConfig(source=str(path)))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["http://127.0.0.1:9/a.tif", "/vsicurl/a.tif", "pipe", "nowhere.tif"])
+def test_a_vrt_names_ordinary_files_only(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    path = tmp_path / "dem.vrt"
+    path.write_text(VRT.format(name), encoding="utf-8")
+    with pytest.raises(TerrainError, match="expected a file that lies on this machine"):
+        read_elevation(path, TerrainConfig(source=str(path)))
+    path.write_text(VRT.format(written(tmp_path / "dem.tif").name), encoding="utf-8")
+    assert np.array_equal(read_elevation(path, TerrainConfig(source=str(path))).elevation_m, HEIGHTS)
+
+
+def test_a_file_of_several_variables_is_refused_with_their_names(tmp_path: Path) -> None:
+    from scipy.io import netcdf_file
+
+    path = tmp_path / "dem.nc"
+    with netcdf_file(path, "w") as file:
+        for axis in ("y", "x"):
+            file.createDimension(axis, 40)
+        for name in ("height", "snow"):
+            file.createVariable(name, "f4", ("y", "x"))[:] = HEIGHTS
+    with pytest.raises(TerrainError, match=r"several rasters .*height.*snow"):
+        read_elevation(path, TerrainConfig(source=str(path)))
+
+
+def test_a_slope_too_gentle_to_see_between_two_cells_is_no_lake() -> None:
+    slope = np.add.outer(np.arange(200) * 0.002, np.arange(200) * 0.001).astype(np.float32)
+    assert not level_ground(slope).mask.any()
+    slope[60:100, 60:100] = slope.min() - 1
+    assert np.count_nonzero(level_ground(slope).mask) == 1600
+
+
+def test_a_level_floor_without_a_shore_is_no_lake() -> None:
+    assert not level_ground(np.full((50, 50), 412, np.float32)).mask.any()
+
+
+@pytest.mark.parametrize("code", [np.inf, -np.inf, -3.4e38])
+def test_what_is_no_height_is_no_lake_and_no_warning(code: float) -> None:
+    heights = HEIGHTS.copy()
+    heights[5:20, 5:20] = code
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert level_ground(heights).patches == ()
+
+
+def test_a_file_of_one_code_only_has_no_heights() -> None:
+    assert undeclared_voids(np.full((9, 9), -9999, np.float32)) == (-9999,)
+    assert undeclared_voids(np.zeros((9, 9), np.float32)) == ()
+
+
+def test_a_map_in_metres_may_lie_across_180_degrees(tmp_path: Path) -> None:
+    path = written(tmp_path / "fiji.tif", crs="EPSG:3832", where=(3_339_000.0, -1_800_000.0))
+    raster = read_elevation(path, TerrainConfig(source=str(path)))
+    assert raster.grid.rows in range(37, 42)
+    assert raster.grid.cols in range(37, 42)
+    path = written(tmp_path / "edge.tif", crs="EPSG:3857", where=(20_037_000.0, -1_800_000.0))
+    with pytest.raises(TerrainError, match="beyond the edge of EPSG:3857"):
+        read_elevation(path, TerrainConfig(source=str(path)))
+
+
+def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
+    from shared_map.terrain.importers import level_ground as module
+    from shared_map.terrain.importers.sources import _looked_at
+
+    monkeypatch.setattr(module, "MOST_SAMPLED", 2000)
+    heights = np.add.outer(np.arange(101) * 2.0, np.arange(83) * 1.0).astype(np.float32) + 50
+    heights[20:60, 20:60] = 40
+    _, level, _ = _looked_at(heights, 1.0, TerrainConfig(source="dem.asc"))
+    assert level.shape == heights.shape
+    assert (level != (heights == 40)).mean() < 0.03
