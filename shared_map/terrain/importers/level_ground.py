@@ -34,8 +34,8 @@ _FINE_M = 0.25
 """Heights in smaller steps than this are equal by levelling only. In whole metres gentle ground is level, too."""
 _LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 9, 40
 _MOST_LOWER = 0.25
-"""Water has a shore, above it but for an outlet: wide rivers are levelled in steps, each with a lower one behind it.
-Level ground beside much lower ground is a terrace, or a rounded slope."""
+"""Water has a shore, above it but for an outlet: wide rivers are levelled in steps, each beside a lower one. Level
+ground beside much lower ground is a terrace, or a rounded slope."""
 _LEAST_SHORE = 0.2
 """So much of its border is at another height than the patch, as far as one can see."""
 _SEA_M = 0.5
