@@ -59,14 +59,14 @@ def test_a_lake_that_differs_by_millimetres_is_one_lake() -> None:
     assert largest >= 0.9 * np.bincount(labels.ravel())[1:].max()
 
 
-@pytest.mark.parametrize("length", [32, 64])
+@pytest.mark.parametrize("length", [25, 50])
 def test_a_wide_river_is_levelled_in_steps_and_is_water(length: int) -> None:
     row, col = np.mgrid[0:SIDE, 0:SIDE]
     river = np.abs(col - SIDE // 2) < 8
     ground = np.abs(col - SIDE // 2) * 0.4 + (SIDE - 1 - row) * 0.05 + 5
     ground[river] = np.floor((SIDE - 1 - row[river]) / length)
     found = level_ground(ground.astype(np.float32)).mask
-    assert found[river].mean() > 0.9  # the step that the border cuts is too short
+    assert found[river].mean() > 0.95
     assert not found[~river].any()
 
 
