@@ -87,13 +87,13 @@ def test_inflated_borders_of_a_zone_are_left_too_and_walls_are_not_crossed() -> 
 def test_a_way_out_does_not_lead_over_ground_that_is_seen_to_be_lethal() -> None:
     """By the map all of a zone is lethal, so it cannot say what is so in truth, and nobody marks it there."""
     truth = ["." * 20 for _ in range(20)]
-    for row in range(5, 9):
-        truth[row] = "." * 8 + "#" * 6 + "." * 6
-    world = ClosedWorld(scenario(1, [(10, 10)], per_agent=1), pace_of(OPEN), truth=pace_of(truth))
-    world.put_target("t", 10, 10)
+    for row in (7, 8):  # further than the vehicle sees from where it starts
+        truth[row] = "." * 6 + "#" * 9 + "." * 5
+    world = ClosedWorld(scenario(1, [(14, 10)], per_agent=1), pace_of(OPEN), truth=pace_of(truth))
+    world.put_target("t", 14, 10)
     world.start_all()
     world.run(0.5)
-    world.close(7, 2, 16, 19)  # the way north is the shortest
+    world.close(6, 0, 20, 20)
     world.until(lambda: not world._inside, within_s=30)
     assert world.entered == []
     world.assert_lawful()
