@@ -379,15 +379,16 @@ class Interplay:
                     if id.startswith("extra") and id not in self._seen and np.isinf(closed[vehicle.cell]):
                         self.broken.append(f"{now_s:.2f} {id} enters the map on lethal cell {vehicle.cell}")
                     continue
-                cell, stopped, at_rest = before[id]
+                cell, stood, at_rest = before[id]
+                drives = cell != vehicle.cell or not vehicle.motion.at_rest
+                if stood and at_rest and drives and service._obedience.book.stopped(id):
+                    self.broken.append(f"{now_s:.2f} {id} is ordered to stand and drives")
                 if cell == vehicle.cell:
                     continue
                 if np.isinf(closed[vehicle.cell]) and np.isfinite(closed[cell]):
                     self.broken.append(
                         f"{now_s:.2f} {id} drives from {cell} into {vehicle.cell}, lethal by its map"
                     )
-                if stopped and at_rest:
-                    self.broken.append(f"{now_s:.2f} {id} is ordered to stand and drives to {vehicle.cell}")
         lethal = ~np.isfinite(self.simulation.truth.reshape(-1))
         for id, vehicle in agent.vehicles.items():
             towards, self._towards[id] = self._towards.get(id), vehicle.motion.entering
