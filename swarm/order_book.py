@@ -102,12 +102,17 @@ class OrderBook:
         return found
 
     def targets_of(self, group: str, scenario: Scenario) -> list[str]:
-        """The targets that a group may chase."""
+        """The targets that a group may chase. An order of which no target is left counts no more: whom a removed
+        target leaves behind chases what the scenario says."""
         order = self.about("group", group)
         config = next((each for each in scenario.groups if each.name == group), None)
-        chosen: Sequence[str] = order.targets if order is not None else config.targets if config is not None else ()
+        usual: Sequence[str] = config.targets if config is not None else ()
         known = self.targets(scenario)
-        return [id for id in (chosen or known) if id in known]
+        ordered = [id for id in order.targets if id in known] if order is not None else []
+        if ordered:
+            return ordered
+        chosen = known if order is not None and not order.targets else usual or known
+        return [id for id in chosen if id in known]
 
 
 def target_of(order: Order) -> TargetConfig:

@@ -112,6 +112,8 @@ class Agent:
         sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
         self._sight_cells = max(sense_cells, config.reserve_cells + 1)
         """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
+        self.seen_lethal: set[int] = set()
+        """Cells in zones over which no way out leads, as vehicles have seen."""
         self._driven_ns: int | None = None
         self._wished: dict[str, tuple[object, ...]] = {}
         """Vehicle under way -> what its wish was made of."""
@@ -145,6 +147,11 @@ class Agent:
             self._driver.entered[cell] = None
             self._unassigned = True
 
+    def is_open(self, cell: int) -> bool:
+        """Whether a vehicle may enter the map on a cell: it is not lethal, and no body closes it, as far as all
+        bodies are known."""
+        return not (self.bodies.is_deaf or self._steering.closed(cell))
+
     def remove(self, vehicles: Sequence[str]) -> None:
         """These leave the map: their cells are given back."""
         for id in vehicles:
@@ -160,7 +167,18 @@ class Agent:
 
     def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
         """Cells that only an operator's zone closes, and how many steps it is from each out of it."""
+        self.seen_lethal.intersection_update(ways_out)
+        self._go_out(ways_out)
+
+    def _go_out(self, ways_out: Mapping[int, int]) -> None:
+        ways_out = {cell: steps for cell, steps in ways_out.items() if cell not in self.seen_lethal}
+        if ways_out == self._steering.ways_out:
+            return
         self._steering.ways_out = ways_out
+        for vehicle in self.vehicles.values():
+            if vehicle.cell in ways_out:  # a step along the way before this one is not allowed any more
+                self._driver.end_path(vehicle)
+                self._wished.pop(vehicle.id, None)
 
     @property
     def places(self) -> list[int]:
@@ -185,6 +203,12 @@ class Agent:
             return None
         sight = self._sensor.look(list(self._driver.entered))
         self._driver.entered = {}
+        if ways_out := self._steering.ways_out:
+            # In a zone all is lethal by the map, so it cannot say which cells are so in truth.
+            lethal = set(sight.cells[np.isinf(sight.paces)].tolist())
+            if seen := lethal.intersection(ways_out):
+                self.seen_lethal |= seen
+                self._go_out(ways_out)
         return compare(sight, self._map.ground, self._map.prior)
 
     def map_changed(self, changed: Sequence[Window], now_ns: int, *, look: bool = False) -> None:
@@ -239,6 +263,10 @@ class Agent:
             if stopped:
                 self._driver.stop_soon(vehicle)
             path = self.holdings.path(vehicle.id)
+            if len(path) > 1 and vehicle.motion.at_rest:
+                # What was granted late may be closed by now, and would be held for good.
+                self._driver.end_path(vehicle)
+                path = self.holdings.path(vehicle.id)
             ask = vehicle.route_request(now_ns, path[-1])
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)

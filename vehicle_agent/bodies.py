@@ -143,10 +143,11 @@ class Bodies:
             return
         leaps = known is not None and self._leaps(known.report, report, now_ns - known.came_ns)
         charge, wrong = self._charge(report)
+        kind = "refused"
         if wrong is None:
-            wrong = self._crowded(known, leaps, charge)
+            kind, wrong = "crowded", self._crowded(known, leaps, charge)
         if wrong is not None:
-            self._complain("refused", report.id, f"is not avoided: {wrong}")
+            self._complain(kind, report.id, f"is not avoided: {wrong}")
             return
         self._meet_namesake(report, known)
         x_m, y_m = report.x_m, report.y_m
@@ -216,8 +217,9 @@ class Bodies:
 
     def _complain(self, kind: str, id: str, text: str) -> None:
         self.refused += 1
-        if (kind, id) not in self._told and len(self._told) < _MOST_TOLD:
-            self._told.add((kind, id))
+        told = kind, "" if kind == "crowded" else id  # a crowd has as many ids as it likes
+        if told not in self._told and len(self._told) < _MOST_TOLD:
+            self._told.add(told)
             self.complaints.append(f"body {id} {text}")
 
     # --- time passes ----------------------------------------------------------------------------------------

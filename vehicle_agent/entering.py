@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.holdings import Holdings
@@ -19,21 +19,32 @@ class Entering:
 
     vehicles  all of the agent
     cells     where they may, the best first
+    is_open   whether a cell may be entered now: no body and no zone closes it
     """
 
-    def __init__(self, vehicles: Iterable[str], cells: Sequence[int], holdings: Holdings) -> None:
+    def __init__(
+        self, vehicles: Iterable[str], cells: Sequence[int], holdings: Holdings, is_open: Callable[[int], bool]
+    ) -> None:
         self._waiting = list(vehicles)
         self._cells = deque(cells)
         self._holdings = holdings
+        self._is_open = is_open
         self._life = 0
         self._since_ns = 0
         """Since when the life has been informed of what earlier ones held."""
-        self._asked_ns: dict[str, int] = {}
+        self._asked: dict[str, tuple[int, int]] = {}
+        """Vehicle -> the cell that was asked for last, and when."""
 
     def remove(self, vehicles: Iterable[str]) -> None:
         """These enter no more."""
         gone = set(vehicles)
         self._waiting = [vehicle for vehicle in self._waiting if vehicle not in gone]
+
+    def may_stand(self, vehicle: str, cell: int) -> bool:
+        """Whether a vehicle that has found its place may take it. One of an earlier life stands there already; one
+        that would enter has a body there that came while the cell was asked for, and goes elsewhere."""
+        asked_cell, _ = self._asked.get(vehicle, (None, 0))
+        return cell != asked_cell or self._is_open(cell)
 
     @property
     def over(self) -> bool:
@@ -47,14 +58,22 @@ class Entering:
             return
         if holdings.life != self._life or not informed:
             self._life, self._since_ns = holdings.life, now_ns
-            self._asked_ns.clear()
+            self._asked.clear()
         if now_ns - self._since_ns < _FOUND_NS:
             return
         for vehicle in self._waiting:
-            asked_ns = self._asked_ns.get(vehicle)
-            if holdings.path(vehicle) or not self._cells:
+            if holdings.path(vehicle):
                 continue
-            if asked_ns is None or now_ns - asked_ns >= _ANOTHER_CELL_NS:
-                self._asked_ns[vehicle] = now_ns
-                holdings.enter(vehicle, self._cells[0])
-                self._cells.rotate(-1)
+            cell, asked_ns = self._asked.get(vehicle, (None, 0))
+            if cell is None or now_ns - asked_ns >= _ANOTHER_CELL_NS or not self._is_open(cell):
+                self._ask(vehicle, now_ns)
+
+    def _ask(self, vehicle: str, now_ns: int) -> None:
+        """For the next cell that is open. While none is, what was asked for is not taken once it is granted."""
+        for _ in range(len(self._cells)):
+            cell = self._cells[0]
+            self._cells.rotate(-1)
+            if self._is_open(cell):
+                self._asked[vehicle] = cell, now_ns
+                self._holdings.enter(vehicle, cell)
+                return

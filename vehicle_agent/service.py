@@ -151,7 +151,7 @@ class AgentService:
         self._entering: Entering | None = None
         if setup.added is not None:
             cells = entry_cells(setup.added, grid, homes, setup.incarnation)
-            self._entering = Entering(plan.vehicle_ids, cells, self._agent.holdings)
+            self._entering = Entering(plan.vehicle_ids, cells, self._agent.holdings, self._agent.is_open)
         self._fleet = FleetReport(self._author, group)
         self._chasers = ChasersReport(self._author)
 
@@ -229,7 +229,7 @@ class AgentService:
             self._entering.tick(self._right_of_way.core.informed, now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
-        self._zones.update(agent.places, now_ns)
+        self._zones.update(agent.places, now_ns, agent.bodies.standing | agent.seen_lethal)
         agent.set_ways_out(self._zones.ways_out)
         self._obey(now_ns)
         agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
@@ -286,6 +286,11 @@ class AgentService:
     # --- places ---------------------------------------------------------------------------------------------
 
     def _place(self, vehicles: Sequence[str]) -> None:
+        if self._entering is not None:
+            holdings, may_stand = self._agent.holdings, self._entering.may_stand
+            closed = [id for id in vehicles if not may_stand(id, holdings.path(id)[0])]
+            self._agent.remove(closed)
+            vehicles = [id for id in vehicles if id not in closed]
         if vehicles:
             self._agent.place(vehicles)
             log.info("%d vehicles have their places", len(self._agent.vehicles))

@@ -35,10 +35,11 @@ class ZonesAround:
         self._cells: NDArray[np.int64] = np.empty(0, np.int64)
         self._due_ns = 0
 
-    def update(self, places: Collection[int], now_ns: int) -> None:
+    def update(self, places: Collection[int], now_ns: int, shut: Collection[int] = ()) -> None:
         """Take in what changed.
 
         places  the cells that our vehicles hold
+        shut    cells over which no way out leads: bodies stand there, or vehicles have seen that they are lethal
         """
         if self._version != self._replica.zones_version:
             self._version = self._replica.zones_version
@@ -49,7 +50,7 @@ class ZonesAround:
             self.ways_out = {}
         elif now_ns >= self._due_ns or not self.ways_out:
             self._due_ns = now_ns + _AGAIN_NS
-            self.ways_out = self._find_ways_out()
+            self.ways_out = self._find_ways_out(shut)
 
     def without(self, findings: Findings) -> Findings:
         """Findings without those in zones: an operator's word stands, whatever a vehicle sees there."""
@@ -67,22 +68,25 @@ class ZonesAround:
                     found.append(grid_cells(replica.grid, tile_corners(replica.grid, tile), cells).astype(np.int64))
         return np.unique(np.concatenate(found))
 
-    def _find_ways_out(self) -> dict[int, int]:
-        """Breadth first from the open cells around zones, along straight steps over cells that only zones close."""
+    def _find_ways_out(self, shut: Collection[int]) -> dict[int, int]:
+        """Breadth first from the open cells around zones, along straight steps over cells that only zones close.
+        What is shut leads out too, as a vehicle may stand there, but nothing leads over it."""
         closed = self._closed_by_zones()
         cols, pace = self._cost_map.grid.cols, self._cost_map.pace_s_per_m.reshape(-1)
+        passable = ~np.isin(closed, list(shut))
         depth = np.zeros(len(closed), np.int64)
         beside = _straight(closed, cols, len(pace))
         at = np.searchsorted(closed, beside.clip(0))
         at[at == len(closed)] = 0
         inside = (closed[at] == beside) if len(closed) else np.zeros_like(beside, bool)
-        front = ((beside >= 0) & np.isfinite(pace[beside.clip(0)])).any(axis=1)
+        outside = (beside >= 0) & np.isfinite(pace[beside.clip(0)]) & ~np.isin(beside, list(shut))
+        front = outside.any(axis=1)
         level = 0
         while front.any():
             level += 1
             depth[front] = level
             reached = np.zeros(len(closed), bool)
-            reached[at[front][inside[front]]] = True
+            reached[at[front & passable][inside[front & passable]]] = True
             front = reached & (depth == 0)
         led = depth > 0
         return dict(zip(closed[led].tolist(), depth[led].tolist(), strict=True))

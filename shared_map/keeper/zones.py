@@ -148,6 +148,12 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
     covered = int(inside.sum())
     if not covered:
         return f"polygon: it covers no cell of the terrain of {grid.rows} x {grid.cols} cells"
+    if order.kind == "pace":
+        # An operator's word wins over what vehicles find: it must not send them into what the terrain closes.
+        inside &= np.isfinite(terrain.ground_s_per_m)
+        covered = int(inside.sum())
+        if not covered:
+            return "polygon: a zone of a pace in which all cells of the terrain are lethal, and stay so"
     if covered > MOST_CELLS:
         return f"polygon: it covers {covered} cells, at most {MOST_CELLS}: make several zones"
     if order.kind == "lethal" and not (np.isfinite(terrain.pace_s_per_m) & ~inside).any():

@@ -409,6 +409,11 @@ class MapReplica:
         wanted = self.filter.accepted([(author, self.held.lacking(author, rows))])
         return [tile for _, tiles in wanted for tile in tiles]
 
+    def has_ended(self, author: str) -> bool:
+        """Whether all that an author states on some tile has ended: at once if our clock is far ahead of its."""
+        sets = (self.held.get(tile, author) for tile in self.held.tiles)
+        return any(each and each.kinds and not len(standing(each, self._now_ns).cells) for each in sets)
+
     def own_digest(self) -> dict[str, bytes]:
         """Rows of all that we stated ourselves."""
         return self.held.ledger.held([] if self.author is None else [self.author])

@@ -188,12 +188,12 @@ class MapSync:
             self._put(action.mark_set)
 
     def holds(self, author: str, rows: bytes, now_ns: int) -> bool:
-        """Whether the map has what these rows of a digest name of an author, as far as it is of interest here. What
-        is missing is asked for."""
+        """Whether the map has what these rows of a digest name of an author, as far as it is of interest here, and
+        it has not ended yet by our clock. What is missing is asked for."""
         lacking = self.replica.lacking(author, rows)
         if lacking and not self._heard:  # else it may have come, and waits for the tick
             self._fetch(author, lacking, now_ns)
-        return not lacking
+        return not lacking and not self.replica.has_ended(author)
 
     @property
     def throttled(self) -> list[str]:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 from launch_scripts.simulation.node import Node
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.worlds import seeded
+from launch_scripts.simulation.worlds import crowd, seeded
 from swarm.bus.bus import Event, Replied
 from swarm.config.agents import added_agent
 from swarm.right_of_way.guest_service import GuestService
 from swarm.right_of_way.life_file import MemoryLives
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.guests import Removed, RemoveVehicles
-from swarm.wire.topics import LEAVE
+from swarm.wire.messages.orders import ZoneOrder
+from swarm.wire.topics import BODY, LEAVE
 from vehicle_agent.agent import Agent
 from vehicle_agent.service import AgentService
 
@@ -150,6 +153,32 @@ def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anyb
     bus.ask(LEAVE, RemoveVehicles(), hear, tag="x", agent="extra")
     drive(simulation, [], 0.5)
     assert asked[-1].held == 0
+
+
+def test_vehicles_are_added_beside_a_body_and_outside_of_a_zone_where_their_place_is_closed() -> None:
+    scenario, terrain = crowd("open", 1, vehicles=8, per_agent=4, side=20)
+    simulation = Simulation(scenario, terrain=terrain)
+    zone: Any = [(6, 6), (6, 14), (14, 14), (14, 6)]
+    simulation.order(2.0, ZoneOrder(action="add", name="z", polygon=zone))
+    bus = simulation.network.bus("walker", scenario.network.namespace, simulation.authenticator)
+    group = scenario.groups[0].name
+    for tick in range(80):
+        # In the middle of cell [17, 17].
+        report = Body(id="walker", incarnation=1, seq=tick, x_m=175.0, y_m=-175.0, radius_m=3.0)
+        bus.publish(BODY, report, id="walker")
+        if tick == 20:
+            nodes = [
+                simulation.add(added_agent(scenario, f"extra{n}", group, 1, place))
+                for n, place in enumerate([(17, 17), (10, 10)])
+            ]
+        drive(simulation, [], 0.1)
+        if tick > 20:
+            for node in nodes:
+                for vehicle in agent_of_node(node).vehicles.values():
+                    row, col = terrain.grid.row_col(vehicle.cell)
+                    assert (row, col) != (17, 17)
+                    assert not (6 <= row < 14 and 6 <= col < 14)
+    assert all(agent_of_node(node).vehicles for node in nodes)
 
 
 def agent_of_node(node: Node) -> Agent:

@@ -15,7 +15,7 @@ from launch_scripts.simulation.trial import Trial, nodes_of
 from launch_scripts.simulation.worlds import SMALL, seeded
 from launch_scripts.world.service import TargetsService
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.wire.messages.orders import GiveOrder, ZoneOrder
+from swarm.wire.messages.orders import GiveOrder, Obey, ZoneOrder
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.service import AgentService
 
@@ -131,6 +131,18 @@ def test_settings_change_while_the_swarm_runs(terrain: Terrain) -> None:
     simulation.order(9.0, GiveOrder(subject="set", name="time_scale", off=True))
     simulation.run_until(13.0)
     assert cells(simulation) != before
+
+
+def test_who_takes_a_zone_for_over_as_its_clock_is_wrong_does_not_say_that_it_obeys(terrain: Terrain) -> None:
+    simulation = simulated(terrain, FaultPlan(skews_ms={"agent-a0": 3.6e6, "agent-a1": -3.6e6}))
+    corners: Any = [(5, 5), (5, 20), (20, 20), (20, 5)]
+    simulation.order(3.0, ZoneOrder(action="add", name="z", polygon=corners, lasts_s=60.0))
+    simulation.run_until(5.0)
+    obey = {each.agent.plan.id: each._obeys(Obey(author="operator.z")) for each in agents(simulation)}
+    assert obey == {"a0": False, "a1": True, "a2": True}
+    simulation.order(5.0, ZoneOrder(action="remove", name="z"))
+    simulation.run_until(7.0)
+    assert all(each._obeys(Obey(author="operator.z")) for each in agents(simulation))
 
 
 def _open(terrain: Terrain) -> int:

@@ -40,7 +40,8 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     """Asks a keeper to close an area, to open it again, or which zones there are.
 
     name          of the zone; one that exists is replaced. Without a name the keeper finds one
-    kind          lethal: no vehicle enters; pace: it is driven at `pace_s_per_m`, whatever is found there
+    kind          lethal: no vehicle enters; pace: what the terrain does not close is driven at
+                  `pace_s_per_m`, whatever is found there
     polygon       corners [row, col]; (0, 0) is the north-west corner of the terrain, (1, 1) of the cell one further
     polygon_m     corners [x_m, y_m] instead, as poses have them
     lasts_s       after so long the zone ends by itself; without it never

@@ -6,6 +6,7 @@ import itertools
 from fractions import Fraction
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,9 +14,11 @@ from hypothesis import strategies as st
 from support.map_strategies import held_winners, set_of
 from support.swarm_model import SwarmModel
 
+from shared_map.cost_map import CostMap
 from shared_map.keeper.store import KeeperStore
-from shared_map.keeper.zones import _crossing, rows_of
+from shared_map.keeper.zones import _crossing, rows_of, zone_sets
 from shared_map.replication.filter import readable_for_target
+from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.load import parse_scenario
@@ -359,3 +362,19 @@ targets = ["t1"]
 
 def test_rows_of_no_sets_are_none() -> None:
     assert rows_of([]) == b""
+
+
+def test_a_zone_of_a_pace_does_not_open_what_the_terrain_closes() -> None:
+    pace = np.ones((ROWS, COLS), np.float32)
+    pace[3, 3:6] = np.inf
+    terrain, store = terrain_of_pace(pace), KeeperStore(":memory:")
+    replica = MapReplica(terrain.grid, CostMap(terrain))
+    order = ZoneOrder(
+        action="add", name="z", kind="pace", pace_s_per_m=0.5, polygon=[(2, 2), (2, 8), (5, 8), (5, 2)]
+    )
+    sets = zone_sets(order, replica, terrain, store.set_aside, 1)
+    assert not isinstance(sets, str)
+    assert sum(len(each.kinds) for each in sets) == 3 * 6 - 3
+    closed = msgspec.structs.replace(order, polygon=[(3, 3), (3, 6), (4, 6), (4, 3)])
+    refused = zone_sets(closed, replica, terrain, store.set_aside, 1)
+    assert refused == "polygon: a zone of a pace in which all cells of the terrain are lethal, and stay so"

@@ -99,7 +99,7 @@ def test_targets_come_move_and_go() -> None:
     assert keeper.give(subject="group", name="red", targets=["x"]) is None
     assert keeper.book.targets_of("red", SCENARIO) == ["x"]
     assert keeper.give(subject="target", name="x", off=True) is None
-    assert keeper.book.targets_of("red", SCENARIO) == []
+    assert keeper.book.targets_of("red", SCENARIO) == ["t0"], "removing loses nobody"
     assert keeper.give(subject="group", name="red", off=True) is None
     assert keeper.book.targets_of("red", SCENARIO) == ["t0"]
     assert keeper.give(subject="target", name="t0", off=True) is None

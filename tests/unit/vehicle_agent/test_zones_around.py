@@ -8,9 +8,10 @@ from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
 from shared_map.keeper.store import KeeperStore
 from swarm.bus.bus import Event, Replied
+from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.orders import ZoneOrder, Zones
 from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.topics import ZONES
+from swarm.wire.topics import BODY, ZONES
 
 
 class ClosedWorld(AgentWorld):
@@ -79,5 +80,45 @@ def test_inflated_borders_of_a_zone_are_left_too_and_walls_are_not_crossed() -> 
     world.run(0.5)
     world.close(5, 6, 13, 15)
     world.until(lambda: not world._inside, within_s=30)
+    assert world.entered == []
+    world.assert_lawful()
+
+
+def test_a_way_out_does_not_lead_over_ground_that_is_seen_to_be_lethal() -> None:
+    """By the map all of a zone is lethal, so it cannot say what is so in truth, and nobody marks it there."""
+    truth = ["." * 20 for _ in range(20)]
+    for row in (7, 8):  # further than the vehicle sees from where it starts
+        truth[row] = "." * 6 + "#" * 9 + "." * 5
+    world = ClosedWorld(scenario(1, [(14, 10)], per_agent=1), pace_of(OPEN), truth=pace_of(truth))
+    world.put_target("t", 14, 10)
+    world.start_all()
+    world.run(0.5)
+    world.close(6, 0, 20, 20)
+    world.until(lambda: not world._inside, within_s=30)
+    assert world.entered == []
+    world.assert_lawful()
+
+
+def test_a_way_out_leads_around_a_body_that_stands_on_the_nearest() -> None:
+    world = ClosedWorld(scenario(1, [(10, 10)], per_agent=1), pace_of(OPEN))
+    world.put_target("t", 10, 10)
+    world.start_all()
+    grid = world.terrain.grid
+    side_m = grid.resolution_m
+    x_m, y_m = grid.west_m + 10.5 * side_m, grid.north_m - 9.5 * side_m
+    seq = iter(range(1, 1000))
+
+    def report() -> None:
+        body = Body(id="r", incarnation=1, seq=next(seq), x_m=x_m, y_m=y_m, radius_m=0.3 * side_m, lease_s=1.0)
+        world._watch.publish(BODY, body, id="r")
+
+    for _ in range(10):
+        report()
+        world.run(0.2)
+    world.close(9, 4, 17, 17)
+    for _ in range(100):
+        report()
+        world.run(0.2)
+    assert not world._inside
     assert world.entered == []
     world.assert_lawful()

@@ -1,0 +1,451 @@
+"""Everything that joins a running swarm at once: bodies, guests, added agents, zones, orders, under all faults."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import random
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from launch_scripts.simulation.faults import Partition, random_plan
+from launch_scripts.simulation.node import Node
+from launch_scripts.simulation.simulate import Simulation
+from launch_scripts.simulation.trial import Trial, nodes_of
+from launch_scripts.simulation.worlds import SMALL, crowd, seeded
+from shared_map.terrain.terrain import build_terrain
+from swarm.bus.bus import Event
+from swarm.clock import NS_PER_S
+from swarm.config.agents import added_agent
+from swarm.config.scenario import RoverConfig
+from swarm.right_of_way.guest_service import GuestService
+from swarm.right_of_way.life_file import MemoryLives
+from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.guests import RemoveVehicles
+from swarm.wire.messages.orders import GiveOrder, ZoneOrder
+from swarm.wire.topics import BODY, LEAVE
+from vehicle_agent.service import AgentService
+
+TICK_S = 0.1
+ADDED = "agent-extra"
+_ROVERS = (
+    RoverConfig(name="quick", count=2, speed_m_per_s=3.0),
+    RoverConfig(name="still", count=1, speed_m_per_s=0.0, radius_m=3.0),
+)
+
+
+class Robot:
+    """A guest that drives at random on what it is granted, and is a body too, as in `swarm.client`."""
+
+    def __init__(self, world: Interplay, name: str, cell: int) -> None:
+        self.world, self.name, self.cell = world, name, cell
+        self.lives = MemoryLives()
+        self.on: int | None = None
+        self.moves = self.seq = 0
+        self.service: GuestService | None = None
+        self.bus: Any = None
+        self.incarnation = 0
+        self.warnings: list[str] = []
+
+    def boot(self) -> None:
+        if self.service is not None or self.world.guests_over:
+            return
+        simulation = self.world.simulation
+        self.bus = simulation.network.bus(
+            self.name, simulation.scenario.network.namespace, simulation.authenticator
+        )
+        self.incarnation = now_ns = self.world.now_ns
+        self.service = GuestService(
+            self.name, self.world.grid, now_ns, self.lives, self.bus, self.hear, self.warnings.append
+        )
+        self.service.start(now_ns)
+        self.service.enter(self.cell if self.on is None else self.on, now_ns)
+
+    def hear(self, event: Event) -> None:
+        if self.service is not None:
+            self.service.handle(event, self.world.now_ns)
+
+    def crash(self) -> None:
+        if self.service is not None:
+            self.bus.close()
+            self.service = None
+
+    def leave(self) -> None:
+        if self.service is not None:
+            self.service.leave(self.world.now_ns)
+            self.on = None
+
+    def tick(self) -> None:
+        if self.service is None:
+            return
+        guest, chance = self.service.guest, self.world.chance
+        if guest is not None and guest.cells:
+            if len(guest.cells) > 1 and chance.random() < 0.5:
+                guest.left(guest.cells[0])
+                self.moves += 1
+            self.on = self.cell = guest.cells[0]
+            path = list(guest.cells)
+            while len(path) < 4:
+                near = [cell for cell in self.near(path[-1]) if cell not in path[-2:]]
+                if not near:
+                    break
+                path.append(chance.choice(near))
+            guest.want(path, self.near(self.on))
+            self.tell()
+        self.service.tick(self.world.now_ns)
+
+    def tell(self) -> None:
+        assert self.on is not None
+        self.seq += 1
+        x_m, y_m = self.world.middle(self.on)
+        half_m = self.world.grid.resolution_m / 2
+        report = Body(id=self.name, incarnation=self.incarnation, seq=self.seq, x_m=x_m, y_m=y_m, radius_m=half_m)
+        self.bus.publish(BODY, report, id=self.name)
+
+    def near(self, cell: int) -> list[int]:
+        return [other for _, other in self.world.grid.neighbours(cell) if self.world.open[other]]
+
+
+class Walker:
+    """A body that nobody steers: it stands, walks onto things, leaps, or reports nonsense at the bounds."""
+
+    def __init__(self, world: Interplay, name: str, until_s: float) -> None:
+        chance = world.chance
+        self.world, self.name, self.until_s = world, name, until_s
+        self.bus = world.bus(f"walker-{name}")
+        self.seq, self.incarnation = 0, world.now_ns + int(chance.choice((0, -3600, 3600)) * NS_PER_S)
+        self.kind = chance.choice(("stands", "walks", "onto", "leaps", "huge", "twins"))
+        self.radius_m = {"huge": 100.0}.get(self.kind, chance.choice((0.5, 3.0, 8.0)))
+        self.lease_s = chance.choice((0.3, 1.0, 10.0))
+        self.x_m, self.y_m = world.middle(chance.choice(world.free))
+        self.heading = chance.uniform(0.0, math.tau)
+        self.speed = chance.choice((0.5, 2.0, 5.0)) if self.kind == "walks" else 0.0
+        if self.kind == "huge":
+            self.until_s, self.lease_s = min(until_s, world.simulation.now_s + 1.5), 1.0
+
+    def tick(self) -> bool:
+        """False once it is gone."""
+        world, chance = self.world, self.world.chance
+        gone = world.simulation.now_s >= self.until_s
+        if self.kind == "walks":
+            self.x_m += math.sin(self.heading) * self.speed * TICK_S
+            self.y_m += math.cos(self.heading) * self.speed * TICK_S
+            row, col = (world.grid.north_m - self.y_m), (self.x_m - world.grid.west_m)
+            side_m = world.grid.resolution_m
+            if not (0 < row < world.grid.rows * side_m and 0 < col < world.grid.cols * side_m):
+                self.heading += math.pi
+                self.x_m += 2 * math.sin(self.heading) * self.speed * TICK_S
+                self.y_m += 2 * math.cos(self.heading) * self.speed * TICK_S
+        elif self.kind == "onto" and chance.random() < 0.02:  # it is put onto a vehicle, stopped or not
+            cells = world.vehicle_cells()
+            if cells:
+                self.x_m, self.y_m = world.middle(chance.choice(cells))
+        elif self.kind == "leaps" and chance.random() < 0.05:
+            self.x_m, self.y_m = world.middle(chance.choice(world.free))
+        self.seq += 1
+        twin = 1 if self.kind == "twins" and self.seq % 2 else 0
+        report = Body(
+            id=self.name,
+            incarnation=self.incarnation + twin,
+            seq=self.seq,
+            x_m=self.x_m,
+            y_m=self.y_m,
+            heading_rad=math.remainder(self.heading, math.tau) if self.kind == "walks" else None,
+            speed_m_per_s=self.speed,
+            radius_m=self.radius_m,
+            lease_s=0.0 if gone else self.lease_s,
+        )
+        self.bus.publish(BODY, report, id=self.name)
+        return not gone
+
+
+class Interplay:
+    """One seed. `broken` is what did not hold."""
+
+    def __init__(self, seed: int, seconds: float = 27.0) -> None:
+        self.seed, self.seconds = seed, seconds
+        self.chance = chance = random.Random(f"interplay/{seed}")
+        kinds = ("small", "open", "doors", "maze")
+        self.kind = kinds[seed % len(kinds)]
+        if self.kind == "small":
+            scenario = seeded(seed, SMALL)
+            terrain = build_terrain(scenario)
+        else:
+            scenario, terrain = crowd(self.kind, seed, vehicles=16, per_agent=4, side=20)
+        scenario = msgspec.structs.replace(scenario, rovers=_ROVERS)
+        names = nodes_of(scenario)
+        self.plan = plan = random_plan(seed, names, 20.0)
+        self.quiet_s = quiet_s = plan.quiet_s or 18.0
+        cuts = list(plan.partitions)
+        for name in ("robot-0", "robot-1", ADDED):
+            if chance.random() < 0.4:
+                from_s = chance.uniform(4.0, quiet_s - 3.0)
+                cuts.append(Partition(from_s, from_s + chance.choice((0.7, 3.0)), (name,), chance.random() < 0.4))
+        self.plan = plan = dataclasses.replace(plan, partitions=tuple(cuts))
+        self.simulation = simulation = Simulation(scenario, faults=plan, terrain=terrain)
+        self.grid = terrain.grid
+        self.open = np.isfinite(terrain.pace_s_per_m).ravel() & np.isfinite(simulation.truth).ravel()
+        self.free = [int(cell) for cell in np.flatnonzero(self.open)]
+        self.broken: list[str] = []
+        self.guests_over = False
+        self.routed_after_s: float | None = None
+        self.removed: set[str] = set()
+        self._before: dict[str, tuple[Any, dict[str, tuple[int, bool, bool]], np.ndarray, set[int]]] = {}
+        self._seen: set[str] = set()
+        self._towards: dict[str, int | None] = {}
+        simulation.after_tick.append(self._forget_removed)
+        self.trial = Trial(simulation)
+        simulation.after_tick.append(self._look)
+        self.robots = [Robot(self, f"robot-{n}", chance.choice(self.free)) for n in range(2)]
+        self.walkers: list[Walker] = []
+        self._operator = self.bus("operator")
+        self.calls: list[tuple[float, Any]] = []
+        self._draw()
+
+    # --- small helpers ----------------------------------------------------------------------------------------
+
+    @property
+    def now_ns(self) -> int:
+        return self.simulation.scheduler.clock.now_ns()
+
+    def bus(self, name: str) -> Any:
+        simulation = self.simulation
+        return simulation.network.bus(name, simulation.scenario.network.namespace, simulation.authenticator)
+
+    def middle(self, cell: int) -> tuple[float, float]:
+        row, col = divmod(cell, self.grid.cols)
+        side_m = self.grid.resolution_m
+        return self.grid.west_m + (col + 0.5) * side_m, self.grid.north_m - (row + 0.5) * side_m
+
+    def agents(self) -> dict[str, AgentService]:
+        nodes = self.simulation.nodes.values()
+        return {node.name: node.service for node in nodes if isinstance(node.service, AgentService)}
+
+    def vehicle_cells(self) -> list[int]:
+        return [v.cell for each in self.agents().values() for v in each.agent.vehicles.values()]
+
+    # --- what happens -----------------------------------------------------------------------------------------
+
+    def _draw(self) -> None:
+        chance, quiet_s, simulation = self.chance, self.quiet_s, self.simulation
+        at = lambda lo=2.0, hi=quiet_s: chance.uniform(lo, hi)  # noqa: E731
+        self.calls = []
+        for robot in self.robots:
+            self.calls.append((at(1.0, 8.0), robot.boot))
+            if chance.random() < 0.6:
+                dies_s = at(6.0)
+                self.calls += [(dies_s, robot.crash), (dies_s + chance.uniform(0.5, 4.0), robot.boot)]
+        for n in range(5):
+            name = chance.choice((f"walker{n}", f"walker{n}", "a0-01", "extra-00", "a1-00"))
+            until_s = at(4.0, quiet_s + 1.0)
+            begin_s = chance.uniform(1.0, until_s)
+            self.calls.append((begin_s, lambda n=name, u=until_s: self.walkers.append(Walker(self, n, u))))
+        if chance.random() < 0.3:
+            self.calls.append((at(5.0), self._flood))
+        if chance.random() < 0.7:
+            group = simulation.scenario.groups[0].name
+            joins_s = at(3.0, 7.0)
+            place = self.grid.row_col(chance.choice(self.free)) if chance.random() < 0.7 else None
+            self.calls.append(
+                (joins_s, lambda: simulation.add(added_agent(simulation.scenario, "extra", group, 3, place)))
+            )
+            for _ in range(chance.randrange(3)):
+                self.calls.append((at(joins_s), lambda: simulation.crash(ADDED)))
+            if chance.random() < 0.4:
+                hangs_s = at(joins_s)
+                self.calls += [
+                    (hangs_s, lambda: self._node(ADDED, Node.hang)),
+                    (min(hangs_s + chance.choice((0.4, 2.0)), quiet_s), lambda: self._node(ADDED, Node.wake)),
+                ]
+            if chance.random() < 0.5:
+                which = chance.choice(([], ["extra-01"]))
+                self.calls.append((at(joins_s + 1.5, quiet_s + 1.0), lambda: self._remove("extra", which)))
+        if chance.random() < 0.3:
+            self.calls.append((at(4.0), lambda: self._remove("a0", ["a0-02"])))
+        for _ in range(14):
+            self.calls.append((at(2.0, quiet_s + 1.0), self._order))
+        ends: list[GiveOrder | ZoneOrder] = [
+            GiveOrder(subject="pause", off=True),
+            *(GiveOrder(subject="vehicle", name=f"a{n}-00", off=True) for n in range(3)),
+            GiveOrder(subject="vehicle", name="extra-00", off=True),
+            GiveOrder(subject="group", name="all", off=True),
+            GiveOrder(subject="set", name="time_scale", off=True),
+            *(ZoneOrder(action="remove", name=name) for name in "abc"),
+        ]
+        for order in ends:
+            self.calls += [
+                (quiet_s + 1.5 + again, lambda o=order: simulation._give(o)) for again in (0.0, 0.4, 0.8)
+            ]
+        self.calls.append((quiet_s + 1.5, self._end_guests))
+        self.calls.sort(key=lambda call: call[0])
+
+    def _node(self, name: str, do: Any) -> None:
+        if name in self.simulation.nodes:
+            do(self.simulation.nodes[name])
+
+    def _remove(self, agent: str, vehicles: list[str]) -> None:
+        self._operator.ask(LEAVE, RemoveVehicles(vehicles=vehicles), lambda event: None, tag="x", agent=agent)
+
+    def _flood(self) -> None:
+        bus = self.bus("flood")
+        for n in range(400):
+            x_m, y_m = self.middle(self.chance.choice(self.free))
+            wrong = self.chance.random()
+            report = Body(
+                id=f"flood-{n}",
+                incarnation=1,
+                seq=1,
+                x_m=1e7 if wrong < 0.05 else x_m,
+                y_m=y_m,
+                radius_m=5e3 if wrong > 0.95 else 0.1,
+                speed_m_per_s=1e6 if 0.5 < wrong < 0.55 else 0.0,
+                lease_s=self.chance.choice((0.0, 0.2, 1.0)),
+            )
+            bus.publish(BODY, report, id=f"flood-{n}")
+        bus.close()
+
+    def _end_guests(self) -> None:
+        self.guests_over = True
+        for robot in self.robots:
+            if robot.service is None and robot.on is not None:  # it comes back, to leave by its own word
+                self.guests_over = False
+                robot.boot()
+                self.guests_over = True
+            robot.leave()
+
+    def _order(self) -> None:
+        chance, simulation = self.chance, self.simulation
+        cell = chance.choice(self.free)
+        around = [robot.on for robot in self.robots if robot.on is not None] + self.vehicle_cells()
+        if around and chance.random() < 0.6:
+            middle = chance.choice(around)
+        elif self.walkers and chance.random() < 0.5:
+            walker = chance.choice(self.walkers)
+            row = int((self.grid.north_m - walker.y_m) / self.grid.resolution_m)
+            col = int((walker.x_m - self.grid.west_m) / self.grid.resolution_m)
+            middle = min(max(row, 0), self.grid.rows - 1) * self.grid.cols + min(max(col, 0), self.grid.cols - 1)
+        else:
+            middle = cell
+        row, col = divmod(middle, self.grid.cols)
+        half = chance.choice((1, 2, 4))
+        corners: Any = [
+            (row - half, col - half), (row - half, col + half + 1), (row + half + 1, col + half + 1),
+            (row + half + 1, col - half),
+        ]  # fmt: skip
+        ids = list(self.simulation.book.targets(simulation.scenario)) or ["t0"]
+        name = chance.choice(("a0-00", "a1-00", "a2-00", "extra-00"))
+        order: GiveOrder | ZoneOrder = chance.choice([
+            GiveOrder(subject="pause"),
+            GiveOrder(subject="pause", off=True),
+            GiveOrder(subject="vehicle", name=name, off=chance.random() < 0.4),
+            GiveOrder(subject="group", name="all", targets=[chance.choice(ids)]),
+            GiveOrder(subject="target", name="x", cell=cell, new=True),
+            GiveOrder(subject="target", name=chance.choice(["t0", "x"]), off=True),
+            GiveOrder(subject="target", name="t1", cell=cell),
+            GiveOrder(subject="set", name="time_scale", value=chance.choice([1.0, 5.0, 20.0])),
+            *[ZoneOrder(action="add", name=chance.choice("abc"), polygon=corners)] * 3,
+            ZoneOrder(action="add", name=chance.choice("abc"), polygon=corners, lasts_s=chance.choice([1.0, 4.0])),
+            ZoneOrder(action="remove", name=chance.choice("abc")),
+        ])  # fmt: skip
+        simulation._give(order)
+
+    # --- laws -------------------------------------------------------------------------------------------------
+
+    def _forget_removed(self, node: Node) -> None:
+        """What has left by its agent's word stands nowhere."""
+        if isinstance(node.service, AgentService):
+            bodies = self.trial.laws._bodies.get(node.name, {})
+            gone = node.service._removed | (bodies.keys() & node.service.agent.holdings._away)
+            for id in gone:
+                bodies.pop(id, None)
+            self.removed |= gone
+        for robot in self.robots:
+            self.trial.laws._bodies[robot.name] = {} if robot.on is None else {robot.name: robot.on}
+
+    def _look(self, node: Node) -> None:
+        if not isinstance(node.service, AgentService):
+            return
+        service, now_s = node.service, self.simulation.now_s
+        agent = service.agent
+        pace = agent._map.pace.reshape(-1)
+        known, before, closed, shut = self._before.get(node.name, (None, {}, pace, set()))
+        if known is service:
+            for id, vehicle in agent.vehicles.items():
+                if id not in before:
+                    if id.startswith("extra") and id not in self._seen and vehicle.cell in shut:
+                        self.broken.append(f"{now_s:.2f} {id} enters the map on cell {vehicle.cell}, on a body")
+                    if id.startswith("extra") and id not in self._seen and np.isinf(closed[vehicle.cell]):
+                        self.broken.append(f"{now_s:.2f} {id} enters the map on lethal cell {vehicle.cell}")
+                    continue
+                cell, stood, at_rest = before[id]
+                drives = cell != vehicle.cell or not vehicle.motion.at_rest
+                if stood and at_rest and drives and service._obedience.book.stopped(id):
+                    self.broken.append(f"{now_s:.2f} {id} is ordered to stand and drives")
+                if cell == vehicle.cell:
+                    continue
+                if np.isinf(closed[vehicle.cell]) and np.isfinite(closed[cell]):
+                    self.broken.append(
+                        f"{now_s:.2f} {id} drives from {cell} into {vehicle.cell}, lethal by its map"
+                    )
+        lethal = ~np.isfinite(self.simulation.truth.reshape(-1))
+        for id, vehicle in agent.vehicles.items():
+            towards, self._towards[id] = self._towards.get(id), vehicle.motion.entering
+            if towards is not None and towards == vehicle.motion.entering and lethal[towards]:
+                self.broken.append(f"{now_s:.2f} {id} drives towards {towards}, which is lethal")
+        self._seen.update(agent.vehicles)
+        stopped = service._obedience.book.stopped
+        states = {id: (v.cell, stopped(id), v.motion.at_rest) for id, v in agent.vehicles.items()}
+        self._before[node.name] = (service, states, pace.copy(), set(agent.bodies._closed))
+
+    # --- the run ----------------------------------------------------------------------------------------------
+
+    def run(self) -> list[str]:
+        self._advance(self.seconds - 5.0)
+        broken = self.broken
+        broken += self._orders_obeyed()
+        result = self.trial.run(self.seconds)
+        for text in result:
+            if "vehicles have no route any more" in text:
+                lost = [id for id in self.trial.routed.missing() if id not in self.removed]
+                if lost:
+                    broken.append(f"no route any more: {lost}")
+                continue
+            if text.startswith("driven into body"):
+                continue
+            broken.append(text)
+        for when_s, vehicle, name, cell in self.trial.bodies.broken:
+            if not name.startswith("flood-"):
+                broken.append(f"driven into body {name} at {when_s:.2f}: {vehicle} on {cell}")
+        routed = self.trial.routed
+        if routed.whole_s is not None:
+            late = max((at for id, at in routed._at_s.items() if id not in self.removed), default=0.0)
+            self.routed_after_s = late - routed.whole_s
+        return broken
+
+    def _advance(self, until_s: float) -> None:
+        simulation = self.simulation
+        while simulation.now_s < until_s - 1e-9:
+            while self.calls and self.calls[0][0] <= simulation.now_s:
+                self.calls.pop(0)[1]()
+            for robot in self.robots:
+                robot.tick()
+            self.walkers = [walker for walker in self.walkers if walker.tick()]
+            simulation.run_until(simulation.now_s + TICK_S)
+
+    def _orders_obeyed(self) -> list[str]:
+        """Everybody's book is the keeper's, and holds what was acknowledged."""
+        simulation = self.simulation
+        keeper: Any = simulation.nodes["keeper-0"].service
+        if keeper is None:
+            return ["the keeper is dead at the end"]
+        kept, found = keeper._orders.book, []
+        for order in simulation.book:
+            if not kept.knows(order.subject, order.name, order.stamp_ns):
+                found.append(f"the keeper has lost {order}")
+        for node in simulation.nodes.values():
+            obedience = getattr(node.service, "_obedience", None)
+            if obedience is not None and list(obedience.book) != list(kept):
+                found.append(f"{node.name} goes by another book: {obedience.book.standing} not {kept.standing}")
+        return found

@@ -1,0 +1,60 @@
+"""Vehicles of an added agent enter the map where nobody stands: no body, and not in a zone."""
+
+from __future__ import annotations
+
+from swarm.clock import NS_PER_S
+from vehicle_agent.entering import Entering
+
+
+class Held:
+    """Holdings of which wardens grant nothing by themselves."""
+
+    def __init__(self) -> None:
+        self.life, self.replaced = 1, False
+        self.asked: list[tuple[str, int]] = []
+        self.paths: dict[str, list[int]] = {}
+
+    def path(self, vehicle: str) -> list[int]:
+        return self.paths.get(vehicle, [])
+
+    def enter(self, vehicle: str, cell: int) -> None:
+        self.asked.append((vehicle, cell))
+
+
+def entering(closed: set[int]) -> tuple[Entering, Held]:
+    held = Held()
+    made = Entering(["v"], [1, 2, 3], held, lambda cell: cell not in closed)  # type: ignore[arg-type]
+    made.tick(False, 0)
+    return made, held
+
+
+def test_a_closed_cell_is_not_asked_for() -> None:
+    made, held = entering({1, 2})
+    made.tick(True, 2 * NS_PER_S)
+    assert held.asked == [("v", 3)]
+
+
+def test_a_cell_that_is_closed_while_it_is_asked_for_is_not_taken_and_another_is_asked_for_at_once() -> None:
+    closed: set[int] = set()
+    made, held = entering(closed)
+    made.tick(True, 2 * NS_PER_S)
+    closed.add(1)
+    assert not made.may_stand("v", 1)
+    made.tick(True, 2 * NS_PER_S + 1)
+    assert held.asked == [("v", 1), ("v", 2)]
+    assert made.may_stand("v", 2)
+
+
+def test_who_is_found_where_an_earlier_life_left_it_stands_there_whatever_closes_the_cell() -> None:
+    made, _ = entering({7})
+    assert made.may_stand("v", 7)
+
+
+def test_nothing_is_asked_for_while_every_cell_is_closed() -> None:
+    closed = {1, 2, 3}
+    made, held = entering(closed)
+    made.tick(True, 2 * NS_PER_S)
+    assert held.asked == []
+    closed.remove(2)
+    made.tick(True, 3 * NS_PER_S)
+    assert held.asked == [("v", 2)]
