@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window
-from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.bodies import MOST_M_PER_S, MOST_RADIUS_M, Body
 from vehicle_agent.discs import Capsule
 
 REACTION_S = 0.5
@@ -28,9 +28,6 @@ MAKE_WAY_S = 2.0
 STANDS_NS = NS_PER_S
 """A body that has kept its place for so long is driven around, not waited for."""
 MOST_BODIES = 256
-MOST_RADIUS_M = 100.0
-MOST_M_PER_S = 340.0
-"""What drives quicker than sound is no vehicle, as of marks."""
 MOST_CELLS = 100_000
 """That all bodies together may close: bounds time and memory, and what liars can do."""
 _FURTHEST_CELLS = 64
@@ -182,8 +179,13 @@ class Bodies:
             return 0, f"its speed_m_per_s is {report.speed_m_per_s:g}, expected at most {MOST_M_PER_S:g}"
         window = self._capsule(report, report.speed_m_per_s * (REACTION_S + report.lease_s)).window(self._grid)
         if window.empty:
-            grid, place = self._grid, f"x_m {report.x_m:g}, y_m {report.y_m:g}"
-            return 0, f"{place} is outside the grid, whose west is {grid.west_m:g} and north {grid.north_m:g}"
+            grid, place = self._grid, f"x_m {report.x_m:.10g}, y_m {report.y_m:.10g}"
+            east_m = grid.west_m + grid.cols * grid.resolution_m
+            south_m = grid.north_m - grid.rows * grid.resolution_m
+            return 0, (
+                f"{place} is outside the terrain, which has x_m {grid.west_m:.10g} ... {east_m:.10g} "
+                f"and y_m {south_m:.10g} ... {grid.north_m:.10g}"
+            )
         return window.cells, None
 
     def _crowded(self, known: _Known | None, leaps: bool, charge: int) -> str | None:

@@ -22,13 +22,13 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
     import msgspec
 
     from swarm.errors import ConfigError
-    from swarm.wire.codec import schema_of_type
+    from swarm.wire.codec import field_fault, schema_of_type
 
+    given = {name: value for name, value in fields.items() if value is not None}
     try:
-        given = {name: value for name, value in fields.items() if value is not None}
         return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
     except (msgspec.ValidationError, ValueError) as error:
-        raise ConfigError(f"the order is not possible: {error}") from None
+        raise ConfigError(f"the order is not possible: {field_fault(error, given)}") from None
 
 
 def give(orders: list[GiveOrder], where: Where, tls: Tls, as_json: bool) -> None:

@@ -50,6 +50,7 @@ def check(
     broken = check_plugin(kind, name, table, str(folder), range(seeds))
     for sentence in broken:
         typer.echo(f"broken: {sentence}")
-    typer.echo(f"{name} breaks {len(broken)} promises" if broken else f"{name} keeps what a {kind} promises")
+    many = "1 promise" if len(broken) == 1 else f"{len(broken)} promises"
+    typer.echo(f"{name} breaks {many}" if broken else f"{name} keeps what a {kind} promises")
     if broken:
         raise typer.Exit(1)

@@ -111,6 +111,9 @@ MessagePack first, so the same rules are checked. It may have {MAX_JSON_BYTES >>
 - A column is a list of its numbers, or base64 of its bytes; rows of bytes are lists of lists. Directions are
   `"N"`, `"NE"` ... or their codes. `null` is infinite where a number may be infinite.
 - Unknown fields are refused, unlike in MessagePack: a person who mistypes one is told, in the log of who reads it.
+- `x_m` and `y_m` are of the terrain's own frame: ask `run/*/*` for its `west_m`, `north_m` and `resolution_m`. The
+  middle of a cell is `west_m + (col + 0.5) * resolution_m`, `north_m - (row + 0.5) * resolution_m`. A place outside
+  the terrain, as those below are on that of `jacksboro`, is not used, and named in a note.
 - Numbers from 2^53 on, such as times in ns, lose digits in JavaScript: no harm, as long as a later one is greater.
 
 An answer is JSON if the question was, or has `format=json`. Keys `with a code` take JSON too, with the code over

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.wire.messages.bodies import Body
-from vehicle_agent.bodies import MOST_BODIES, MOST_M_PER_S, MOST_RADIUS_M, REACTION_S, capsule_of
+from swarm.wire.messages.bodies import MOST_M_PER_S, MOST_RADIUS_M, Body
+from vehicle_agent.bodies import MOST_BODIES, REACTION_S, capsule_of
 
 IN_TIME_NS = NS_PER_S // 5
 """Two ticks of an agent: a cell that a body has closed for so long is closed to every vehicle."""

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import bisect
+import contextlib
 import math
+import operator
+import reprlib
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
+from typing import Any
 
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
@@ -41,7 +46,7 @@ class Frame:
 
     def cell(self, x_m: float, y_m: float) -> int:
         """The cell at a place. Raises ConfigError on a place outside the terrain and on what is no number."""
-        grid = self.grid
+        grid, x_m, y_m = self.grid, number("x_m", x_m), number("y_m", y_m)
         if not (math.isfinite(x_m) and math.isfinite(y_m)):
             raise ConfigError(f"x_m {x_m!r}, y_m {y_m!r} is no place: both must be finite numbers of metres")
         row = math.floor((grid.north_m - y_m) / grid.resolution_m)
@@ -79,17 +84,22 @@ class Frame:
     def cells_in(self, polygon_m: Sequence[Point]) -> list[int]:
         """The cells whose middle is inside a polygon, given by its corners; edges that cross leave holes
         (even-odd). Raises ConfigError on fewer than three corners and on what is no number."""
-        if len(polygon_m) < 3 or not all(math.isfinite(value) for corner in polygon_m for value in corner):
-            raise ConfigError(f"a polygon of {len(polygon_m)} corners: expected three or more, all finite numbers")
+        try:
+            corners = [(number("x_m", x_m), number("y_m", y_m)) for x_m, y_m in polygon_m]
+        except (TypeError, ValueError):
+            raise ConfigError("polygon_m is no list of corners, each with x_m and y_m") from None
+        if len(corners) < 3 or not all(math.isfinite(value) for corner in corners for value in corner):
+            raise ConfigError(f"a polygon of {len(corners)} corners: expected three or more, all finite numbers")
         grid, cells = self.grid, []
-        edges = list(zip(polygon_m, [*polygon_m[1:], polygon_m[0]], strict=True))
-        for row in range(grid.rows):
-            y_m = grid.north_m - (row + 0.5) * grid.resolution_m
-            crossings = sorted(
-                ax + (y_m - ay) / (by - ay) * (bx - ax)
-                for (ax, ay), (bx, by) in edges
-                if (ay <= y_m) != (by <= y_m)
-            )
+        middles = [grid.north_m - (row + 0.5) * grid.resolution_m for row in reversed(range(grid.rows))]
+        crossed: dict[int, list[float]] = {}
+        for (ax, ay), (bx, by) in zip(corners, [*corners[1:], corners[0]], strict=True):
+            # Only the rows that an edge crosses are looked at, so that many corners take no more than their length.
+            south, north = sorted((bisect.bisect_left(middles, ay), bisect.bisect_left(middles, by)))
+            for at in range(south, north):
+                crossed.setdefault(grid.rows - 1 - at, []).append(ax + (middles[at] - ay) / (by - ay) * (bx - ax))
+        for row, crossings in sorted(crossed.items()):
+            crossings.sort()
             for left_m, right_m in zip(crossings[::2], crossings[1::2], strict=True):
                 first = math.ceil((left_m - grid.west_m) / grid.resolution_m - 0.5)
                 last = math.ceil((right_m - grid.west_m) / grid.resolution_m - 0.5)
@@ -126,8 +136,21 @@ class Frame:
 
 
 def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
-    """Cells of the terrain, each once. Raises ConfigError on one outside."""
-    once = list(dict.fromkeys(cells))
-    for cell in once:
+    """Cells of the terrain, each once. Raises ConfigError on one outside, and on what is no cell."""
+    once: dict[int, None] = {}
+    for each in cells:
+        try:
+            cell = operator.index(each)  # of NumPy's integers too
+        except TypeError:
+            raise ConfigError(f"cell {reprlib.repr(each)} is no whole number") from None
         frame.centre_m(cell)
-    return once
+        once[cell] = None
+    return list(once)
+
+
+def number(name: str, value: Any) -> float:
+    """What a program gives for a number, as one. Raises ConfigError on anything else, such as text."""
+    if not isinstance(value, str):
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            return float(value)
+    raise ConfigError(f"{name} is {reprlib.repr(value)}, expected a number")

@@ -10,7 +10,7 @@ import msgspec
 from swarm.client.session import Session
 from swarm.errors import ConfigError
 from swarm.orders import Acknowledged, Operator
-from swarm.wire.codec import schema_of_type
+from swarm.wire.codec import field_fault, schema_of_type
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.orders import GiveOrder, Order, Zone, ZoneOrder
 
@@ -85,7 +85,8 @@ class Orders:
         zones, acknowledged = self._operator.zone(
             _checked(
                 ZoneOrder, action="add", name=name, kind="lethal" if pace_s_per_m is None else "pace",
-                pace_s_per_m=pace_s_per_m, polygon_m=[list(corner) for corner in polygon_m], lasts_s=for_s,
+                pace_s_per_m=pace_s_per_m, polygon_m=[*map(list, polygon_m)],
+                lasts_s=for_s,
             )
         )  # fmt: skip
         return zones.changed, acknowledged
@@ -111,4 +112,4 @@ def _checked(message_type: type[M], /, **fields: Any) -> M:
     try:
         return msgspec.convert({**given, "schema": schema_of_type(message_type)}, message_type)
     except (msgspec.ValidationError, ValueError) as error:
-        raise ConfigError(f"the order is not possible: {error}") from None
+        raise ConfigError(f"the order is not possible: {field_fault(error, given)}") from None

@@ -12,7 +12,7 @@ from concurrent.futures import Future
 from typing import Any, Protocol
 
 from swarm.bus.bus import AskEnded, Bus, Event, LinkChanged, Post, Replied
-from swarm.client.frame import Frame
+from swarm.client.frame import Frame, number
 from swarm.clock import NS_PER_S, Clock
 from swarm.errors import BusError, ConfigError, ProtocolError, RunMismatchError, SwarmError
 from swarm.wire.codec import M, decode, encode
@@ -116,6 +116,13 @@ class Session:
         """The error of a value that was not sent, counted."""
         self.counts["refused"] += 1
         return ConfigError(sentence)
+
+    def number(self, name: str, value: Any) -> float:
+        """A number that a program gives. Raises ConfigError, and counts it, on anything else."""
+        try:
+            return number(name, value)
+        except ConfigError as error:
+            raise self.refused(str(error)) from None
 
     def ask(self, topic: Topic, request: Message, timeout_s: float, **fields: str) -> Future[list[Any]]:
         """All answers to a question. Its failure is a BusError."""

@@ -37,6 +37,7 @@ class Target:
                     check_id(name, value)
             except ValueError as error:
                 raise session.refused(str(error)) from error
+        lease_s = session.number("lease_s", lease_s)
         if not 0 < lease_s <= LONGEST_LEASE_S:
             raise session.refused(f"lease_s is {lease_s!r}, expected more than 0 and at most {LONGEST_LEASE_S:g}")
         self.id = id

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import msgspec
 
 from swarm.bus.bus import Asked, Event, Heard, LinkChanged
-from swarm.client.frame import checked_cells
+from swarm.client.frame import checked_cells, number
 from swarm.client.own_marks import OwnMarks
 from swarm.client.right_of_way import RightOfWay
 from swarm.client.route import Route
@@ -20,7 +19,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.wire.fields import check_id
-from swarm.wire.messages.bodies import LONGEST_LEASE_S, Body
+from swarm.wire.messages.bodies import LONGEST_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Body
 from swarm.wire.messages.marks import MarkSet, MarksRequest
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
 from swarm.wire.statements import FOREVER, PACE_LEAST, PACE_MOST, MarkKind
@@ -51,10 +50,11 @@ class Vehicle:
                 raise session.refused(str(error)) from error
         if agent_of(id) != id:
             raise session.refused(f"id {id!r} has a '-', by which the swarm names vehicles of its own agents")
+        radius_m, lease_s = session.number("radius_m", radius_m), session.number("lease_s", lease_s)
         if not 0 < lease_s <= LONGEST_LEASE_S:
             raise session.refused(f"lease_s is {lease_s!r}, expected more than 0 and at most {LONGEST_LEASE_S:g}")
-        if not 0 <= radius_m < math.inf:
-            raise session.refused(f"radius_m is {radius_m!r}, expected metres, 0 or more")
+        if not 0 <= radius_m <= MOST_RADIUS_M:
+            raise session.refused(f"radius_m is {radius_m!r}, expected 0 ... {MOST_RADIUS_M:g} metres")
         self.id = id
         self.group = group
         self.radius_m = radius_m
@@ -99,6 +99,9 @@ class Vehicle:
         with session.lock:
             try:
                 session.frame.cell(x_m, y_m)
+                heading_rad = None if heading_rad is None else number("heading_rad", heading_rad)
+                if not 0 <= (speed_m_per_s := number("speed_m_per_s", speed_m_per_s)) <= MOST_M_PER_S:
+                    raise ConfigError(f"speed_m_per_s is {speed_m_per_s!r}, expected 0 ... {MOST_M_PER_S:g}")
             except ConfigError as error:
                 raise session.refused(f"vehicle {self.id}: {error}") from None
             body = Body(
@@ -109,10 +112,10 @@ class Vehicle:
                 stamp_ns=session.now_ns(),
                 x_m=float(x_m),
                 y_m=float(y_m),
-                heading_rad=None if heading_rad is None else float(heading_rad),
-                speed_m_per_s=float(speed_m_per_s),
-                radius_m=float(self.radius_m),
-                lease_s=float(self.lease_s),
+                heading_rad=heading_rad,
+                speed_m_per_s=speed_m_per_s,
+                radius_m=self.radius_m,
+                lease_s=self.lease_s,
             )
             self._body = session.publish(BODY, body, id=self.id)
             self._seq += 1
@@ -291,6 +294,8 @@ class Vehicle:
         session = self._session
         if (lethal, pace_s_per_m is not None, clear).count(True) != 1:
             raise session.refused("mark states one thing: lethal=True, pace_s_per_m=... or clear=True")
+        pace_s_per_m = None if pace_s_per_m is None else session.number("pace_s_per_m", pace_s_per_m)
+        for_s = None if for_s is None else session.number("for_s", for_s)
         if pace_s_per_m is not None and not PACE_LEAST <= pace_s_per_m <= PACE_MOST:
             raise session.refused(f"pace_s_per_m is {pace_s_per_m!r}, expected {PACE_LEAST:.4g} ... {PACE_MOST:g}")
         if for_s is not None and not 0 < for_s < 1e9:

@@ -26,13 +26,14 @@ def call_within(seconds: float, call: Callable[[], T]) -> T:
     """What `call` returns. Raises `Hangs` in it once so many seconds have passed, and again as often.
 
     An alarm of the operating system ends loops, sleeps and waits alike. It does not reach native code that never
-    comes back to the interpreter: once that has used five times as much processor time, the process is killed, and
-    the line that it hangs in is on its standard error. On another thread than the main one there is neither.
+    comes back to the interpreter, nor end a call that swallows it, as a bare `except` does. Once the first has used
+    five times as much processor time, or the other has swallowed it five times, the process is killed, and the line
+    that it hangs in is on its standard error. On another thread than the main one there is neither.
     """
     if threading.current_thread() is not threading.main_thread():
         return call()
     _tell_line()
-    before = signal.signal(signal.SIGALRM, _ring)
+    before = signal.signal(signal.SIGALRM, _Alarm().ring)
     began_s = time.monotonic()
     left_s, every_s = signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
     signal.setitimer(signal.ITIMER_VIRTUAL, _KILL_FACTOR * seconds)
@@ -50,8 +51,17 @@ def call_within(seconds: float, call: Callable[[], T]) -> T:
             signal.setitimer(signal.ITIMER_REAL, max(left_s - (time.monotonic() - began_s), 1e-3), every_s)
 
 
-def _ring(signum: int, frame: FrameType | None) -> None:
-    raise Hangs
+class _Alarm:
+    """Rings for one call."""
+
+    def __init__(self) -> None:
+        self._rung = 0
+
+    def ring(self, signum: int, frame: FrameType | None) -> None:
+        self._rung += 1
+        if self._rung >= _KILL_FACTOR:
+            signal.raise_signal(KILLED_BY)
+        raise Hangs
 
 
 @functools.cache

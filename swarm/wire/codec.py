@@ -7,7 +7,9 @@ Decision 5 says what each of the two libraries does and what that costs.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+import re
+import reprlib
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
 import msgpack
@@ -36,6 +38,8 @@ _LIMITS: dict[str, Any] = {
     "max_bin_len": MAX_PAYLOAD_BYTES,
     "max_ext_len": 0,
 }
+_STEPS = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
+"""Of a path such as `held.cells[3]`: names and indices."""
 _MANY_SETS = 8
 """From so many sets of marks on, checking them as arrays is faster than one by one."""
 _STATEMENT_COLUMNS = ("cells", "kinds", "paces", "stamps_ns")
@@ -122,7 +126,7 @@ def _unpacked(payload: bytes) -> dict[Any, Any]:
     except ProtocolError:
         raise
     except Exception as error:  # msgpack raises a dozen kinds; none may pass
-        raise ProtocolError(f"{type(error).__name__}: {error}"[:300]) from error
+        raise ProtocolError(f"no MessagePack: {str(error) or type(error).__name__}"[:300]) from error
     if not isinstance(fields, dict) or "schema" not in fields:
         raise ProtocolError("no map with a schema")  # msgspec would take a missing tag for the right one
     return fields
@@ -133,7 +137,24 @@ def _converted(fields: dict[Any, Any], message_type: type[M]) -> M:
     try:
         return msgspec.convert(fields, message_type, builtin_types=_BYTES)
     except Exception as error:
-        raise ProtocolError(f"{type(error).__name__}: {error}"[:300]) from error
+        raise ProtocolError(field_fault(error, fields)) from error
+
+
+def field_fault(error: Exception, fields: Mapping[Any, Any]) -> str:
+    """What msgspec finds wrong with fields, as a sentence: which it is, what was expected, what was found."""
+    expected, _, place = str(error).partition(" - at `$")
+    path = place.rstrip("`").lstrip(".")
+    if not path:
+        return (expected or type(error).__name__)[:300]
+    if expected.startswith("Invalid"):  # says itself what was found
+        return f"{path}: {expected}"[:300]
+    found: Any = fields
+    try:
+        for name, index in _STEPS.findall(path):
+            found = found[int(index)] if index else found[name]
+    except (LookupError, TypeError):  # a place in a mapping, which msgspec writes as [...]
+        return f"{path}: {expected}"[:300]
+    return f"{path}: {expected}, found {reprlib.repr(found)}"[:300]
 
 
 def _checked(message: M) -> M:

@@ -10,6 +10,7 @@ A check raises ValueError, which the codec turns into ProtocolError. Bounds refu
 from __future__ import annotations
 
 import re
+import reprlib
 import sys
 import typing
 from collections.abc import Callable, Iterator
@@ -179,8 +180,10 @@ def check_column(name: str, data: bytes, width: int, count: int) -> None:
         raise ValueError(f"{name} has {len(data)} bytes, expected {count} values of {width}")
 
 
-def check_id(name: str, value: str) -> None:
+def check_id(name: str, value: object) -> None:
     """Raise ValueError unless `value` can be one chunk of a key."""
+    if not isinstance(value, str):
+        raise ValueError(f"{name} is {reprlib.repr(value)}, expected text")
     if value in _KNOWN_IDS:
         return
     if _ID.fullmatch(value) is not None:

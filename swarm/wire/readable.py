@@ -22,7 +22,7 @@ import msgspec
 
 from swarm.errors import ProtocolError
 from swarm.grid import STEP_COL, STEP_ROW
-from swarm.wire.codec import M, schema_of_type
+from swarm.wire.codec import M, field_fault, schema_of_type
 from swarm.wire.fields import CODES, OR_INFINITE, Column, Directions, name_of, taken_apart
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import RouteReply
@@ -46,7 +46,7 @@ def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
     try:
         return msgspec.convert({**fields, "schema": schema_of_type(message_type)}, message_type, strict=False)
     except (msgspec.ValidationError, ValueError) as error:
-        raise ProtocolError(str(error)) from error
+        raise ProtocolError(field_fault(error, fields)) from error
 
 
 def may_be_json(payload: bytes) -> bool:

@@ -11,6 +11,9 @@ from swarm.wire.fields import Distance, Id, Incarnation, Metres, Natural, StampN
 from swarm.wire.messages.base import Message, schema_of
 
 LONGEST_LEASE_S = 10.0
+MOST_RADIUS_M = 100.0
+MOST_M_PER_S = 340.0
+"""What drives quicker than sound is no vehicle, as of marks. Whoever hears more of a body names it and goes on."""
 Heading = Annotated[float, Meta(ge=-2 * math.tau, le=2 * math.tau)]
 Speed = Annotated[float, Meta(ge=0, le=1e6)]
 

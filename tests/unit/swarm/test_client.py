@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import threading
+import time
 from itertools import pairwise
 from typing import Any
 
@@ -104,7 +105,7 @@ def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(
 @pytest.mark.parametrize(
     "wrong",
     [{"id": "a b"}, {"id": "a0-01"}, {"group": "x/y"}, {"radius_m": -1.0}, {"radius_m": math.nan}, {"lease_s": 0.0},
-     {"lease_s": 1e9}],
+     {"lease_s": 1e9}, {"id": 5}, {"id": []}, {"radius_m": "5"}, {"radius_m": 100.1}, {"lease_s": None}],
 )  # fmt: skip
 def test_a_vehicle_that_cannot_be_is_refused_in_a_sentence(world: Swarm, wrong: dict[str, Any]) -> None:
     program = Program(world)
@@ -126,9 +127,12 @@ def test_one_program_has_each_vehicle_and_target_once_at_a_time(world: Swarm) ->
 
 def test_wrong_headings_and_speeds_are_refused_by_the_rules_of_the_wire(world: Swarm) -> None:
     rover = Program(world).swarm.vehicle("rover")
-    for wrong in ({"heading_rad": 99.0}, {"speed_m_per_s": -1.0}, {"speed_m_per_s": math.nan}):
+    for wrong in (
+        {"heading_rad": 99.0}, {"heading_rad": "N"}, {"speed_m_per_s": -1.0}, {"speed_m_per_s": math.nan},
+        {"speed_m_per_s": 341.0}, {"x_m": "5"}, {"x_m": None}, {"y_m": 10**400},
+    ):  # fmt: skip
         with pytest.raises(ConfigError, match=next(iter(wrong))):
-            rover.at(5.0, -5.0, **wrong)
+            rover.at(**({"x_m": 5.0, "y_m": -5.0} | wrong))
 
 
 def test_two_programs_with_one_id_are_both_told_whose_word_counts(world: Swarm) -> None:
@@ -319,6 +323,9 @@ def test_most_processes_say_which_run_it_is_and_what_time() -> None:
         ({"lethal": True, "for_s": -1.0}, "for_s is -1.0"),
         ({"lethal": True, "cells": [3, 10**9]}, "cell 1000000000 is outside"),
         ({"lethal": True, "cells": [-1]}, "cell -1 is outside"),
+        ({"lethal": True, "cells": [3.5]}, "cell 3.5 is no whole number"),
+        ({"lethal": True, "cells": "x"}, "cell 'x' is no whole number"),
+        ({"pace_s_per_m": "quick"}, "pace_s_per_m is 'quick', expected a number"),
     ],
 )
 def test_a_wrong_mark_is_refused_whole(world: Swarm, wrong: dict[str, Any], complaint: str) -> None:
@@ -329,6 +336,7 @@ def test_a_wrong_mark_is_refused_whole(world: Swarm, wrong: dict[str, Any], comp
     world.run(0.5)
     assert not rover._marks.any
     assert program.swarm.counts["refused"] == 1
+    assert rover.mark([3], lethal=True) == 1, "what was refused spoils nothing that follows"
 
 
 def test_a_keeper_that_took_us_for_dead_is_told_again_under_a_higher_epoch() -> None:
@@ -562,6 +570,21 @@ def test_the_cells_of_a_polygon_are_those_whose_middle_a_ray_leaves_an_odd_numbe
         return odd
 
     assert frame.cells_in(corners) == [c for c in range(400) if inside(*frame.centre_m(c))]
+
+
+def test_a_polygon_of_very_many_corners_takes_no_longer_than_they_are_many() -> None:
+    frame = Frame(GridSpec(500, 500, 10.0))
+    turns = [step * math.tau / 50_000 for step in range(50_000)]
+    began_s = time.process_time()
+    cells = frame.cells_in([(2500 + 1000 * math.cos(turn), -2500 + 1000 * math.sin(turn)) for turn in turns])
+    assert time.process_time() - began_s < 2.0
+    assert len(cells) == pytest.approx(math.pi * 100**2, rel=0.01)
+
+
+@pytest.mark.parametrize("corners", ["abc", [1, 2, 3], [(1, 2), (3, 4), (5, "6")], [(0, 0, 0)] * 3, 5])
+def test_what_is_no_polygon_is_refused_in_a_sentence(corners: Any) -> None:
+    with pytest.raises(ConfigError, match=r"polygon_m is no list of corners|x_m is|y_m is"):
+        Frame(GridSpec(5, 5, 1.0)).cells_in(corners)
 
 
 def test_latitudes_need_coordinates_and_pyproj() -> None:

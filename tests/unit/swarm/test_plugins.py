@@ -265,6 +265,23 @@ def test_on_another_thread_a_call_is_made_without_an_alarm() -> None:
     assert found == [3]
 
 
+def test_a_call_that_swallows_the_alarm_ends_its_process_with_the_line_that_it_hangs_in() -> None:
+    code = (
+        "import time\n"
+        "from swarm.plugins.deadline import call_within\n"
+        "def swallows():\n"
+        "    while True:\n"
+        "        try:\n"
+        "            time.sleep(30)\n"
+        "        except:\n"
+        "            pass\n"
+        "call_within(0.1, swallows)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=20)
+    assert ended.returncode == -KILLED_BY
+    assert "in swallows" in ended.stderr
+
+
 @settings(deadline=None)
 @given(st.from_regex(r"[\w.+:-]{0,20}", fullmatch=True))
 def test_whatever_a_scenario_names_is_found_or_refused_in_one_sentence(name: str) -> None:

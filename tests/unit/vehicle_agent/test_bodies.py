@@ -84,8 +84,8 @@ def test_a_body_that_says_that_it_leaves_opens_its_cells_at_once(bodies: Bodies)
 @pytest.mark.parametrize(
     ("said", "why"),
     [
-        ({"x_m": -500.0}, "outside the grid, whose west is 0 and north 0"),
-        ({"y_m": 9e8}, "outside the grid"),
+        ({"x_m": -500.0}, "is outside the terrain, which has x_m 0 ... "),
+        ({"y_m": 9e8}, "outside the terrain"),
         ({"speed_m_per_s": 1e6}, "its speed_m_per_s is 1e+06, expected at most 340"),
         ({"radius_m": 1000.0}, "its radius_m is 1000, expected at most 100"),
     ],
