@@ -6,6 +6,7 @@ one cannot drive there, and a level plain is the cheapest ground of all.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -158,6 +159,34 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     found = found[np.argsort(-cells[found], kind="stable")]
     patches = tuple((float(height_m[n]), int(cells[n])) for n in found.tolist())
     return LevelGround(water[with_shore], patches, float(cells[unsure].sum() / elevation_m.size))
+
+
+def without(heights: Floats, voids: Sequence[float]) -> Floats:
+    """Heights as stored, with NaN for each value that stands for no height."""
+    if not voids:
+        return heights
+    return np.where(np.isin(heights, np.array(voids, np.float32)), np.float32(np.nan), heights)
+
+
+def looked_at(
+    stored: Floats, config: TerrainConfig, scale: float = 1.0, offset: float = 0.0
+) -> tuple[tuple[float, ...], Bools, list[str]]:
+    """(values that stand for no height, bool (rows, cols) of what is level, what people should know of both).
+
+    Parameters
+    ----------
+    stored : float32 (rows, cols)
+        As in the file; `scale` and `offset` make metres of it. Of a large one only some cells are looked at for
+        what is level.
+    """
+    unknown = undeclared_voids(without(stored, config.nodata_values))
+    voids = (*config.nodata_values, *unknown)
+    rows, cols = stored.shape
+    every = math.ceil(math.sqrt(max(stored.size / MOST_SAMPLED, 1.0)))
+    some_m = without(stored[::every, ::every], voids) * np.float32(scale) + np.float32(offset)
+    found = level_ground(some_m)
+    level = found.mask.repeat(every, axis=0)[:rows].repeat(every, axis=1)[:, :cols]
+    return voids, level, [*notes_of_voids(unknown), *notes_of_level(found, config)]
 
 
 def notes_of_voids(voids: Sequence[float]) -> Iterator[str]:

@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.georeference import crs_of, plan_grid, resampling
-from shared_map.terrain.importers.level_ground import (
-    MOST_SAMPLED,
-    level_ground,
-    notes_of_level,
-    notes_of_voids,
-    undeclared_voids,
-)
+from shared_map.terrain.importers.level_ground import MOST_SAMPLED, looked_at, without
 from shared_map.terrain.importers.raster_kinds import kind_of
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.config.input_files import size
@@ -194,11 +188,9 @@ def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_pr
         if dataset.count == 2:
             notes.append("the file has two bands; heights are taken from the first")
         sample = _sampled(dataset)
-        voids = (*config.nodata_values, *undeclared_voids(_without(sample, config.nodata_values)))
-        notes.extend(notes_of_voids(voids[len(config.nodata_values) :]))
-        found = level_ground(_without(sample, voids) * np.float32(factor) + np.float32(offset))
-        notes.extend(notes_of_level(found, config))
-        level = _placed_mask(dataset, found.mask, crs, grid, target)
+        voids, found, told = looked_at(sample, config, factor, offset)
+        notes.extend(told)
+        level = _placed_mask(dataset, found, crs, grid, target)
         elevation_m = np.empty((grid.rows, grid.cols), np.float32)
         heights = _heights_without(dataset, voids, path) if voids and target is not None else None
         for row0, row1 in bands(grid.rows, _READ_ROWS):
@@ -227,12 +219,6 @@ def _sampled(dataset: Any) -> Floats:
     return sample
 
 
-def _without(heights: Floats, voids: Sequence[float]) -> Floats:
-    if not voids:
-        return heights
-    return np.where(np.isin(heights, np.array(voids, np.float32)), np.float32(np.nan), heights)
-
-
 def _heights_without(dataset: Any, voids: Sequence[float], path: Path) -> Floats:
     """The whole first band, float32, as stored, NaN where there is no height. GDAL warps one value of no height
     only; of a second one it would make slopes."""
@@ -243,7 +229,7 @@ def _heights_without(dataset: Any, voids: Sequence[float], path: Path) -> Floats
         )
     heights: Floats = dataset.read(1).astype(np.float32)
     heights[dataset.read_masks(1) == 0] = np.nan
-    return _without(heights, voids)
+    return without(heights, voids)
 
 
 def _placed_mask(dataset: Any, mask: Bools, crs: Any, grid: GridSpec, target: Any) -> Bools:
@@ -291,7 +277,7 @@ def _read_straight(dataset: Any, row0: int, row1: int, band: Floats, voids: Sequ
     elif MaskFlags.all_valid not in flags:
         band[dataset.read_masks(1, window=window) == 0] = np.nan
     if voids:
-        band[:] = _without(band, voids)
+        band[:] = without(band, voids)
 
 
 def _read_warped(

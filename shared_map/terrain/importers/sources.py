@@ -167,24 +167,10 @@ def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
     """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
-    from shared_map.terrain.importers.level_ground import (
-        MOST_SAMPLED,
-        level_ground,
-        notes_of_level,
-        notes_of_voids,
-        undeclared_voids,
-    )
+    from shared_map.terrain.importers.level_ground import looked_at, without
 
-    heights = stored.astype(np.float32)
-    heights[np.isin(heights, np.array(config.nodata_values, np.float32))] = np.nan
-    voids = undeclared_voids(heights)
-    heights[np.isin(heights, np.array(voids, np.float32))] = np.nan
-    heights *= np.float32(scale)
-    rows, cols = heights.shape
-    every = math.ceil(math.sqrt(max(heights.size / MOST_SAMPLED, 1.0)))
-    found = level_ground(heights[::every, ::every])
-    level = found.mask.repeat(every, axis=0)[:rows].repeat(every, axis=1)[:, :cols]
-    return heights, level, [*notes_of_voids(voids), *notes_of_level(found, config)]
+    voids, level, told = looked_at(stored.astype(np.float32), config, scale)
+    return without(stored.astype(np.float32), voids) * np.float32(scale), level, told
 
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
