@@ -16,8 +16,8 @@ from typing import Literal, Protocol
 from planner_service.tree.windows import AHEAD
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
-from swarm.plugins.door import Door, Nonsense, Tell
 from swarm.plugins.find import Plugin
+from swarm.plugins.guard import Guard, Nonsense, Tell
 
 
 class OnMove(Enum):
@@ -177,18 +177,18 @@ def strategy_of(plugin: Plugin, world: StrategyWorld, tell: Tell) -> Strategy:
     """The strategy that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
     if plugin.factory is None:
         return STRATEGIES[plugin.named.name]()
-    return PluginStrategy(plugin.make(world), Door(plugin, tell))
+    return PluginStrategy(plugin.make(world), Guard(plugin, tell))
 
 
 class PluginStrategy:
     """The rows of a plug-in; whole trees, which are exact, once it has failed."""
 
-    def __init__(self, strategy: Strategy, door: Door) -> None:
+    def __init__(self, strategy: Strategy, guard: Guard) -> None:
         self._strategy = strategy
-        self._door = door
+        self._guard = guard
 
     def row(self, growths: Growths) -> StrategyRow:
-        return self._door.ask(lambda: self._strategy.row(growths), _checked, lambda: STAGES["exact"])
+        return self._guard.ask(lambda: self._strategy.row(growths), _checked, lambda: STAGES["exact"])
 
 
 def _checked(row: object) -> StrategyRow:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
-from swarm.plugins.door import Door, Nonsense, Tell
 from swarm.plugins.find import Plugin
+from swarm.plugins.guard import Guard, Nonsense, Tell
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.driving.vehicle import Vehicle
 
@@ -165,19 +165,19 @@ def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
     """The assigner that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
     if plugin.factory is None:
         return ASSIGNERS[plugin.named.name]()
-    return PluginAssigner(plugin.make(world), Door(plugin, tell))
+    return PluginAssigner(plugin.make(world), Guard(plugin, tell))
 
 
 class PluginAssigner:
     """What a plug-in assigns; even shares once it has failed."""
 
-    def __init__(self, assigner: Assigner, door: Door) -> None:
+    def __init__(self, assigner: Assigner, guard: Guard) -> None:
         self._assigner = assigner
-        self._door = door
+        self._guard = guard
 
     def assign(self, table: CostTable) -> NDArray[np.int64]:
         told = replace(table, costs_s=table.costs_s.copy())
-        return self._door.ask(
+        return self._guard.ask(
             lambda: self._assigner.assign(told),
             lambda chosen: _checked(chosen, table.costs_s),
             lambda: spread(table.costs_s, table.current),

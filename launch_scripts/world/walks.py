@@ -19,8 +19,8 @@ from shared_map.arrays import CellsOf
 from swarm.config.scenario import CostConfig, TargetConfig
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
-from swarm.plugins.door import Door, Nonsense, Tell
 from swarm.plugins.find import Plugin
+from swarm.plugins.guard import Guard, Nonsense, Tell
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -284,19 +284,19 @@ def walk_of(plugin: Plugin, world: WalkWorld, tell: Tell) -> Walk:
     """The walk that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
     if plugin.factory is None:
         return WALKS[plugin.named.name](world)
-    return PluginWalk(plugin.make(world), world.terrain, Door(plugin, tell))
+    return PluginWalk(plugin.make(world), world.terrain, Guard(plugin, tell))
 
 
 class PluginWalk:
     """The steps that a plug-in chooses, each of them legal. The target stands still once it has failed."""
 
-    def __init__(self, walk: Walk, terrain: TrueTerrain, door: Door) -> None:
+    def __init__(self, walk: Walk, terrain: TrueTerrain, guard: Guard) -> None:
         self._walk = walk
         self._terrain = terrain
-        self._door = door
+        self._guard = guard
 
     def choose(self, cell: int, vehicles: NDArray[np.int64]) -> int | None:
-        return self._door.ask(
+        return self._guard.ask(
             lambda: self._walk.choose(cell, vehicles.copy()), lambda to: self._legal(cell, to), lambda: None
         )
 

@@ -13,8 +13,8 @@ from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
-from swarm.plugins.door import Door, Nonsense
 from swarm.plugins.find import Plugin, find_plugin
+from swarm.plugins.guard import Guard, Nonsense
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 
@@ -70,8 +70,8 @@ def checked_layer(plugin: Plugin, world: CostWorld, pace: Floats) -> Floats:
     """The pace with one layer. Raises TerrainError if that fails, ConfigError if it cannot be made."""
     layer: CostLayer = plugin.make(world)
     void = np.isnan(world.elevation_m)
-    door = Door(plugin, _refuse)
-    return door.ask(lambda: layer.cost(pace.copy()), lambda found: _checked(found, pace, void), lambda: pace)
+    guard = Guard(plugin, _refuse)
+    return guard.ask(lambda: layer.cost(pace.copy()), lambda found: _checked(found, pace, void), lambda: pace)
 
 
 def _refuse(fault: str) -> NoReturn:

@@ -43,7 +43,7 @@ def call_within(seconds: float, call: Callable[[], T]) -> T:
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
     finally:
-        # Again: the alarm may have rung after the call, before it was put off.
+        # Again: the alarm may have come after the call, before it was put off.
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
         signal.signal(signal.SIGALRM, before)

@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from swarm.grid import GridSpec
-from swarm.plugins.door import Door, Nonsense, Tell
 from swarm.plugins.find import Plugin
+from swarm.plugins.guard import Guard, Nonsense, Tell
 from vehicle_agent.driving.motion import Motion
 
 
@@ -67,16 +67,16 @@ def dynamics_of(plugin: Plugin, world: DynamicsWorld, tell: Tell) -> PluginDynam
     """
     if plugin.factory is None:
         return None
-    return PluginDynamics(plugin.make(world), world.grid, Door(plugin, tell))
+    return PluginDynamics(plugin.make(world), world.grid, Guard(plugin, tell))
 
 
 class PluginDynamics:
     """Drives vehicles at the speeds of a plug-in; as the ground allows once it has failed."""
 
-    def __init__(self, dynamics: Dynamics, grid: GridSpec, door: Door) -> None:
+    def __init__(self, dynamics: Dynamics, grid: GridSpec, guard: Guard) -> None:
         self._dynamics = dynamics
         self._grid = grid
-        self._door = door
+        self._guard = guard
         self._tick_s = 0.0
         self._were: dict[str, tuple[float, float]] = {}
         """Vehicle -> speed and heading at the end of the last tick, of those which drove in it."""
@@ -95,14 +95,14 @@ class PluginDynamics:
 
         path  the cells that the vehicle was granted, from its own on
         """
-        if not self._door.works or not math.isfinite(pace_s_per_m):
+        if not self._guard.works or not math.isfinite(pace_s_per_m):
             return motion.advance(seconds, pace_s_per_m)
         limit = 1.0 / pace_s_per_m
         speed, heading = self._were.get(vehicle, (0.0, motion.heading_rad))
         before = self._are[vehicle][1] if vehicle in self._are else heading
         turn = (motion.heading_rad - before + math.pi) % math.tau - math.pi
         stretch = Stretch(vehicle, speed, limit, turn, self._ahead_m(motion, path), self._tick_s)
-        wanted = self._door.ask(lambda: self._dynamics.speed(stretch), _checked, lambda: limit)
+        wanted = self._guard.ask(lambda: self._dynamics.speed(stretch), _checked, lambda: limit)
         chosen = min(wanted, limit)
         self._are[vehicle] = chosen, motion.heading_rad
         return motion.advance(seconds, 1.0 / chosen if chosen > 0 else math.inf)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import GridSpec
-from swarm.plugins.door import Door, Nonsense, Tell
 from swarm.plugins.find import Plugin
+from swarm.plugins.guard import Guard, Nonsense, Tell
 from swarm.wire.statements import PACE_LEAST, PACE_MOST, MarkKind
 
 _TOLERANCE = np.float32(0.01)
@@ -103,22 +103,22 @@ def sensor_of(plugin: Plugin, world: SensorWorld, tell: Tell) -> Sensor:
     truth = world.truth_s_per_m.view()
     truth.flags.writeable = False
     world = SensorWorld(world.grid, truth, world.range_m, world.agent, world.seed)
-    return PluginSensor(plugin.make(world), world, Door(plugin, tell))
+    return PluginSensor(plugin.make(world), world, Guard(plugin, tell))
 
 
 class PluginSensor:
     """A plug-in's sight, and of the cells next to a vehicle the truth: a bumper, which no plug-in takes away, and
     whose word counts where they differ. So no vehicle stands for ever before what its sensor does not see."""
 
-    def __init__(self, sensor: Sensor, world: SensorWorld, door: Door) -> None:
+    def __init__(self, sensor: Sensor, world: SensorWorld, guard: Guard) -> None:
         self._sensor = sensor
         self._cells = world.grid.cells
         self._bumper = TruthSensor(world.grid, world.truth_s_per_m, 0.0)
-        self._door = door
+        self._guard = guard
 
     def look(self, cells: Sequence[int]) -> Sight:
         near = self._bumper.look(cells)
-        return self._door.ask(
+        return self._guard.ask(
             lambda: self._sensor.look(list(cells)), lambda sight: self._beside(near, sight), lambda: near
         )
 

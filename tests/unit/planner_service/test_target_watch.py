@@ -199,7 +199,7 @@ def test_however_many_trackers_a_liar_makes_up_few_are_named() -> None:
     ("field", "value"),
     [("x_m", float("nan")), ("lease_s", float("inf")), ("lease_s", -1.0), ("lease_s", 61.0), ("tracker", "a/b")],
 )
-def test_what_no_pose_may_say_is_refused_at_the_door(field: str, value: Any) -> None:
+def test_what_no_pose_may_say_is_refused_when_it_is_decoded(field: str, value: Any) -> None:
     here = Watch()
     here.hear()
     pose = here.watch.pose

@@ -1,4 +1,4 @@
-"""How plug-ins are named and found, and the door through which they are called."""
+"""How plug-ins are named and found, and the guard through which they are called."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.errors import ConfigError
 from swarm.plugins.deadline import KILLED_BY, Hangs, call_within
-from swarm.plugins.door import Door, Nonsense
 from swarm.plugins.find import Plugin, check_plugins, find_plugin, named_plugin
+from swarm.plugins.guard import Guard, Nonsense
 
 MODULE = """
 import msgspec, dataclasses
@@ -151,13 +151,13 @@ def test_an_installed_packages_name_is_found_and_two_of_one_name_are_refused(
     check_plugins(scenario, ["planner", "targets"])  # others do not need it
 
 
-# --- the door ---------------------------------------------------------------------------------------------------
+# --- the guard --------------------------------------------------------------------------------------------------
 
 
 class Faults(list[str]):
-    def door(self, call_s: float = 0.2) -> Door:
+    def guard(self, call_s: float = 0.2) -> Guard:
         named = NamedPlugin(replace(PLUGIN_KINDS["sensor"], call_s=call_s), "vehicles.sensor", "eyes:Wide", {})
-        return Door(Plugin(named, None, {}), self.append)
+        return Guard(Plugin(named, None, {}), self.append)
 
 
 def whole(value: object) -> int:
@@ -168,9 +168,9 @@ def whole(value: object) -> int:
 
 def test_a_plugin_that_works_is_asked_each_time() -> None:
     faults = Faults()
-    door = faults.door()
-    assert [door.ask(lambda n=n: n, whole, lambda: -1) for n in range(5)] == list(range(5))  # type: ignore[misc]
-    assert door.works
+    guard = faults.guard()
+    assert [guard.ask(lambda n=n: n, whole, lambda: -1) for n in range(5)] == list(range(5))  # type: ignore[misc]
+    assert guard.works
     assert not faults
 
 
@@ -205,15 +205,15 @@ def recurse() -> None:
 )
 def test_one_that_fails_is_named_once_and_never_asked_again(call: object, said: str) -> None:
     faults = Faults()
-    door = faults.door()
+    guard = faults.guard()
     asked = []
 
     def ask() -> int:
-        return door.ask(lambda: asked.append(1) or call(), whole, lambda: -1)  # type: ignore[func-returns-value, operator]
+        return guard.ask(lambda: asked.append(1) or call(), whole, lambda: -1)  # type: ignore[func-returns-value, operator]
 
     assert [ask(), ask(), ask()] == [-1] * 3
     assert len(asked) == len(faults) == 1
-    assert not door.works
+    assert not guard.works
     assert faults[0].startswith("sensor plug-in 'eyes:Wide' of vehicles.sensor: ")
     assert said in faults[0]
     assert faults[0].endswith("; this agent's vehicles see only the cells next to them now")
@@ -223,21 +223,21 @@ def test_one_that_fails_is_named_once_and_never_asked_again(call: object, said: 
 def test_an_interrupt_of_the_user_is_no_fault_of_the_plugin() -> None:
     faults = Faults()
     with pytest.raises(KeyboardInterrupt):
-        faults.door().ask(lambda: signal.raise_signal(signal.SIGINT), whole, lambda: -1)
+        faults.guard().ask(lambda: signal.raise_signal(signal.SIGINT), whole, lambda: -1)
     assert not faults
 
 
 def test_an_alarm_leaves_that_of_others_as_it_was() -> None:
-    rung: list[int] = []
-    before = signal.signal(signal.SIGALRM, lambda *_: rung.append(1))
+    fired: list[int] = []
+    before = signal.signal(signal.SIGALRM, lambda *_: fired.append(1))
     old = signal.setitimer(signal.ITIMER_REAL, 0.3)
     try:
         with pytest.raises(Hangs):
             call_within(0.05, spin)
         assert call_within(5.0, lambda: 3) == 3
-        assert not rung
+        assert not fired
         time.sleep(0.5)
-        assert rung == [1]
+        assert fired == [1]
     finally:
         signal.signal(signal.SIGALRM, before)
         signal.setitimer(signal.ITIMER_REAL, *old)

@@ -1,4 +1,4 @@
-"""The door through which a plug-in is called: whatever it does there, its caller gets a checked value.
+"""The guard through which a plug-in is called: whatever it does there, its caller gets a checked value.
 
 One that raises, hangs or returns what breaks its contract is out for the rest of the process's life: its fault is
 said once, with its name, its kind and the place, and its caller does what `PluginKind.failing` says.
@@ -28,7 +28,7 @@ class Nonsense(SwarmError):  # noqa: N818
     """What a plug-in returned breaks its contract: what was found, what was expected."""
 
 
-class Door:
+class Guard:
     """Where one plug-in is called.
 
     tell   takes its fault
