@@ -6,9 +6,10 @@ import importlib.util
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.ground_cover import classified, with_photo, with_water, without_voids
@@ -20,6 +21,9 @@ from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
+
+if TYPE_CHECKING:
+    from shared_map.terrain.importers.raster_contents import Contents
 
 JACKSBORO_RESOLUTION_M = 75.0
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
@@ -61,12 +65,28 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
         source = _from_file(Path(config.source), config, progress)
     source = without_voids(source, config)
     if config.photo is not None:
+        config = _photo_or_cover(config)
+    if config.photo is not None:
         source = with_photo(source, Path(config.photo), config, progress)
     if source.photo is not None:
         source = classified(source, config, seed, progress)
     elif config.labels is not None:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
-    return with_water(source, config)
+    source = with_water(source, config)
+    if config.cover is not None:
+        from shared_map.terrain.importers.land_cover import with_cover
+
+        source = with_cover(source, config, progress)
+    return source
+
+
+def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
+    """The settings with a photo that is a drawn map of land cover named as such."""
+    from shared_map.terrain.importers.land_cover import is_drawn
+
+    if config.photo is None or config.cover is not None or config.labels is not None:
+        return config
+    return replace(config, photo=None, cover=config.photo) if is_drawn(Path(config.photo), config) else config
 
 
 # --- built in -----------------------------------------------------------------------------------------------
@@ -125,12 +145,74 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 
 def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.terrain.importers.rasters import read_elevation
+    from shared_map.terrain.importers.rasters import elevation_of, opened
 
     _check_hgt(path)
-    raster = read_elevation(path, config, progress)
+    with opened(path, "terrain") as dataset:
+        source = _of_other_contents(dataset, path, config, progress)
+        if source is not None:
+            return source
+        raster = elevation_of(dataset, path, config, progress)
     classes = np.zeros(raster.elevation_m.shape, np.uint8)
     return Source(raster.grid, raster.elevation_m, classes, level=raster.level, notes=(str(path), *raster.notes))
+
+
+def _of_other_contents(dataset: Any, path: Path, config: TerrainConfig, progress: Progress) -> Source | None:
+    """What a raster gives that holds land cover, or heights stored as colours; None if it holds plain heights."""
+    from shared_map.terrain.importers.raster_contents import contents_of
+
+    holds = contents_of(dataset, f"terrain {path}", config)
+    if holds.is_cover:
+        return _cover(dataset, path, config, progress)
+    return None if holds.encoding is None else _colours(dataset, holds, path, config, progress)
+
+
+def _cover(dataset: Any, path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    """A land-cover map alone: its classes on level ground."""
+    from shared_map.terrain.importers.georeference import check_size, crs_of, plan_grid
+    from shared_map.terrain.importers.land_cover import read_cover
+
+    what, notes = f"terrain {path}", list[str]()
+    if _has_place(dataset):
+        crs = crs_of(dataset.crs, config.crs, what)
+        placed = (dataset.transform, dataset.height, dataset.width, crs)
+        grid, _, notes = plan_grid(*placed, config.resolution_m, what)
+    else:
+        check_size(dataset.height, dataset.width, what)
+        grid = GridSpec(dataset.height, dataset.width, _scale_of(path, config))
+    cover = read_cover(path, grid, config, progress)
+    level = np.zeros((grid.rows, grid.cols), np.float32)
+    alone = "there are no heights: the land cover lies on level ground, and slopes cost nothing"
+    return Source(grid, level, cover.classes, factor=cover.factor, notes=(str(path), *notes, *cover.notes, alone))
+
+
+def _colours(dataset: Any, holds: Contents, path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    """Heights stored as colours, decoded in the file's own cells."""
+    from shared_map.terrain.importers.encoded_heights import TITLES, heights_decoded
+    from shared_map.terrain.importers.rasters import elevation_of
+
+    assert holds.encoding is not None
+    known = f"heights are stored as colours, {TITLES[holds.encoding]}, {holds.how}"
+    with heights_decoded(dataset, holds.encoding, path) as (heights, told):
+        if _has_place(dataset):
+            raster = elevation_of(heights, path, config, progress)
+            grid, elevation_m, level, notes = raster.grid, raster.elevation_m, raster.level, list(raster.notes)
+        else:
+            elevation_m, level, notes = _looked_at(heights.read(1), config.height_scale or 1.0, config)
+            grid = GridSpec(elevation_m.shape[0], elevation_m.shape[1], _scale_of(path, config))
+    classes = np.zeros(elevation_m.shape, np.uint8)
+    return Source(grid, elevation_m, classes, level=level, notes=(str(path), known, *told, *notes))
+
+
+def _has_place(dataset: Any) -> bool:
+    return bool(dataset.crs) or not dataset.transform.is_identity
+
+
+def _scale_of(path: Path, config: TerrainConfig) -> float:
+    """Metres per pixel of an image without a place."""
+    if config.resolution_m is None:
+        raise TerrainError(f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel)")
+    return config.resolution_m
 
 
 def _check_hgt(path: Path) -> None:
@@ -149,12 +231,15 @@ def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     from shared_map.terrain.importers.georeference import check_size
     from shared_map.terrain.importers.rasters import opened
 
-    if config.resolution_m is None or config.height_scale is None:
-        raise TerrainError(
-            f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel) and"
-            " terrain.height_scale (metres per grey level)"
-        )
     with opened(path, "terrain") as dataset:
+        source = _of_other_contents(dataset, path, config, progress)
+        if source is not None:
+            return source
+        if config.resolution_m is None or config.height_scale is None:
+            raise TerrainError(
+                f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel) and"
+                " terrain.height_scale (metres per grey level)"
+            )
         if dataset.count not in (1, 2):
             raise TerrainError(f"terrain {path} has {dataset.count} colour bands; heights are one grey band")
         check_size(dataset.height, dataset.width, f"terrain {path}")
@@ -290,9 +375,7 @@ def _from_degrees(
 
 
 def _at(config: TerrainConfig, resolution_m: float) -> TerrainConfig:
-    import msgspec
-
-    return msgspec.structs.replace(config, resolution_m=resolution_m)
+    return replace(config, resolution_m=resolution_m)
 
 
 def _from_metres(
