@@ -106,8 +106,10 @@ def encodings_of(dataset: Any) -> list[Encoding]:
 
 
 @contextmanager
-def heights_decoded(dataset: Any, encoding: Encoding, path: Path) -> Iterator[tuple[Any, list[str]]]:
-    """(a dataset of the decoded heights at the same place, NaN for no height; what people should know of it).
+def heights_decoded(
+    dataset: Any, encoding: Encoding, path: Path, crs: Any, transform: Any
+) -> Iterator[tuple[Any, list[str]]]:
+    """(a dataset of the decoded heights at a place, NaN for no height; what people should know of it).
 
     Raises TerrainError if the image is no such one, too large, or was compressed with loss, which leaves no height
     as it was.
@@ -127,7 +129,7 @@ def heights_decoded(dataset: Any, encoding: Encoding, path: Path) -> Iterator[tu
     rows, cols = dataset.height, dataset.width
     if rows * cols > _MOST_CELLS:
         raise TerrainError(f"{what} has {rows} x {cols} pixels, {size(4 * rows * cols)} of heights; crop it")
-    place = {"crs": dataset.crs, "transform": dataset.transform, "nodata": math.nan}
+    place = {"crs": crs, "transform": transform, "nodata": math.nan}
     voids = 0
     with MemoryFile() as memory:
         with memory.open(driver="GTiff", height=rows, width=cols, count=1, dtype="float32", **place) as copy:

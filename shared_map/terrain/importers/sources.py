@@ -6,7 +6,7 @@ import importlib.util
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -21,9 +21,6 @@ from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
-
-if TYPE_CHECKING:
-    from shared_map.terrain.importers.raster_contents import Contents
 
 JACKSBORO_RESOLUTION_M = 75.0
 JACKSBORO_FILE = "jacksboro_fault_dem.npz"
@@ -145,74 +142,17 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 
 def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
+    from shared_map.terrain.importers.coded_rasters import of_other_contents
     from shared_map.terrain.importers.rasters import elevation_of, opened
 
     _check_hgt(path)
     with opened(path, "terrain") as dataset:
-        source = _of_other_contents(dataset, path, config, progress)
+        source = of_other_contents(dataset, path, config, progress)
         if source is not None:
             return source
         raster = elevation_of(dataset, path, config, progress)
     classes = np.zeros(raster.elevation_m.shape, np.uint8)
     return Source(raster.grid, raster.elevation_m, classes, level=raster.level, notes=(str(path), *raster.notes))
-
-
-def _of_other_contents(dataset: Any, path: Path, config: TerrainConfig, progress: Progress) -> Source | None:
-    """What a raster gives that holds land cover, or heights stored as colours; None if it holds plain heights."""
-    from shared_map.terrain.importers.raster_contents import contents_of
-
-    holds = contents_of(dataset, f"terrain {path}", config)
-    if holds.is_cover:
-        return _cover(dataset, path, config, progress)
-    return None if holds.encoding is None else _colours(dataset, holds, path, config, progress)
-
-
-def _cover(dataset: Any, path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    """A land-cover map alone: its classes on level ground."""
-    from shared_map.terrain.importers.georeference import check_size, crs_of, plan_grid
-    from shared_map.terrain.importers.land_cover import read_cover
-
-    what, notes = f"terrain {path}", list[str]()
-    if _has_place(dataset):
-        crs = crs_of(dataset.crs, config.crs, what)
-        placed = (dataset.transform, dataset.height, dataset.width, crs)
-        grid, _, notes = plan_grid(*placed, config.resolution_m, what)
-    else:
-        check_size(dataset.height, dataset.width, what)
-        grid = GridSpec(dataset.height, dataset.width, _scale_of(path, config))
-    cover = read_cover(path, grid, config, progress)
-    level = np.zeros((grid.rows, grid.cols), np.float32)
-    alone = "there are no heights: the land cover lies on level ground, and slopes cost nothing"
-    return Source(grid, level, cover.classes, factor=cover.factor, notes=(str(path), *notes, *cover.notes, alone))
-
-
-def _colours(dataset: Any, holds: Contents, path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    """Heights stored as colours, decoded in the file's own cells."""
-    from shared_map.terrain.importers.encoded_heights import TITLES, heights_decoded
-    from shared_map.terrain.importers.rasters import elevation_of
-
-    assert holds.encoding is not None
-    known = f"heights are stored as colours, {TITLES[holds.encoding]}, {holds.how}"
-    with heights_decoded(dataset, holds.encoding, path) as (heights, told):
-        if _has_place(dataset):
-            raster = elevation_of(heights, path, config, progress)
-            grid, elevation_m, level, notes = raster.grid, raster.elevation_m, raster.level, list(raster.notes)
-        else:
-            elevation_m, level, notes = _looked_at(heights.read(1), config.height_scale or 1.0, config)
-            grid = GridSpec(elevation_m.shape[0], elevation_m.shape[1], _scale_of(path, config))
-    classes = np.zeros(elevation_m.shape, np.uint8)
-    return Source(grid, elevation_m, classes, level=level, notes=(str(path), known, *told, *notes))
-
-
-def _has_place(dataset: Any) -> bool:
-    return bool(dataset.crs) or not dataset.transform.is_identity
-
-
-def _scale_of(path: Path, config: TerrainConfig) -> float:
-    """Metres per pixel of an image without a place."""
-    if config.resolution_m is None:
-        raise TerrainError(f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel)")
-    return config.resolution_m
 
 
 def _check_hgt(path: Path) -> None:
@@ -228,11 +168,12 @@ def _check_hgt(path: Path) -> None:
 
 def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A grey image of heights: needs to be told how many metres a grey level and a cell are."""
+    from shared_map.terrain.importers.coded_rasters import of_other_contents
     from shared_map.terrain.importers.georeference import check_size
     from shared_map.terrain.importers.rasters import opened
 
     with opened(path, "terrain") as dataset:
-        source = _of_other_contents(dataset, path, config, progress)
+        source = of_other_contents(dataset, path, config, progress)
         if source is not None:
             return source
         if config.resolution_m is None or config.height_scale is None:
@@ -260,8 +201,10 @@ def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Flo
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     from shared_map.terrain.importers.plain_files import read_asc, read_npz
+    from shared_map.terrain.importers.text_grids import read_text_grid
 
-    plain = read_asc(path) if path.suffix.lower() == ".asc" else read_npz(path)
+    suffix = path.suffix.lower()
+    plain = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)(path)
     assert plain.heights is not None
     step, photo = plain.step, plain.photo
     heights, level, told = _looked_at(plain.heights, config.height_scale or 1.0, config)
@@ -270,7 +213,7 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
             raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
         step = (config.resolution_m, config.resolution_m)
     degrees = plain.degrees or _geographic(config.crs)
-    if path.suffix.lower() == ".asc" and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
+    if suffix != ".npz" and not degrees and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
         raise TerrainError(
             f"terrain {path}: a cell of {step[0]:g} looks like degrees; set terrain.crs = 'EPSG:4326'"
         )
@@ -282,7 +225,7 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         photo = photo[_nearest(photo.shape[0], photo.shape[1], grid)]
     classes = np.zeros(heights.shape, np.uint8)
     level = level[_nearest(level.shape[0], level.shape[1], grid)]
-    return Source(grid, heights, classes, photo, level=level, notes=(str(path), note, *told))
+    return Source(grid, heights, classes, photo, level=level, notes=(str(path), *plain.notes, note, *told))
 
 
 def _nearest(rows: int, cols: int, grid: GridSpec) -> tuple[Any, ...]:
@@ -334,6 +277,8 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".zip": _raster,
     ".asc": _heights,
     ".npz": _heights,
+    ".csv": _heights,
+    ".xyz": _heights,
     ".png": _png,
     ".map": _map,
     ".yaml": _map,
