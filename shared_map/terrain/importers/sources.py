@@ -204,7 +204,8 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     from shared_map.terrain.importers.text_grids import read_text_grid
 
     suffix = path.suffix.lower()
-    plain = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)(path)
+    read = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)
+    plain = read(path)
     assert plain.heights is not None
     step, photo = plain.step, plain.photo
     heights, level, told = _looked_at(plain.heights, config.height_scale or 1.0, config)
@@ -225,7 +226,10 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         photo = photo[_nearest(photo.shape[0], photo.shape[1], grid)]
     classes = np.zeros(heights.shape, np.uint8)
     level = level[_nearest(level.shape[0], level.shape[1], grid)]
-    return Source(grid, heights, classes, photo, level=level, notes=(str(path), *plain.notes, note, *told))
+    notes = [str(path), *plain.notes, note, *told]
+    if read is read_text_grid and plain.step != (0.0, 0.0) and grid.crs == "local":
+        notes.append("x and y are taken for metres of a system without a name; terrain.crs names it")
+    return Source(grid, heights, classes, photo, level=level, notes=tuple(notes))
 
 
 def _nearest(rows: int, cols: int, grid: GridSpec) -> tuple[Any, ...]:

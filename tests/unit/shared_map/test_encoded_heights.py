@@ -83,6 +83,28 @@ def test_warping_happens_to_heights_and_not_to_colours(tmp_path: Path, encoding:
     assert np.nanmax(np.abs(found.elevation_m - plain.elevation_m)) <= STEP_M[encoding] / 2 + 2e-3
 
 
+def test_a_tile_of_the_web_lies_where_its_path_says(tmp_path: Path) -> None:
+    import rasterio.warp
+
+    zoom, col, row = 12, 2170, 1434
+    folder = tmp_path / str(zoom) / str(col)
+    folder.mkdir(parents=True)
+    ground = hills(1, 900) + 600
+    source = load(tile(folder / f"{row}.png", encoded(ground, "terrarium"), "PNG"))
+    (lon,), (lat,) = rasterio.warp.transform(
+        source.grid.crs,
+        "EPSG:4326",
+        [source.grid.west_m + source.grid.cols * source.grid.resolution_m / 2],
+        [source.grid.north_m - source.grid.rows * source.grid.resolution_m / 2],
+    )
+    # From the formula of slippy maps.
+    n = 2**zoom
+    assert (lon + 180) / 360 * n == pytest.approx(col + 0.5, abs=0.01)
+    assert (1 - np.arcsinh(np.tan(np.radians(lat))) / np.pi) / 2 * n == pytest.approx(row + 0.5, abs=0.01)
+    assert any("tile x 2170, y 1434 (from the north) of zoom 12" in note for note in source.notes)
+    assert np.nanmax(source.elevation_m) == pytest.approx(1500, abs=5)
+
+
 def test_transparent_cells_are_voids(tmp_path: Path) -> None:
     ground = hills(1, 900)
     alpha = np.full((1, SIDE, SIDE), 255, np.uint8)
