@@ -242,7 +242,8 @@ def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
 def scenario_key(scenario: Scenario) -> str:
     """Fingerprint of all that a terrain is built from: a prepared one with another key is another terrain."""
     parts = {"format": FORMAT, "seed": scenario.seed, "terrain": scenario.terrain, "cost": scenario.cost}
-    files = [name for name in (scenario.terrain.source, scenario.terrain.photo) if name]
+    named = scenario.terrain
+    files = [name for name in (named.source, named.photo, named.labels, named.cover, named.cover_codes) if name]
     stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in map(Path, files) if path.is_file()]
     layers = [source_of(named, scenario.plugin_folder) for named in cost_layers_of(scenario)]
     payload = msgspec.json.encode([parts, stamps, layers], order="sorted")
