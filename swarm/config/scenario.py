@@ -34,9 +34,6 @@ MOST_TARGETS = 1000
 Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
 ]
-WHOLE_TREE_STRATEGIES: tuple[Strategy, ...] = ("auto", "full")
-"""Strategies which need no windows, and so go with `cost.directional`: a window knows one cost per cell."""
-
 SlopeRule = Literal["linear", "quadratic", "tobler", "energy"]
 
 Walk = Literal["still", "random", "waypoints", "evade", "external"]
@@ -158,7 +155,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     slope_rule          linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
                         Tobler's hiking function; energy is a wheeled vehicle of constant power
     directional         uphill is not downhill: a step costs by what it climbs along its way, instead of a cell by
-                        how steep it is; the planner grows whole trees then (strategy auto or full)
+                        how steep it is; every strategy of the planner goes with it
     steep_factor        pace at `max_slope_deg` over the flat pace, for the linear and the quadratic rule
     max_slope_deg       steeper ground is lethal
     rough_per_m         share by which a metre of roughness (neighbours off the even slope) raises the pace
