@@ -6,7 +6,6 @@ import ipaddress
 import re
 from collections import Counter
 from pathlib import Path
-from typing import get_args
 
 import msgspec
 
@@ -17,10 +16,8 @@ from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import (
     MOST_TARGETS,
     RESERVED_GROUP,
-    WHOLE_TREE_STRATEGIES,
     PlannerConfig,
     Scenario,
-    Strategy,
     TlsConfig,
     ZoneConfig,
     ids_of,
@@ -103,12 +100,6 @@ def _check(scenario: Scenario, source: str) -> None:
 
 
 def _check_directional(planner: PlannerConfig, source: str) -> None:
-    if planner.strategy in get_args(Strategy) and planner.strategy not in WHOLE_TREE_STRATEGIES:
-        allowed = " or ".join(map(repr, WHOLE_TREE_STRATEGIES))
-        raise ConfigError(
-            f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
-            f" and corridors know one cost per cell; expected {allowed}, which grow whole trees"
-        )
     if planner.length_weight:
         raise ConfigError(
             f"{source}: planner.length_weight: {planner.length_weight:g} does not go with cost.directional = true;"

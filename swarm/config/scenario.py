@@ -34,9 +34,6 @@ MOST_TARGETS = 1000
 Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
 ]
-WHOLE_TREE_STRATEGIES: tuple[Strategy, ...] = ("auto", "full")
-"""Strategies which need no windows, and so go with `cost.directional`: a window knows one cost per cell."""
-
 SlopeRule = Literal[
     "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
 ]
@@ -190,7 +187,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     road_speed_m_per_s      speed on roads
     slope_rule              what slope does to pace; `swarm terrain rules` shows all, and where they come from
     directional             uphill is not downhill: a step costs by what it climbs along its way, instead of a cell
-                            by how steep it is; the planner grows whole trees then (strategy auto or full)
+                            by how steep it is; every strategy of the planner goes with it
     steep_factor            linear, quadratic: pace at `max_slope_deg` over the flat pace
     rolling_resistance      energy: share of its weight that a vehicle needs to roll on level open ground
     power_reserve           energy: power of the motor over what it needs on level ground at the flat speed
