@@ -108,10 +108,6 @@ class Holdings:
         """Vehicle that holds nothing -> the cell on which it would begin, until that is granted."""
         self._away: set[str] = set()
         """Vehicles that have left in this life: what is still granted to them is given back."""
-        self._cells: set[int] | None = None
-        """All cells of our paths; None when they have changed."""
-        self._others: set[int] | None = None
-        """The cells beside our vehicles that others hold; None when they have changed."""
         self._pushed: dict[str, int] | None = None
         """Vehicle -> the age with which it is asked to make way; None when a warden has spoken."""
         self._said: dict[str, _Said] = {}
@@ -142,24 +138,21 @@ class Holdings:
                     self._pushed[id] = max(age, self._pushed.get(id, 0))
         return self._pushed.get(vehicle, 0)
 
-    def occupied(self, cell: int) -> bool:
-        """Whether a vehicle holds a cell to which one of ours at rest could go, as far as wardens tell."""
-        if self._cells is None:
-            self._cells = {cell for path in self._paths.values() for cell in path}
-        if self._others is None:
-            self._others = {cell for plot in self.plots for cell in self._views[plot].others}
-        return cell in self._cells or cell in self._others
+    def occupied(self) -> set[int]:
+        """The cells that vehicles hold, of all to which one of ours at rest could go, as far as wardens tell."""
+        occupied = {cell for path in self._paths.values() for cell in path}
+        for plot in self.plots:
+            occupied |= self._views[plot].others
+        return occupied
 
     def moved(self, vehicle: str, cell: int) -> None:
         """It has come to the next cell of its path."""
         path = self._paths[vehicle]
         self._paths[vehicle] = path[path.index(cell) :]
-        self._cells = None
 
     def give_back(self, vehicle: str, keep: int = 1) -> None:
         """Keep only the first cells of the path. The rest must not be entered any more."""
         self._paths[vehicle] = self._paths[vehicle][: max(keep, 1)]
-        self._cells = None
 
     def enter(self, vehicle: str, cell: int) -> None:
         """Ask for a first cell for a vehicle that holds none; the newest call counts. Where an earlier life of ours
@@ -175,7 +168,6 @@ class Holdings:
         self._paths.pop(vehicle, None)
         self._said.pop(vehicle, None)
         self._away.add(vehicle)
-        self._cells = None
 
     @property
     def gone(self) -> bool:
@@ -222,7 +214,7 @@ class Holdings:
         view.knows, view.heard = granted.stamp, granted.heard
         view.pushed = {id: age for id, age in granted.pushed.items() if id in self._paths}
         view.others = frozenset(granted.occupied)
-        self._cells = self._others = self._pushed = None
+        self._pushed = None
         return self._take(view, granted, place)
 
     def _take(self, view: _View, granted: Granted, place: Place) -> list[str]:
@@ -362,4 +354,3 @@ class Holdings:
             or self._views[plot].heard < quiet
             or self._views[plot].seen
         }
-        self._others = None
