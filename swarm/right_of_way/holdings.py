@@ -33,6 +33,7 @@ class Wish:
 
 
 _NO_WISH = Wish()
+_NO_CELLS: Sequence[int] = []
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,7 @@ class _Said:
     """What is told of one vehicle while nothing about it changes: by plot a stand, and what of it is news."""
 
     wish: Wish
-    path: list[int]
+    path: Sequence[int]
     stands: list[tuple[int, Stand, object]]
 
 
@@ -104,6 +105,7 @@ class Holdings:
         self.plots: dict[int, None] = {}
         self._dead: list[int] = []
         self._paths: dict[str, list[int]] = {}
+        """Vehicle -> the cells that it holds, in driving order; another list when they change."""
         self._enters: dict[str, int] = {}
         """Vehicle that holds nothing -> the cell on which it would begin, until that is granted."""
         self._away: set[str] = set()
@@ -126,7 +128,8 @@ class Holdings:
     # --- what is held ---------------------------------------------------------------------------------------
 
     def path(self, vehicle: str) -> Sequence[int]:
-        """The cells that a vehicle may stand on or enter, its own first; empty of one that has no place yet."""
+        """The cells that a vehicle may stand on or enter, its own first; empty of one that has no place yet. The
+        same object for as long as nothing has changed."""
         return self._paths.get(vehicle, ())
 
     def pushed(self, vehicle: str) -> int:
@@ -152,7 +155,9 @@ class Holdings:
 
     def give_back(self, vehicle: str, keep: int = 1) -> None:
         """Keep only the first cells of the path. The rest must not be entered any more."""
-        self._paths[vehicle] = self._paths[vehicle][: max(keep, 1)]
+        keep = max(keep, 1)
+        if len(self._paths[vehicle]) > keep:
+            self._paths[vehicle] = self._paths[vehicle][:keep]
 
     def enter(self, vehicle: str, cell: int) -> None:
         """Ask for a first cell for a vehicle that holds none; the newest call counts. Where an earlier life of ours
@@ -224,13 +229,14 @@ class Holdings:
             self._said.pop(vehicle, None)
         placed = []
         for vehicle, cells in granted.grants.items():
+            seen = before.get(vehicle, _NO_CELLS)
+            if cells == seen and vehicle in self._paths:
+                view.seen[vehicle] = cells
+                continue
             ours = self._vehicles is None or vehicle in self._vehicles
             if not ours or any(self._plots.of(cell) != granted.plot for cell in cells):
                 continue
             view.seen[vehicle] = cells
-            seen = before.get(vehicle, [])
-            if cells == seen and vehicle in self._paths:
-                continue
             self._said.pop(vehicle, None)
             if vehicle in self._paths:
                 self._extend(vehicle, cells, seen)
@@ -259,7 +265,7 @@ class Holdings:
         for cell in cells[after + 1 :]:
             if cell in seen or not self._plots.adjacent(path[-1], cell):
                 return
-            path.append(cell)
+            path = self._paths[vehicle] = [*path, cell]
 
     # --- what to say ----------------------------------------------------------------------------------------
 
@@ -271,7 +277,7 @@ class Holdings:
         for vehicle, path in self._paths.items():
             wish = wishes.get(vehicle, _NO_WISH)
             said = self._said.get(vehicle)
-            if said is None or said.wish is not wish or said.path != path:
+            if said is None or said.wish is not wish or said.path is not path:
                 said = self._said[vehicle] = self._say(vehicle, path, wish)
             for each in said.stands:
                 by_plot.setdefault(each[0], []).append(each)
@@ -327,7 +333,7 @@ class Holdings:
             holds = [cell for cell, of in zip(path, plots, strict=True) if of == plot]
             stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, asked.age_ms)
             stands.append((plot, stand, (vehicle, path[0], holds, ahead, better)))
-        return _Said(wish, list(path), stands)
+        return _Said(wish, path, stands)
 
     def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
         """Without cells that were left or given back while a table still grants them: granted anew, such a cell

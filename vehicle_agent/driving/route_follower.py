@@ -78,7 +78,8 @@ class Follower:
     @property
     def left(self) -> int:
         """How many cells are ahead."""
-        return max(len(self._cells) - self._at - 1, 0)
+        left = len(self._cells) - self._at - 1
+        return left if left > 0 else 0
 
     def cut(self, passable: Callable[[Sequence[int]], int]) -> bool:
         """End the route before the first step ahead that is not passable; True if there is one.
