@@ -12,9 +12,11 @@ import typer
 from launch_scripts.commands.shared_options import AsJson
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.places import MapFrame
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
+from swarm.places import extent_of, fields_of, written
 from swarm.wire.messages.marks import MarkSet
 
 app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is_help=True)
@@ -42,6 +44,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         authors.setdefault(each.author, []).append(each)
     with KeeperStore(store, read_only=True) as kept:
         seen = kept.sightings()
+    frame = MapFrame(grid)
     found = {
         "store": str(store),
         "terrain": terrain,
@@ -62,6 +65,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         "sightings": {
             each.target: {
                 "row_col": list(divmod(each.cell, grid.cols)),
+                "at": fields_of(frame, each.cell),
                 "uncertainty_m": each.uncertainty_m,
                 "author": each.author,
                 "stamp_ns": each.stamp_ns,
@@ -74,13 +78,14 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         print(json.dumps(found, indent=2))
         return
     print(f"{store}: terrain {terrain}, {grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m")
+    if grid.crs != "local":
+        print(f"it lies at {extent_of(frame, 'latlon')}")
     print(f"{found['marks']} marks in {len(sets)} sets; {found['cells_with_marks']} cells marked, "
           f"{found['cells_lethal']} of them lethal")  # fmt: skip
     for author, of in sorted(authors.items()):
         print(f"  {author:40} {sum(len(each.kinds) for each in of):7} marks in {len(of):5} tiles")
     for sighted in seen:
-        row, col = divmod(sighted.cell, grid.cols)
-        where = f"row {row}, col {col}, within {sighted.uncertainty_m:.0f} m"
+        where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.report.recorder import Recorder
 from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain_report import bounds_deg
 from swarm.errors import StoreError
 
 log = logging.getLogger(__name__)
@@ -34,6 +35,10 @@ def make_report(recorder: Recorder, terrain: Terrain, **measured: Any) -> dict[s
             "rows": terrain.grid.rows,
             "cols": terrain.grid.cols,
             "resolution_m": terrain.grid.resolution_m,
+            "west_m": terrain.grid.west_m,
+            "north_m": terrain.grid.north_m,
+            "crs": terrain.grid.crs,
+            **bounds_deg(terrain.grid),
             "notes": list(terrain.notes),
         },
         "series": recorder.series(),

@@ -25,6 +25,7 @@ from swarm.config.scenario import (
     ids_of,
 )
 from swarm.errors import ConfigError
+from swarm.places import read_place
 from swarm.ranks import split_rank
 
 
@@ -64,10 +65,21 @@ def _check(scenario: Scenario, source: str) -> None:
         ("terrain.hidden.zones", scenario.terrain.hidden.zones),
     ):
         for n, zone in enumerate(zones):
-            if zone.polygon_m is None and zone.mask is None:
-                raise ConfigError(f"{source}: {key}[{n}]: missing required field `polygon_m` (or `mask`)")
-            if zone.polygon_m is not None and zone.mask is not None:
-                raise ConfigError(f"{source}: {key}[{n}]: polygon_m and mask exclude each other")
+            given = [name for name in ("polygon", "polygon_m", "mask") if getattr(zone, name) is not None]
+            if not given:
+                raise ConfigError(
+                    f"{source}: {key}[{n}]: missing required field `polygon` (or `polygon_m`, `mask`)"
+                )
+            if len(given) > 1:
+                raise ConfigError(f"{source}: {key}[{n}]: {given[0]} and {given[1]} exclude each other")
+            for corner in zone.polygon or ():
+                read_place(corner, f"{source}: {key}[{n}].polygon")
+    for n, target in enumerate(scenario.targets):
+        if target.start is not None:
+            read_place(target.start, f"{source}: targets[{n}].start")
+    for n, group in enumerate(scenario.groups):
+        for place in group.cells:
+            read_place(place, f"{source}: groups[{n}].cells")
     for plugin in plugins_of(scenario):
         check_name(plugin, source)
     if scenario.cost.directional:
