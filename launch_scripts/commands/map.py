@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.report.geo_layers import Layer, mark_layer, write_layers
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.places import MapFrame
@@ -24,6 +25,7 @@ app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is
 Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST/map.sqlite; it may be in use.")]
 _TEXT = (".json",)
 _PIXELS = (".tif", ".tiff")
+_SHAPES = (".geojson", ".gpkg")
 
 
 def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
@@ -90,8 +92,11 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
 
 
 @app.command()
-def export(store: Store, out: Annotated[Path, typer.Argument(help=".json: every set; .tif: the winners.")]) -> None:
-    """Write the marks of a store as JSON, which can be imported again, or as a GeoTIFF of pace and kind."""
+def export(
+    store: Store,
+    out: Annotated[Path, typer.Argument(help=".json: every set; .tif, .gpkg, .geojson: the winners.")],
+) -> None:
+    """Write the marks of a store: all of them as JSON, which can be imported; the winners as pixels or polygons."""
     terrain, grid, sets = _read(store)
     kind_of_file = out.suffix.lower()
     try:
@@ -99,11 +104,24 @@ def export(store: Store, out: Annotated[Path, typer.Argument(help=".json: every 
             out.write_text(stored_marks.to_json(terrain, grid, sets), encoding="utf-8")
         elif kind_of_file in _PIXELS:
             _write_tiff(out, terrain, grid, sets)
+        elif kind_of_file in _SHAPES:
+            write_layers(out, [_layer(grid, sets)], MapFrame(grid))
         else:
-            raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS)}")
+            raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS + _SHAPES)}")
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
     print(f"{out}: {sum(len(each.kinds) for each in sets)} marks in {len(sets)} sets")
+
+
+def marks_of(store: Path) -> tuple[GridSpec, Layer]:
+    """The grid of a store, and its winning marks as polygons."""
+    _, grid, sets = _read(store)
+    return grid, _layer(grid, sets)
+
+
+def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:
+    pace, kind, stamps_ns = stored_marks.to_cells(grid, sets, time.time_ns())
+    return mark_layer(grid, kind, pace, stamps_ns)
 
 
 @app.command("import")
