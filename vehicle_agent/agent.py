@@ -97,7 +97,8 @@ class Agent:
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
         self._steering = Steering(
-            grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied, self.bodies
+            *(grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied, self.bodies),
+            local_map.climb,
         )
         self._driver = Driver(local_map, holdings, self._steering.passable, dynamics)
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies)

@@ -35,7 +35,7 @@ class DirectedCostGrid(CostGrid):
         self._lowest = climb.lowest
         self._metres = grid.resolution_m * self._lowest
         factors = climb.factors / np.float32(self._lowest)
-        self._highest = float(factors.max())
+        self._highest = climb.highest / self._lowest
         height = np.zeros((grid.rows + 2, self.stride), np.float32)
         height[1:-1, 1:-1] = climb.elevation_m
         self._climbs: Climbs = (height.reshape(-1), factors, np.array(climb.per_metre, np.float32))

@@ -10,6 +10,7 @@ from typing import get_args
 
 import msgspec
 
+from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import explain, nearest
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.plugin_names import check_name, plugins_of
@@ -36,11 +37,12 @@ def load_scenario(path: Path) -> Scenario:
 
 def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
     """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given."""
-    raw = parse_toml(text, source, ConfigError)
+    raw = with_preset(parse_toml(text, source, ConfigError))
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {explain(str(error), raw, Scenario)}") from error
+    scenario = msgspec.structs.replace(scenario, cost=with_slope_csv(scenario.cost, source, base))
     _check(scenario, source)
     return scenario if base is None else _anchored(scenario, base)
 
@@ -82,6 +84,7 @@ def _check(scenario: Scenario, source: str) -> None:
             read_place(place, f"{source}: groups[{n}].cells")
     for plugin in plugins_of(scenario):
         check_name(plugin, source)
+    check_cost(scenario.cost, source)
     if scenario.cost.directional:
         _check_directional(scenario.planner, source)
     names = [group.name for group in scenario.groups]
@@ -154,6 +157,10 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
         source = str(base / source)
     photo = None if terrain.photo is None else str(base / terrain.photo)
     labels = None if terrain.labels is None else str(base / terrain.labels)
+    cover = None if terrain.cover is None else str(base / terrain.cover)
+    codes = terrain.cover_codes
+    if codes is not None and codes not in COVER_TABLES:
+        codes = str(base / codes)
     hidden = msgspec.structs.replace(terrain.hidden, zones=_anchored_zones(terrain.hidden.zones, base))
     cost = msgspec.structs.replace(scenario.cost, zones=_anchored_zones(scenario.cost.zones, base))
     network = scenario.network
@@ -161,7 +168,8 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
         tls = network.tls
         tls = TlsConfig(ca=str(base / tls.ca), certificate=str(base / tls.certificate), key=str(base / tls.key))
         network = msgspec.structs.replace(network, tls=tls)
-    terrain = msgspec.structs.replace(terrain, source=source, photo=photo, labels=labels, hidden=hidden)
+    files = {"source": source, "photo": photo, "labels": labels, "cover": cover, "cover_codes": codes}
+    terrain = msgspec.structs.replace(terrain, **files, hidden=hidden)
     folder = str(base / scenario.plugin_folder)
     return msgspec.structs.replace(scenario, terrain=terrain, cost=cost, network=network, plugin_folder=folder)
 
@@ -173,3 +181,4 @@ def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConf
 
 
 BUILT_IN_TERRAINS = ("jacksboro", "synthetic")
+COVER_TABLES = ("worldcover", "corine", "corine-level-3", "nlcd")
