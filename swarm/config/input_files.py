@@ -41,6 +41,7 @@ class FileKind(Enum):
     VECTOR_TEXT = ("zone", 256 << 20, TerrainError)
     PREPARED = ("prepared terrain", 1 << 20, TerrainError)
     EXPORTED_MAP = ("exported map", 512 << 20, StoreError)
+    TRACKS = ("tracks", 256 << 20, StoreError)
     STORE = ("store", 4 << 30, StoreError)
     PROMISES = ("promises", 256 << 20, StoreError)
 

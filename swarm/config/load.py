@@ -23,6 +23,7 @@ from swarm.config.scenario import (
     ids_of,
 )
 from swarm.errors import ConfigError
+from swarm.places import read_place
 from swarm.ranks import split_rank
 
 
@@ -64,6 +65,12 @@ def _check(scenario: Scenario, source: str) -> None:
     ):
         for n, zone in enumerate(zones):
             _check_zone(zone, f"{source}: {key}[{n}]")
+    for n, target in enumerate(scenario.targets):
+        if target.start is not None:
+            read_place(target.start, f"{source}: targets[{n}].start")
+    for n, group in enumerate(scenario.groups):
+        for place in group.cells:
+            read_place(place, f"{source}: groups[{n}].cells")
     for plugin in plugins_of(scenario):
         check_name(plugin, source)
     check_cost(scenario.cost, source)
@@ -100,11 +107,13 @@ _VALUES = {"factor": "factor", "pace": "pace_s_per_m"}
 
 
 def _check_zone(zone: ZoneConfig, where: str) -> None:
-    given = [key for key in ("polygon_m", "mask", "file") if getattr(zone, key) is not None]
+    given = [key for key in ("polygon", "polygon_m", "mask", "file") if getattr(zone, key) is not None]
     if not given:
-        raise ConfigError(f"{where}: missing required field `polygon_m` (or `mask`, or `file`)")
+        raise ConfigError(f"{where}: missing required field `polygon` (or `polygon_m`, `mask`, `file`)")
     if len(given) > 1:
         raise ConfigError(f"{where}: {given[0]} and {given[1]} exclude each other")
+    for corner in zone.polygon or ():
+        read_place(corner, f"{where}.polygon")
     if zone.file is None:
         of_files = [key for key in ("layer", "crs", "attribute", "width_m", "classes") if getattr(zone, key)]
         if of_files:
