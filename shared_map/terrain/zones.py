@@ -12,9 +12,11 @@ import numpy as np
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.importers.rasters import mask_of
 from shared_map.terrain.layers import LETHAL, TerrainClass, polygon_mask
+from shared_map.terrain.places import MapFrame
 from swarm.config.scenario import CostConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
+from swarm.places import corners_of, extent_of
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 if TYPE_CHECKING:
@@ -304,6 +306,15 @@ def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
     covers none."""
     if zone.mask is not None:
         inside = mask_of(Path(zone.mask), grid)
+    elif zone.polygon is not None:
+        frame = MapFrame(grid)
+        corners = corners_of(zone.polygon, frame, f"{where} {zone.name or zone.kind!r}: polygon")
+        side_m = grid.resolution_m
+        inside = polygon_mask([(col * side_m, row * side_m) for row, col in corners], grid)
+        if not inside.any():
+            raise TerrainError(
+                f"{where} {zone.name or zone.kind!r} covers no cell of the terrain: {extent_of(frame)}"
+            )
     else:
         inside = polygon_mask(zone.polygon_m or (), grid)
     if not inside.any():

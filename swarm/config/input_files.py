@@ -27,7 +27,10 @@ class FileKind(Enum):
 
     SCENARIO = ("scenario", 1 << 19, ConfigError)
     CERTIFICATE = ("certificate or key", 1 << 16, StoreError)
+    SLOPE_TABLE = ("slope table", 1 << 18, ConfigError)
     LABELS = ("labels", 4 << 20, TerrainError)
+    COVER_TABLE = ("cover codes", 4 << 20, TerrainError)
+    POINTS = ("terrain", 2 << 30, TerrainError)
     ROS_MAP = ("terrain", 1 << 16, TerrainError)
     TEXT_GRID = ("terrain", 32 * MAX_CELLS, TerrainError)
     ARRAYS = ("terrain", 12 * MAX_CELLS, TerrainError)
@@ -38,6 +41,7 @@ class FileKind(Enum):
     VECTOR_TEXT = ("zone", 256 << 20, TerrainError)
     PREPARED = ("prepared terrain", 1 << 20, TerrainError)
     EXPORTED_MAP = ("exported map", 512 << 20, StoreError)
+    TRACKS = ("tracks", 256 << 20, StoreError)
     STORE = ("store", 4 << 30, StoreError)
     PROMISES = ("promises", 256 << 20, StoreError)
 
