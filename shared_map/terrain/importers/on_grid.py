@@ -5,7 +5,6 @@ Cell coordinates are (column, row) from the north-west corner: cell (r, c) is th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -302,26 +301,3 @@ def _clipped(shapes: NDArray[Any], box: Box) -> NDArray[Any]:
     import shapely
 
     return np.asarray(shapely.clip_by_rect(shapes, *box), object) if len(shapes) else shapes
-
-
-def cells_spanned(shapes: NDArray[Any]) -> float:
-    """Cells of the rectangles around shapes, in all."""
-    import shapely
-
-    if not len(shapes):
-        return 0.0
-    box = shapely.bounds(shapes)
-    return float(((box[:, 2] - box[:, 0] + 1) * (box[:, 3] - box[:, 1] + 1)).sum())
-
-
-def widened(line: Any, half_cells: float) -> list[Any]:
-    """Areas within a distance of a line or point. Long lines in pieces, as one that crosses itself often would take
-    for ever."""
-    import shapely
-
-    points = shapely.get_coordinates(line)
-    most = 50
-    if len(points) <= most or math.isclose(half_cells, 0.0):
-        return [line.buffer(half_cells)]
-    pieces = [points[n : n + most + 1] for n in range(0, len(points) - 1, most)]
-    return [shapely.LineString(piece).buffer(half_cells) for piece in pieces]
