@@ -21,6 +21,9 @@ _CHUNK = 4096
 _PIECE = 50
 """Corners of a line that is widened at once: one of many that crosses itself often would take for ever."""
 _POLYGON = 3
+_NUDGE = (1.3e-4, 0.7e-4)
+"""In cells. A line through the very corner of cells passes two of them that have no side in common, and no vehicle
+drives from one to the other between closed cells. Only coordinates that somebody rounded to cells do that."""
 
 
 @dataclass
@@ -67,7 +70,8 @@ def burn(drawing: Drawing, grid: GridSpec, what: str, *, least_wins: bool = Fals
     for first in range(0, len(order), _CHUNK):
         some = order[first : first + _CHUNK]
         lines = some[~areas[some]]
-        _rasterize(shapes[lines], values[lines], passed, window, everywhere=True)
+        nudged = shapely.transform(shapes[lines], lambda points: points + _NUDGE)
+        _rasterize(nudged, values[lines], passed, window, everywhere=True)
         # The middle of a cell that a line does not pass is half a cell away from it, at least.
         wide = some[areas[some] | (halves[some] > (0.0 if drawing.everywhere else 0.5))]
         widened, of = _widened(shapes[wide], halves[wide])

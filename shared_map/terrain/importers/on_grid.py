@@ -189,7 +189,8 @@ def _systems(grid: GridSpec, layer: Layer, given: str | None) -> tuple[Any, Any]
     if given == "local":
         return None, None
     try:
-        found = rasterio.CRS.from_user_input(given) if given is not None else None
+        with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
+            found = rasterio.CRS.from_user_input(given) if given is not None else None
     except (CRSError, ValueError) as error:
         raise TerrainError(
             f"{layer.what}: crs {given!r} is no coordinate system; write EPSG:32632 or alike"
