@@ -68,7 +68,11 @@ class CoverTable:
         """The table with other meanings of some codes."""
         if not own:
             return self
-        return replace(self, grounds={**self.grounds, **own}, nothing=self.nothing - own.keys())
+        named = {
+            code: replace(ground, name=self.grounds[code].name) if code in self.grounds else ground
+            for code, ground in own.items()
+        }
+        return replace(self, grounds={**self.grounds, **named}, nothing=self.nothing - own.keys())
 
 
 def ground_of(value: CoverGround, name: str = "", colour: Rgb | None = None) -> Ground:
@@ -219,6 +223,15 @@ TABLES: Mapping[str, CoverTable] = {
     )
 }
 """Built-in tables by what the setting calls them. A new product is a row, and a text of its codes."""
+OTHERS: Mapping[str, frozenset[int]] = {
+    "GlobeLand30": frozenset((0, *range(10, 101, 10), 255)),
+    "ESA CCI": frozenset(
+        (0, *range(10, 13), *range(20, 61, 10), 61, 62, *range(70, 73), *range(80, 83), *range(90, 121, 10), 121)
+    ).union((122, *range(130, 151, 10), 151, 152, 153, *range(160, 201, 10), 201, 202, 210, 220)),
+    "a map whose codes are counted from 1": frozenset(range(31)),
+}
+"""Codes of maps that are not built in, and that built-in ones are not to be taken for by their codes alone: 60 is
+water in one of them and bare ground in the other."""
 
 
 def own_grounds(classes: Mapping[str, CoverGround]) -> dict[int, Ground]:
