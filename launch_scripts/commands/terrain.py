@@ -35,6 +35,7 @@ app = typer.Typer(
     swarm terrain info dem.tif
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain classify dem.tif photo.tif --picture classes.png
+    swarm terrain rules --picture rules.png
     swarm terrain synth --out dem.tif --photo photo.tif
 
     Where to get an elevation model, and the rule for cost: docs/terrain.md.
@@ -131,7 +132,8 @@ def info(
         scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig))
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
-    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid)}
+    rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
+    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid), **rule}
     doubts = doubts_about(facts)
     if as_json:
         console.print_json(json.dumps({**facts, "notes": terrain.notes, "doubts": doubts}))
@@ -216,6 +218,37 @@ def _print_shares(classes: Bytes) -> None:
     counts = np.bincount(classes.reshape(-1), minlength=max(TerrainClass) + 1)
     shares = [f"{kind.name.lower()} {counts[kind] / classes.size:.1%}" for kind in TerrainClass if counts[kind]]
     console.print("classes: " + ", ".join(shares), highlight=False)
+
+
+@app.command()
+def rules(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(help="A scenario file or the name of a built-in one: show its rule alone, in m/s."),
+    ] = None,
+    picture: PictureOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the rules by which slope becomes pace, and the presets of vehicle classes.
+
+    A rule is chosen by cost.slope_rule, a class of vehicles by cost.preset,
+    whose settings stand for those that the scenario does not give.
+
+    swarm terrain rules --picture rules.png
+    swarm terrain rules mine.toml
+    """
+    from launch_scripts.commands import slope_rules
+
+    _check_target(picture, "--picture", ".png")
+    shown = slope_rules.of_all() if scenario is None else slope_rules.of_scenario(_scenario(scenario))
+    if picture is not None:
+        from launch_scripts.commands.slope_picture import draw_rules
+
+        draw_rules(shown, picture)
+    if as_json:
+        console.print_json(json.dumps(shown.facts()))
+        return
+    slope_rules.show(shown, console)
 
 
 @app.command()

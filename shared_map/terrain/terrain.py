@@ -23,6 +23,7 @@ from shared_map.terrain.homes import homes_of
 from shared_map.terrain.kept import fetch_kept, keep, kept_key
 from shared_map.terrain.layers import (
     TerrainClass,
+    along_slope_of_padded,
     class_factors,
     grade_of_padded,
     inflate,
@@ -32,6 +33,7 @@ from shared_map.terrain.layers import (
     terrain_pace,
 )
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.zones import paint_zones
 from swarm.config.input_files import FileKind, read_text
@@ -112,6 +114,9 @@ def _built(scenario: Scenario, source: Source, progress: Progress) -> Terrain:
         notes.append(f"cost layers: {', '.join(each.layer for each in cost.layers)}")
     if cost.zones:
         paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m))
+    if cost.directional and cost.cross_slope_factor > 1:
+        _add_cross_slopes(ground, source.elevation_m, cost, grid, progress)
+    notes.append(said_of_cost(cost))
     photo = source.photo
     if photo is None:
         from shared_map.terrain.synthetic.landscape import paint_photo
@@ -137,6 +142,16 @@ def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress
 
     in_bands(source.grid.rows, work, "slope and cost", progress)
     return ground
+
+
+def _add_cross_slopes(
+    ground: Floats, elevation_m: Floats, cost: CostConfig, grid: GridSpec, progress: Progress
+) -> None:
+    def work(row0: int, row1: int) -> None:
+        padded_m = padded_rows(elevation_m, row0, row1)
+        ground[row0:row1] *= along_slope_of_padded(padded_m, grid.resolution_m, cost)
+
+    in_bands(grid.rows, work, "slope and cost", progress)
 
 
 def finished(

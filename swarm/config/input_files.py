@@ -27,6 +27,7 @@ class FileKind(Enum):
 
     SCENARIO = ("scenario", 1 << 19, ConfigError)
     CERTIFICATE = ("certificate or key", 1 << 16, StoreError)
+    SLOPE_TABLE = ("slope table", 1 << 18, ConfigError)
     LABELS = ("labels", 4 << 20, TerrainError)
     COVER_TABLE = ("cover codes", 4 << 20, TerrainError)
     POINTS = ("terrain", 2 << 30, TerrainError)

@@ -6,20 +6,18 @@ import ipaddress
 import re
 from collections import Counter
 from pathlib import Path
-from typing import get_args
 
 import msgspec
 
+from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import explain, nearest
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import (
     MOST_TARGETS,
     RESERVED_GROUP,
-    WHOLE_TREE_STRATEGIES,
     PlannerConfig,
     Scenario,
-    Strategy,
     TlsConfig,
     ZoneConfig,
     ids_of,
@@ -35,11 +33,12 @@ def load_scenario(path: Path) -> Scenario:
 
 def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
     """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given."""
-    raw = parse_toml(text, source, ConfigError)
+    raw = with_preset(parse_toml(text, source, ConfigError))
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {explain(str(error), raw, Scenario)}") from error
+    scenario = msgspec.structs.replace(scenario, cost=with_slope_csv(scenario.cost, source, base))
     _check(scenario, source)
     return scenario if base is None else _anchored(scenario, base)
 
@@ -70,6 +69,7 @@ def _check(scenario: Scenario, source: str) -> None:
                 raise ConfigError(f"{source}: {key}[{n}]: polygon_m and mask exclude each other")
     for plugin in plugins_of(scenario):
         check_name(plugin, source)
+    check_cost(scenario.cost, source)
     if scenario.cost.directional:
         _check_directional(scenario.planner, source)
     names = [group.name for group in scenario.groups]
@@ -100,12 +100,6 @@ def _check(scenario: Scenario, source: str) -> None:
 
 
 def _check_directional(planner: PlannerConfig, source: str) -> None:
-    if planner.strategy in get_args(Strategy) and planner.strategy not in WHOLE_TREE_STRATEGIES:
-        allowed = " or ".join(map(repr, WHOLE_TREE_STRATEGIES))
-        raise ConfigError(
-            f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
-            f" and corridors know one cost per cell; expected {allowed}, which grow whole trees"
-        )
     if planner.length_weight:
         raise ConfigError(
             f"{source}: planner.length_weight: {planner.length_weight:g} does not go with cost.directional = true;"

@@ -34,10 +34,16 @@ MOST_TARGETS = 1000
 Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
 ]
-WHOLE_TREE_STRATEGIES: tuple[Strategy, ...] = ("auto", "full")
-"""Strategies which need no windows, and so go with `cost.directional`: a window knows one cost per cell."""
+SlopeRule = Literal[
+    "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
+]
 
-SlopeRule = Literal["linear", "quadratic", "tobler", "energy"]
+Preset = Literal["hiker", "wheeled", "tracked", "quadruped"]
+
+Slope = Annotated[float, Meta(gt=-90, lt=90)]
+SlopeFactor = Annotated[float, Meta(ge=0.01, le=100)]
+SpeedOnGround = Annotated[float, Meta(ge=0.01, le=340)]
+"""m/s; what a map can tell of a cell (`swarm.wire.statements.PACE_LEAST` and `PACE_MOST`)."""
 
 Walk = Literal["still", "random", "waypoints", "evade", "external"]
 
@@ -176,28 +182,52 @@ class CostLayerConfig(Section, frozen=True, kw_only=True):
 class CostConfig(Section, frozen=True, kw_only=True):
     """How terrain becomes pace.
 
-    flat_speed_m_per_s  speed on level open ground
-    road_speed_m_per_s  speed on roads
-    slope_rule          linear and quadratic reach `steep_factor` times the flat pace at `max_slope_deg`; tobler is
-                        Tobler's hiking function; energy is a wheeled vehicle of constant power
-    directional         uphill is not downhill: a step costs by what it climbs along its way, instead of a cell by
-                        how steep it is; the planner grows whole trees then (strategy auto or full)
-    steep_factor        pace at `max_slope_deg` over the flat pace, for the linear and the quadratic rule
-    max_slope_deg       steeper ground is lethal
-    rough_per_m         share by which a metre of roughness (neighbours off the even slope) raises the pace
-    classes             whether what covers the ground (water, forest, rock ...) counts
-    class_factor        pace of a class relative to open ground, or "lethal", instead of the built-in factors
-    vehicle_radius_m    cells in whose middle a vehicle of this radius touches a lethal cell are lethal (inflation)
-    layers              rules of the user's own, one after the other; what is a void stays lethal
-    zones               parts of the terrain with a cost of their own, painted in order; forbidden ones last
+    preset                  a class of vehicles, whose settings stand for those that are not given here
+    flat_speed_m_per_s      speed on level open ground
+    road_speed_m_per_s      speed on roads
+    slope_rule              what slope does to pace; `swarm terrain rules` shows all, and where they come from
+    directional             uphill is not downhill: a step costs by what it climbs along its way, instead of a cell
+                            by how steep it is; every strategy of the planner goes with it
+    steep_factor            linear, quadratic: pace at `max_slope_deg` over the flat pace
+    rolling_resistance      energy: share of its weight that a vehicle needs to roll on level open ground
+    power_reserve           energy: power of the motor over what it needs on level ground at the flat speed
+    braking_share           energy: power that the brakes can hold for long over that of the motor
+    critical_slope_percent  herzog_wheeled: the slope that doubles the pace
+    slope_table             table: points [degrees, factor on the flat pace], negative is downhill; straight lines
+                            between them, and beyond the last the same factor
+    slope_csv               table: a .csv file with such points instead. Its first line names two columns:
+                            slope_deg or slope_percent; factor, pace_s_per_m or speed_m_per_s
+    top_speed_m_per_s       no slope makes a vehicle quicker than this on open ground
+    cross_slope_factor      pace along a slope of `max_slope_deg` over that straight up or down it
+    max_slope_deg           steeper ground is lethal
+    max_climb_deg           directional: no step climbs steeper along its way; `max_slope_deg` if not given
+    max_descent_deg         directional: no step descends steeper along its way; `max_slope_deg` if not given
+    rough_per_m             share by which a metre of roughness (neighbours off the even slope) raises the pace
+    classes                 whether what covers the ground (water, forest, rock ...) counts
+    class_factor            pace of a class relative to open ground, or "lethal", instead of the built-in factors
+    vehicle_radius_m        cells in whose middle a vehicle of this radius touches a lethal cell are lethal
+                            (inflation)
+    layers                  rules of the user's own, one after the other; what is a void stays lethal
+    zones                   parts of the terrain with a cost of their own, painted in order; forbidden ones last
     """
 
-    flat_speed_m_per_s: Positive = 10.0
-    road_speed_m_per_s: Positive = 20.0
+    preset: Preset | None = None
+    flat_speed_m_per_s: SpeedOnGround = 10.0
+    road_speed_m_per_s: SpeedOnGround = 20.0
     slope_rule: SlopeRule = "quadratic"
     directional: bool = False
     steep_factor: Annotated[float, Meta(ge=1)] = 6.0
+    rolling_resistance: Annotated[float, Meta(ge=0.01, le=1)] = 0.08
+    power_reserve: Annotated[float, Meta(ge=1, le=100)] = 1.0
+    braking_share: Annotated[float, Meta(ge=0.1, le=100)] = 1.0
+    critical_slope_percent: Annotated[float, Meta(ge=1, le=100)] = 12.0
+    slope_table: Annotated[tuple[tuple[Slope, SlopeFactor], ...], Meta(max_length=1000)] = ()
+    slope_csv: str | None = None
+    top_speed_m_per_s: SpeedOnGround | None = None
+    cross_slope_factor: Annotated[float, Meta(ge=1, le=100)] = 1.0
     max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
+    max_climb_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
+    max_descent_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
     rough_per_m: NotNegative = 0.0
     classes: bool = True
     class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
