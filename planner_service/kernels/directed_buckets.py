@@ -33,8 +33,8 @@ _AHEAD = 8
 _PIECE = np.uint64(1 << 10)
 """Cells that make their offers before what these touched is put into the queue."""
 WIDTH = 0.9
-"""Of a bucket, in cheapest steps. A cell of a bucket that is being served must not be offered less by another of it,
-whatever the rounding: of the sum, of the product that finds the bucket, and of its factor, each at most 2^-24
+"""Of a bucket, in cheapest steps. A cell of a bucket that is being served must not be offered less by another of
+it, whatever the rounding: of the sum, of the product that finds the bucket, and of its factor, each at most 2^-24
 of the cost. Up to `_MOST_BUCKETS` that is a tenth of a bucket."""
 _MOST_BUCKETS = 1 << 19
 _SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], {QUEUE}))"
