@@ -69,8 +69,8 @@ CLASS_FACTOR: Mapping[TerrainClass, float] = {
     TerrainClass.SHRUB: 1.5,
     TerrainClass.WETLAND: 5.0,
 }
-"""Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`. Shrub is the heavy brush
-of Soule and Goldman (1972), for people on foot; wetland is a judgement: vehicles get stuck there."""
+"""Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`. Shrub is the heavy
+brush of Soule and Goldman (1972), for people on foot; wetland is a judgement: vehicles get stuck there."""
 
 
 def gradient(elevation_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
