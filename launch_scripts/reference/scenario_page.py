@@ -185,7 +185,7 @@ def _bounds(meta: msgspec.Meta) -> str:
     if meta.min_length is not None:
         words.append("not empty" if meta.min_length == 1 else f"at least {meta.min_length}")
     if meta.pattern is not None:
-        words.append("of letters, digits, `_`, `.` and `-`")
+        words.append("of digits" if meta.pattern.startswith("^[0-9]{") else "of letters, digits, `_`, `.` and `-`")
     return ", ".join(words)
 
 
