@@ -81,7 +81,7 @@ def test_hidden_zones_may_be_files_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("zone", "reason"),
     [
-        ('kind = "road"', r"missing required field `polygon_m` \(or `mask`, or `file`\)"),
+        ('kind = "road"', r"missing required field `polygon` \(or `polygon_m`, `mask`, `file`\)"),
         ('kind = "road"\nfile = "a"\nmask = "b"', "mask and file exclude each other"),
         ('kind = "road"\nmask = "a"\nlayer = "b"', "layer goes with file only, found mask"),
         ('kind = "factor"\nmask = "a"', "missing required field `factor`"),
