@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
-from shared_map.terrain.importers.georeference import bounds_in, crs_of, resampling
+from shared_map.terrain.importers.georeference import bounds_in, crs_name, crs_of, resampling
 from shared_map.terrain.importers.rasters import opened
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
@@ -69,7 +69,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
             return _read(dataset, grid, None, None, [], progress)
         crs = crs_of(dataset.crs, given_crs if not dataset.crs else None, what)
         target = rasterio.CRS.from_user_input(grid.crs)
-        share = _overlap(dataset, crs, target, grid, what)
+        share = overlap(dataset, crs, target, grid, what)
         notes = [f"photo: {dataset.height} x {dataset.width} pixels, covers {share:.1%} of the terrain"]
         aligned = crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3)
         return _read(dataset, grid, crs, None if aligned else target, notes, progress)
@@ -82,8 +82,18 @@ def transform_of(grid: GridSpec) -> Any:
     return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
 
 
-def _overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
-    west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
+    """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+    except (RasterioError, CPLE_BaseError) as error:
+        names = crs_name(crs), crs_name(target)
+        raise TerrainError(
+            f"{what} is in {names[0]}, from which no way leads to the terrain's {names[1]}"
+        ) from error
     grid_east = grid.west_m + grid.cols * grid.resolution_m
     grid_south = grid.north_m - grid.rows * grid.resolution_m
     wide = min(east, grid_east) - max(west, grid.west_m)

@@ -102,11 +102,12 @@ def test_a_walker_is_fastest_gently_downhill():
 
 @pytest.mark.parametrize("rule", ["linear", "quadratic", "tobler", "energy"])
 @pytest.mark.parametrize("steepest_deg", [5, 35, 90])
-def test_no_step_is_lethal_and_level_ground_costs_its_pace(rule, steepest_deg):
+def test_no_step_is_steeper_than_ground_may_be_and_level_ground_costs_its_pace(rule, steepest_deg):
     climb = climb_on(ramp(per_cell_m=1e4), rule, max_slope_deg=steepest_deg)
-    assert np.isfinite(climb.factors).all()
+    assert np.isfinite(climb.factors[1:-1]).all()
     assert climb.factors[ENTRIES] == 1.0
     assert climb.of_step(0, 1) == climb.factors[-1]
+    assert np.isinf(climb.factors[[0, -1]]).all() == (steepest_deg < 90)
 
 
 def test_a_step_beside_a_void_is_level():
@@ -123,9 +124,7 @@ def test_one_step_and_many_steps_read_the_same_table():
     pairs = [(c, n) for c in range(0, 1200, 7) for _, n in climb.grid.neighbours(c)]
     tails, heads = np.array(pairs).T
     alone = np.array([climb.of_step(a, b) for a, b in pairs])
-    # A rise in the middle between two entries may go to either.
-    np.testing.assert_allclose(climb.along(tails, heads), alone, rtol=2e-2)
-    assert (climb.along(tails, heads) == alone.astype(np.float32)).mean() > 0.99
+    np.testing.assert_array_equal(climb.along(tails, heads), alone.astype(np.float32))
 
 
 # --- trees ------------------------------------------------------------------------------------------------------
@@ -155,7 +154,7 @@ def test_costs_equal_an_independent_dijkstra(seed, rule):
 @pytest.mark.parametrize("seed", range(6))
 def test_routes_end_at_the_target_over_passable_cells_and_cost_what_they_say(seed):
     rng = np.random.default_rng([seed, 2])
-    climb = climb_on(mountains(rng, 40, 50, 12.0) * 150, "tobler" if seed & 1 else "energy")
+    climb = climb_on(mountains(rng, 40, 50, 12.0) * 150, "tobler" if seed & 1 else "energy", max_slope_deg=75)
     pace = rough(rng, 40, 50)
     root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
     tree = TargetTree(climb.grid, PlannerConfig(), climb)
