@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from support import slow_twins
 
 from planner_service.target_tree import TargetTree
+from shared_map.terrain.layers import terrain_pace
 from shared_map.terrain.slope_rules import SLOPE_RULES
 from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.scenario import CostConfig, PlannerConfig
@@ -104,3 +106,23 @@ def test_a_pit_can_be_entered_and_not_left() -> None:
     assert tree.routes([outside])[0].status is RouteStatus.OK
     tree.update(pace, outside, [], 0)
     assert tree.routes([inside])[0].status is not RouteStatus.OK
+
+
+@pytest.mark.parametrize("rule", SLOPE_RULES)
+def test_certificates_hold_while_windows_follow_a_target_on_paces_of_every_rule(rule: str) -> None:
+    rng = np.random.default_rng(40 + sorted(SLOPE_RULES).index(rule))
+    grades = np.abs(rng.normal(0, 0.3, (GRID.rows, GRID.cols))).astype(np.float32)
+    table = {"slope_table": ((-30.0, 0.6), (0.0, 1.0), (20.0, 4.0))} if rule == "table" else {}
+    cost = CostConfig(slope_rule=rule, **table)
+    pace = terrain_pace(grades, np.zeros(grades.shape, np.uint8), cost)
+    tree = TargetTree(GRID, PlannerConfig(strategy="rotation", k_min=0), None)
+    root = int(np.flatnonzero(np.isfinite(pace))[30])
+    for version in range(6):
+        tree.update(pace, root, [], version)
+        best = slow_twins.cost_to_go(pace, root).reshape(-1) * GRID.resolution_m
+        for route in tree.routes(np.arange(0, GRID.cells, 3)):
+            if route.status is RouteStatus.OK:
+                assert route.lower_bound_s <= best[route.start] * (1 + 1e-6)
+                assert route.cost_s >= best[route.start] * (1 - 1e-4)
+        near = [cell for _, cell in GRID.neighbours(root) if np.isfinite(pace.reshape(-1)[cell])]
+        root = near[version % len(near)]
