@@ -18,7 +18,7 @@ from launch_scripts.commands.terrain_files import write_geotiff
 from launch_scripts.launcher.progress import progress
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass
-from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.config.scenario import ElevationEncoding, Scenario, TerrainConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
 
 if TYPE_CHECKING:
@@ -56,6 +56,13 @@ Scale = Annotated[
 Fill = Annotated[
     bool, typer.Option("--fill", help="Fill voids from their surroundings instead of forbidding them.")
 ]
+Cover = Annotated[str | None, typer.Option(help="A raster of land-cover codes on the same ground.")]
+CoverCodes = Annotated[
+    str | None, typer.Option(help="What its codes mean: worldcover, corine, corine-level-3, nlcd, or a CSV file.")
+]
+Encoding = Annotated[
+    ElevationEncoding | None, typer.Option(help="What stands for a height, where the file does not show it.")
+]
 _TIFF = (".tif", ".tiff")
 PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
 
@@ -85,19 +92,25 @@ def info(
     resolution_m: Resolution = None,
     height_scale: Scale = None,
     fill: Fill = False,
+    cover: Cover = None,
+    cover_codes: CoverCodes = None,
+    elevation_encoding: Encoding = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what a terrain file or a scenario holds, and what was done to bring it onto a metric grid.
 
     Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
-    these in a .zip, .asc, .npz, MovingAI .map, ROS map_server .yaml or .yml,
-    and .png with --resolution-m and --height-scale. The lines after the table
+    these in a .zip, .asc, .npz, .csv and .xyz grids, Terrain-RGB and
+    Terrarium tiles, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map,
+    ROS map_server .yaml or .yml, and .png with --resolution-m and
+    --height-scale. The lines after the table
     say what was done to the file, and what you should know about it; those
     with a ! what looks wrong. Costs are those of the scenario, of a file
     those of an empty one.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
+    swarm terrain info dem.tif --cover worldcover.tif
     """
     from shared_map.terrain.terrain import build_terrain
     from shared_map.terrain.terrain_report import doubts_about, facts_of
@@ -112,6 +125,9 @@ def info(
             "resolution_m": resolution_m,
             "height_scale": height_scale,
             "nodata": nodata,
+            "cover": cover,
+            "cover_codes": cover_codes,
+            "elevation_encoding": elevation_encoding,
         }
         scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig))
     with progress() as tell:

@@ -43,6 +43,7 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.plugins.find import source_of
 from swarm.runtime.role import RoleSetup
+from swarm.wire.statements import PACE_MOST
 
 if TYPE_CHECKING:
     from shared_map.terrain.importers.sources import Source
@@ -148,8 +149,9 @@ def _add_cross_slopes(
     ground: Floats, elevation_m: Floats, cost: CostConfig, grid: GridSpec, progress: Progress
 ) -> None:
     def work(row0: int, row1: int) -> None:
-        padded_m = padded_rows(elevation_m, row0, row1)
-        ground[row0:row1] *= along_slope_of_padded(padded_m, grid.resolution_m, cost)
+        padded_m, part = padded_rows(elevation_m, row0, row1), ground[row0:row1]
+        dearer = part * along_slope_of_padded(padded_m, grid.resolution_m, cost)
+        np.minimum(dearer, np.float32(PACE_MOST), out=part, where=np.isfinite(part))
 
     in_bands(grid.rows, work, "slope and cost", progress)
 
@@ -257,7 +259,8 @@ def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
 def scenario_key(scenario: Scenario) -> str:
     """Fingerprint of all that a terrain is built from: a prepared one with another key is another terrain."""
     parts = {"format": FORMAT, "seed": scenario.seed, "terrain": scenario.terrain, "cost": scenario.cost}
-    files = [name for name in (scenario.terrain.source, scenario.terrain.photo) if name]
+    named = scenario.terrain
+    files = [name for name in (named.source, named.photo, named.labels, named.cover, named.cover_codes) if name]
     stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in map(Path, files) if path.is_file()]
     layers = [source_of(named, scenario.plugin_folder) for named in cost_layers_of(scenario)]
     payload = msgspec.json.encode([parts, stamps, layers], order="sorted")

@@ -29,6 +29,8 @@ class FileKind(Enum):
     CERTIFICATE = ("certificate or key", 1 << 16, StoreError)
     SLOPE_TABLE = ("slope table", 1 << 18, ConfigError)
     LABELS = ("labels", 4 << 20, TerrainError)
+    COVER_TABLE = ("cover codes", 4 << 20, TerrainError)
+    POINTS = ("terrain", 2 << 30, TerrainError)
     ROS_MAP = ("terrain", 1 << 16, TerrainError)
     TEXT_GRID = ("terrain", 32 * MAX_CELLS, TerrainError)
     ARRAYS = ("terrain", 12 * MAX_CELLS, TerrainError)

@@ -145,6 +145,10 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
         source = str(base / source)
     photo = None if terrain.photo is None else str(base / terrain.photo)
     labels = None if terrain.labels is None else str(base / terrain.labels)
+    cover = None if terrain.cover is None else str(base / terrain.cover)
+    codes = terrain.cover_codes
+    if codes is not None and codes not in COVER_TABLES:
+        codes = str(base / codes)
     hidden = msgspec.structs.replace(terrain.hidden, zones=_anchored_zones(terrain.hidden.zones, base))
     cost = msgspec.structs.replace(scenario.cost, zones=_anchored_zones(scenario.cost.zones, base))
     network = scenario.network
@@ -152,7 +156,8 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
         tls = network.tls
         tls = TlsConfig(ca=str(base / tls.ca), certificate=str(base / tls.certificate), key=str(base / tls.key))
         network = msgspec.structs.replace(network, tls=tls)
-    terrain = msgspec.structs.replace(terrain, source=source, photo=photo, labels=labels, hidden=hidden)
+    files = {"source": source, "photo": photo, "labels": labels, "cover": cover, "cover_codes": codes}
+    terrain = msgspec.structs.replace(terrain, **files, hidden=hidden)
     folder = str(base / scenario.plugin_folder)
     return msgspec.structs.replace(scenario, terrain=terrain, cost=cost, network=network, plugin_folder=folder)
 
@@ -164,3 +169,4 @@ def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConf
 
 
 BUILT_IN_TERRAINS = ("jacksboro", "synthetic")
+COVER_TABLES = ("worldcover", "corine", "corine-level-3", "nlcd")

@@ -72,6 +72,15 @@ Options = dict[str, Any]
 
 ClassName = Literal["unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow"]
 
+CoverGround = (
+    Literal["unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow", "lethal"] | Positive
+)
+"""What a code of a land-cover map stands for: a class, or a pace relative to open ground."""
+
+CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}$")]
+
+ElevationEncoding = Literal["metres", "terrain-rgb", "terrarium"]
+
 
 class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of the sections of a scenario."""
@@ -111,12 +120,20 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     """Where elevation and photo come from.
 
     source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2,
-                   .nc, .vrt, one of these in a .zip, .asc, .npz, .png, .map (MovingAI), .yaml or .yml (ROS)
+                   .nc, .vrt, one of these in a .zip, .asc, .npz, .png, .csv, .xyz, .map (MovingAI), .yaml or
+                   .yml (ROS)
     photo          a colour GeoTIFF on the same ground, or nothing
     labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
+    cover          a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or codes of one's
+                   own; also an image of such a map in the colours of its published legend
+    cover_codes    what the codes mean, where they do not show it: "worldcover", "corine", "corine-level-3", "nlcd",
+                   or a CSV file with lines of code and class (or pace relative to open ground, or "lethal")
+    cover_classes  single codes with the class (or pace, or "lethal") that counts instead of the table's
     resolution_m   cell size to bring everything to; the source's own if not given
     crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
     height_scale   metres per unit of height, where the file does not say it (.png)
+    elevation_encoding  what stands for a height, where the file does not show it: numbers, or the colours of
+                   Terrain-RGB or Terrarium tiles
     nodata         voids are lethal, or filled from their surroundings
     nodata_values  heights, as they are stored in the source, that stand for no height beside those that it declares
     level_is       what level ground of a file is taken for where no photo shows it: elevation models are levelled
@@ -133,9 +150,15 @@ class TerrainConfig(Section, frozen=True, kw_only=True):
     source: Annotated[str, Meta(min_length=1)] = "jacksboro"
     photo: str | None = None
     labels: str | None = None
+    cover: str | None = None
+    cover_codes: Annotated[str, Meta(min_length=1)] | None = None
+    cover_classes: Annotated[dict[CoverCode, CoverGround], Meta(max_length=10_000)] = msgspec.field(
+        default_factory=dict
+    )
     resolution_m: Positive | None = None
     crs: str | None = None
     height_scale: Positive | None = None
+    elevation_encoding: ElevationEncoding | None = None
     nodata: Literal["lethal", "fill"] = "lethal"
     nodata_values: Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(max_length=20)] = ()
     level_is: Literal["water", "ground"] = "water"
