@@ -132,8 +132,8 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
         )
     elif facts.get("both_ways_share", 1.0) < _SCATTERED:
         doubts.append(
-            f"steps that are too steep part the ground: {facts['both_ways_share']:.0%} of it can be entered and left"
-            " again, and vehicles elsewhere find no way; look at cost.max_climb_deg and cost.max_descent_deg"
+            f"steps that are too steep part the ground: {facts['both_ways_share']:.0%} of it can be entered and"
+            " left again, and vehicles elsewhere find no way; look at cost.max_climb_deg and cost.max_descent_deg"
         )
     if facts.get("slope_median_deg", 0.0) > _STEEP_DEG:
         doubts.append(
