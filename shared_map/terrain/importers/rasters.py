@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.georeference import crs_of, plan_grid, resampling
-from shared_map.terrain.importers.level_ground import MOST_SAMPLED, looked_at, without
+from shared_map.terrain.importers.level_ground import MOST_SAMPLED, looked_at
 from shared_map.terrain.importers.raster_kinds import kind_of
+from shared_map.terrain.importers.voids import without
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.config.input_files import size
 from swarm.config.scenario import TerrainConfig

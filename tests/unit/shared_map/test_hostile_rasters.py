@@ -12,8 +12,9 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from shared_map.terrain.importers.level_ground import level_ground, undeclared_voids
+from shared_map.terrain.importers.level_ground import level_ground
 from shared_map.terrain.importers.rasters import read_elevation
+from shared_map.terrain.importers.voids import undeclared_voids
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 
