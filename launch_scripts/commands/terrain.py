@@ -18,7 +18,7 @@ from launch_scripts.commands.terrain_files import write_geotiff
 from launch_scripts.launcher.progress import progress
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass
-from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.config.scenario import ElevationEncoding, Scenario, TerrainConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ app = typer.Typer(
     swarm terrain info dem.tif
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain classify dem.tif photo.tif --picture classes.png
+    swarm terrain rules --picture rules.png
     swarm terrain synth --out dem.tif --photo photo.tif
 
     Where to get an elevation model, and the rule for cost: docs/terrain.md.
@@ -54,6 +55,13 @@ Scale = Annotated[
 ]
 Fill = Annotated[
     bool, typer.Option("--fill", help="Fill voids from their surroundings instead of forbidding them.")
+]
+Cover = Annotated[str | None, typer.Option(help="A raster of land-cover codes on the same ground.")]
+CoverCodes = Annotated[
+    str | None, typer.Option(help="What its codes mean: worldcover, corine, corine-level-3, nlcd, or a CSV file.")
+]
+Encoding = Annotated[
+    ElevationEncoding | None, typer.Option(help="What stands for a height, where the file does not show it.")
 ]
 _TIFF = (".tif", ".tiff")
 PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
@@ -84,19 +92,25 @@ def info(
     resolution_m: Resolution = None,
     height_scale: Scale = None,
     fill: Fill = False,
+    cover: Cover = None,
+    cover_codes: CoverCodes = None,
+    elevation_encoding: Encoding = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what a terrain file or a scenario holds, and what was done to bring it onto a metric grid.
 
     Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
-    these in a .zip, .asc, .npz, MovingAI .map, ROS map_server .yaml or .yml,
-    and .png with --resolution-m and --height-scale. The lines after the table
+    these in a .zip, .asc, .npz, .csv and .xyz grids, Terrain-RGB and
+    Terrarium tiles, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map,
+    ROS map_server .yaml or .yml, and .png with --resolution-m and
+    --height-scale. The lines after the table
     say what was done to the file, and what you should know about it; those
     with a ! what looks wrong. Costs are those of the scenario, of a file
     those of an empty one.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
+    swarm terrain info dem.tif --cover worldcover.tif
     """
     from shared_map.terrain.terrain import build_terrain
     from shared_map.terrain.terrain_report import doubts_about, facts_of
@@ -111,14 +125,19 @@ def info(
             "resolution_m": resolution_m,
             "height_scale": height_scale,
             "nodata": nodata,
+            "cover": cover,
+            "cover_codes": cover_codes,
+            "elevation_encoding": elevation_encoding,
         }
         scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig))
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
-    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid)}
+    rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
+    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid), **rule}
     doubts = doubts_about(facts)
     if as_json:
-        console.print_json(json.dumps({**facts, "notes": terrain.notes, "doubts": doubts}))
+        zones = [zone.as_json(terrain.grid.cells) for zone in terrain.zones]
+        console.print_json(json.dumps({**facts, "zones": zones, "notes": terrain.notes, "doubts": doubts}))
         return
     table = Table(show_header=False, box=None)
     for key, value in facts.items():
@@ -203,6 +222,37 @@ def _print_shares(classes: Bytes) -> None:
 
 
 @app.command()
+def rules(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(help="A scenario file or the name of a built-in one: show its rule alone, in m/s."),
+    ] = None,
+    picture: PictureOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the rules by which slope becomes pace, and the presets of vehicle classes.
+
+    A rule is chosen by cost.slope_rule, a class of vehicles by cost.preset,
+    whose settings stand for those that the scenario does not give.
+
+    swarm terrain rules --picture rules.png
+    swarm terrain rules mine.toml
+    """
+    from launch_scripts.commands import slope_rules
+
+    _check_target(picture, "--picture", ".png")
+    shown = slope_rules.of_all() if scenario is None else slope_rules.of_scenario(_scenario(scenario))
+    if picture is not None:
+        from launch_scripts.commands.slope_picture import draw_rules
+
+        draw_rules(shown, picture)
+    if as_json:
+        console.print_json(json.dumps(shown.facts()))
+        return
+    slope_rules.show(shown, console)
+
+
+@app.command()
 def synth(
     out: Annotated[Path, typer.Option(help="Write the heights: .tif (in UTM 32) or .npz.")],
     rows: Annotated[int, typer.Option(min=8, max=16384, help="Cells from north to south.")] = 512,
@@ -255,7 +305,14 @@ def synth(
 @app.command()
 def reach(
     terrain: Annotated[str, typer.Argument(help="A terrain file, a scenario file or a built-in scenario.")],
-    to: Annotated[str, typer.Option(help="Where to: LAT,LON, xy:X,Y in metres or cell:ROW,COL.")],
+    to: Annotated[str, typer.Option(metavar="PLACE", help="Where to: LAT,LON, xy:X,Y in metres or cell:ROW,COL.")],
+    start: Annotated[
+        str | None,
+        typer.Option("--from", metavar="PLACE", help="Only where good ways from there lead: a corridor."),
+    ] = None,
+    slack: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="With --from: a way may take this share longer than the best.")
+    ] = 0.05,
     out: Annotated[
         Path | None, typer.Option(help="Write .tif (seconds, -1 where there is no way) or .geojson (areas).")
     ] = None,
@@ -266,27 +323,35 @@ def reach(
 ) -> None:
     """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as GeoJSON.
 
+    With --from: the corridor of near-optimal ways between two places. Each of
+    its cells has the time of the best way that passes it; the areas of a
+    .geojson are seconds lost against the best way of all.
+
     swarm terrain reach dem.tif --to 46.78,9.87 --out seconds.tif
     swarm terrain reach mine.toml --to cell:40,200 --out areas.geojson --every-s 300
+    swarm terrain reach dem.tif --from 46.81,9.84 --to 46.78,9.87 --slack 0.1 --out corridor.tif
     """
+    from launch_scripts.commands.reach import corridor, write_reach
     from launch_scripts.commands.reach import reach as reach_of
-    from launch_scripts.commands.reach import write_reach
 
     _check_target(out, "--out", *_TIFF, ".geojson")
-    found = reach_of(terrain, to)
+    found = reach_of(terrain, to) if start is None else corridor(terrain, start, to, slack)
     if out is not None:
         write_reach(found, out, every_s)
     median_s, longest_s = found.quantiles_s()
     if as_json:
         facts = {"share": round(found.share, 4), "median_s": round(median_s, 2), "longest_s": round(longest_s, 2)}
+        if found.fastest_s is not None:
+            facts["fastest_s"] = round(found.fastest_s, 2)
         console.print_json(json.dumps(facts))
         return
-    console.print(
-        f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {longest_s:.0f} s from"
-        " the furthest",
-        highlight=False,
-        soft_wrap=True,
-    )
+    if found.fastest_s is not None:
+        best = f"the best takes {found.fastest_s:.0f} s"
+        said = f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}"
+    else:
+        furthest = f"{longest_s:.0f} s from the furthest"
+        said = f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}"
+    console.print(said, highlight=False, soft_wrap=True)
 
 
 @app.command()

@@ -8,7 +8,10 @@ import numpy as np
 
 from shared_map.arrays import Bools
 from shared_map.terrain.layers import TerrainClass, slope_deg
+from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
+from swarm.grid import GridSpec
+from swarm.places import bounds_of, extent_of
 
 _MOST_SIDE = 2048
 """Slopes and parts of larger terrains are taken from every second, third, ... cell."""
@@ -30,6 +33,7 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
         "crs": grid.crs,
         "west_m": round(grid.west_m, 2),
         "north_m": round(grid.north_m, 2),
+        **bounds_deg(grid),
         "voids": int(np.isnan(elevation_m).sum()),
     }
     stride = -(-max(grid.rows, grid.cols) // _MOST_SIDE)
@@ -51,6 +55,13 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
         facts[name] = float(f"{np.quantile(finite, quantile):.4g}")
     facts["largest_part_share"] = round(_largest_part(~lethal[::stride, ::stride]), 4)
     return facts
+
+
+def bounds_deg(grid: GridSpec) -> dict[str, float]:
+    """South, west, north and east of a grid, WGS 84; empty where it has no place."""
+    box = None if grid.crs == "local" else bounds_of(MapFrame(grid))
+    names = ("south_deg", "west_deg", "north_deg", "east_deg")
+    return {} if box is None else dict(zip(names, (round(value, 7) for value in box), strict=True))
 
 
 def _largest_part(passable: Bools) -> float:
@@ -97,6 +108,7 @@ def said_of(terrain: Terrain) -> list[str]:
     size = f"{grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m"
     return [
         f"terrain: {size}, {lethal:.1%} lethal, {water:.1%} water",
+        *([] if grid.crs == "local" else [f"terrain: {extent_of(MapFrame(grid), 'latlon')}"]),
         *(f"- {note}" for note in terrain.notes),
         *(f"! {doubt}" for doubt in doubts_about(facts_of(terrain))),
     ]

@@ -67,7 +67,10 @@ def classified(source: Source, config: TerrainConfig, seed: int, progress: Progr
     seen = np.ones(source.classes.shape, np.bool_) if source.seen is None else source.seen
     other = why_not_true_colour(source.photo, seen)
     if config.labels is None and other is not None:
-        note = f"the photo is {other}; no classes are read from it: give a true-colour one, or terrain.labels"
+        note = (
+            f"the photo is {other}; no classes are read from it: give a true-colour one, terrain.labels, or its"
+            " codes as terrain.cover"
+        )
         return replace(source, notes=(*source.notes, note))
     if config.labels is None:
         classes = by_rules(*inputs, source.seen, progress)

@@ -69,7 +69,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
             return _read(dataset, grid, None, None, [], progress)
         crs = crs_of(dataset.crs, given_crs if not dataset.crs else None, what)
         target = rasterio.CRS.from_user_input(grid.crs)
-        share = _overlap(dataset, crs, target, grid, what)
+        share = overlap(dataset, crs, target, grid, what)
         notes = [f"photo: {dataset.height} x {dataset.width} pixels, covers {share:.1%} of the terrain"]
         aligned = crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3)
         return _read(dataset, grid, crs, None if aligned else target, notes, progress)
@@ -82,7 +82,8 @@ def transform_of(grid: GridSpec) -> Any:
     return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
 
 
-def _overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
+def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
+    """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
     west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
     grid_east = grid.west_m + grid.cols * grid.resolution_m
     grid_south = grid.north_m - grid.rows * grid.resolution_m

@@ -177,56 +177,55 @@ def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_pr
         If the file cannot be read, holds no heights, or does not fit a grid (see `plan_grid`).
     """
     with opened(path, "terrain") as dataset:
-        if dataset.count >= 3:
-            raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
-        if np.dtype(dataset.dtypes[0]).kind not in "iuf":
-            raise TerrainError(
-                f"terrain {path} holds {dataset.dtypes[0]} values; heights are whole or real numbers"
-            )
-        crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
-        grid, target, notes = plan_grid(
-            dataset.transform, dataset.height, dataset.width, crs, config.resolution_m, f"terrain {path}"
+        return elevation_of(dataset, path, config, progress)
+
+
+def elevation_of(dataset: Any, path: Path, config: TerrainConfig, progress: Progress = no_progress) -> Raster:
+    """As `read_elevation`, of a dataset that is open; `path` names it in errors."""
+    if dataset.count >= 3:
+        raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
+    if np.dtype(dataset.dtypes[0]).kind not in "iuf":
+        raise TerrainError(f"terrain {path} holds {dataset.dtypes[0]} values; heights are whole or real numbers")
+    crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
+    grid, target, notes = plan_grid(
+        dataset.transform, dataset.height, dataset.width, crs, config.resolution_m, f"terrain {path}"
+    )
+    factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
+    if (factor, offset) != (1.0, 0.0):
+        notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")
+    unit = _plain_unit(dataset.units[0] or "")
+    unit_m = _UNITS_M.get(unit, 1.0)
+    if unit_m != 1.0:
+        factor, offset = factor * unit_m, offset * unit_m
+        notes.append(f"heights are in {unit}, put into metres")
+    elif unit not in _UNITS_M and config.height_scale is None:
+        notes.append(f"heights are in {unit[:40]!r}, which is unknown, and taken for metres: terrain.height_scale")
+    elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
+        name, metres = crs.linear_units_factor
+        notes.append(
+            f"distances are in {name}, and heights, of which the file says nothing, are taken for metres; if"
+            f" they are not, terrain.height_scale = {metres:.6g}"
         )
-        factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
+    if config.height_scale is not None:
+        factor, offset = factor * config.height_scale, offset * config.height_scale
+    if dataset.count == 2:
+        notes.append("the file has two bands; heights are taken from the first")
+    sample = _sampled(dataset)
+    voids, found, told = looked_at(sample, config, factor, offset)
+    notes.extend(told)
+    level = _placed_mask(dataset, found, crs, grid, target)
+    elevation_m = np.empty((grid.rows, grid.cols), np.float32)
+    heights = _heights_without(dataset, voids, path) if voids and target is not None else None
+    for row0, row1 in bands(grid.rows, _READ_ROWS):
+        band = elevation_m[row0:row1]
+        if target is None:
+            _read_straight(dataset, row0, row1, band, voids)
+        else:
+            _read_warped(dataset, heights, crs, grid, target, row0, band)
         if (factor, offset) != (1.0, 0.0):
-            notes.append(
-                f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied"
-            )
-        unit = _plain_unit(dataset.units[0] or "")
-        unit_m = _UNITS_M.get(unit, 1.0)
-        if unit_m != 1.0:
-            factor, offset = factor * unit_m, offset * unit_m
-            notes.append(f"heights are in {unit}, put into metres")
-        elif unit not in _UNITS_M and config.height_scale is None:
-            notes.append(
-                f"heights are in {unit[:40]!r}, which is unknown, and taken for metres: terrain.height_scale"
-            )
-        elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
-            name, metres = crs.linear_units_factor
-            notes.append(
-                f"distances are in {name}, and heights, of which the file says nothing, are taken for metres; if"
-                f" they are not, terrain.height_scale = {metres:.6g}"
-            )
-        if config.height_scale is not None:
-            factor, offset = factor * config.height_scale, offset * config.height_scale
-        if dataset.count == 2:
-            notes.append("the file has two bands; heights are taken from the first")
-        sample = _sampled(dataset)
-        voids, found, told = looked_at(sample, config, factor, offset)
-        notes.extend(told)
-        level = _placed_mask(dataset, found, crs, grid, target)
-        elevation_m = np.empty((grid.rows, grid.cols), np.float32)
-        heights = _heights_without(dataset, voids, path) if voids and target is not None else None
-        for row0, row1 in bands(grid.rows, _READ_ROWS):
-            band = elevation_m[row0:row1]
-            if target is None:
-                _read_straight(dataset, row0, row1, band, voids)
-            else:
-                _read_warped(dataset, heights, crs, grid, target, row0, band)
-            if (factor, offset) != (1.0, 0.0):
-                band *= np.float32(factor)
-                band += np.float32(offset)
-            progress("reading heights", row1 / grid.rows)
+            band *= np.float32(factor)
+            band += np.float32(offset)
+        progress("reading heights", row1 / grid.rows)
     return Raster(grid, elevation_m, level, tuple(notes))
 
 

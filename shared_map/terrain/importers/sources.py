@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.ground_cover import classified, with_photo, with_water, without_voids
@@ -61,12 +62,28 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
         source = _from_file(Path(config.source), config, progress)
     source = without_voids(source, config)
     if config.photo is not None:
+        config = _photo_or_cover(config)
+    if config.photo is not None:
         source = with_photo(source, Path(config.photo), config, progress)
     if source.photo is not None:
         source = classified(source, config, seed, progress)
     elif config.labels is not None:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
-    return with_water(source, config)
+    source = with_water(source, config)
+    if config.cover is not None:
+        from shared_map.terrain.importers.land_cover import with_cover
+
+        source = with_cover(source, config, progress)
+    return source
+
+
+def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
+    """The settings with a photo that is a drawn map of land cover named as such."""
+    from shared_map.terrain.importers.land_cover import is_drawn
+
+    if config.photo is None or config.cover is not None or config.labels is not None:
+        return config
+    return replace(config, photo=None, cover=config.photo) if is_drawn(Path(config.photo), config) else config
 
 
 # --- built in -----------------------------------------------------------------------------------------------
@@ -125,10 +142,15 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 
 def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.terrain.importers.rasters import read_elevation
+    from shared_map.terrain.importers.coded_rasters import of_other_contents
+    from shared_map.terrain.importers.rasters import elevation_of, opened
 
     _check_hgt(path)
-    raster = read_elevation(path, config, progress)
+    with opened(path, "terrain") as dataset:
+        source = of_other_contents(dataset, path, config, progress)
+        if source is not None:
+            return source
+        raster = elevation_of(dataset, path, config, progress)
     classes = np.zeros(raster.elevation_m.shape, np.uint8)
     return Source(raster.grid, raster.elevation_m, classes, level=raster.level, notes=(str(path), *raster.notes))
 
@@ -146,15 +168,19 @@ def _check_hgt(path: Path) -> None:
 
 def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A grey image of heights: needs to be told how many metres a grey level and a cell are."""
+    from shared_map.terrain.importers.coded_rasters import of_other_contents
     from shared_map.terrain.importers.georeference import check_size
     from shared_map.terrain.importers.rasters import opened
 
-    if config.resolution_m is None or config.height_scale is None:
-        raise TerrainError(
-            f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel) and"
-            " terrain.height_scale (metres per grey level)"
-        )
     with opened(path, "terrain") as dataset:
+        source = of_other_contents(dataset, path, config, progress)
+        if source is not None:
+            return source
+        if config.resolution_m is None or config.height_scale is None:
+            raise TerrainError(
+                f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel) and"
+                " terrain.height_scale (metres per grey level)"
+            )
         if dataset.count not in (1, 2):
             raise TerrainError(f"terrain {path} has {dataset.count} colour bands; heights are one grey band")
         check_size(dataset.height, dataset.width, f"terrain {path}")
@@ -176,8 +202,11 @@ def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Flo
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     from shared_map.terrain.importers.plain_files import read_asc, read_npz
+    from shared_map.terrain.importers.text_grids import read_text_grid
 
-    plain = read_asc(path) if path.suffix.lower() == ".asc" else read_npz(path)
+    suffix = path.suffix.lower()
+    read = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)
+    plain = read(path)
     assert plain.heights is not None
     step, photo = plain.step, plain.photo
     heights, level, told = _looked_at(plain.heights, config.height_scale or 1.0, config)
@@ -186,7 +215,7 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
             raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
         step = (config.resolution_m, config.resolution_m)
     degrees = plain.degrees or _geographic(config.crs)
-    if path.suffix.lower() == ".asc" and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
+    if suffix != ".npz" and not degrees and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
         raise TerrainError(
             f"terrain {path}: a cell of {step[0]:g} looks like degrees; set terrain.crs = 'EPSG:4326'"
         )
@@ -198,7 +227,10 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         photo = photo[_nearest(photo.shape[0], photo.shape[1], grid)]
     classes = np.zeros(heights.shape, np.uint8)
     level = level[_nearest(level.shape[0], level.shape[1], grid)]
-    return Source(grid, heights, classes, photo, level=level, notes=(str(path), note, *told))
+    notes = [str(path), *plain.notes, note, *told]
+    if read is read_text_grid and plain.step != (0.0, 0.0) and grid.crs == "local":
+        notes.append("x and y are taken for metres of a system without a name; terrain.crs names it")
+    return Source(grid, heights, classes, photo, level=level, notes=tuple(notes))
 
 
 def _nearest(rows: int, cols: int, grid: GridSpec) -> tuple[Any, ...]:
@@ -250,6 +282,8 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".zip": _raster,
     ".asc": _heights,
     ".npz": _heights,
+    ".csv": _heights,
+    ".xyz": _heights,
     ".png": _png,
     ".map": _map,
     ".yaml": _map,
@@ -291,9 +325,7 @@ def _from_degrees(
 
 
 def _at(config: TerrainConfig, resolution_m: float) -> TerrainConfig:
-    import msgspec
-
-    return msgspec.structs.replace(config, resolution_m=resolution_m)
+    return replace(config, resolution_m=resolution_m)
 
 
 def _from_metres(
