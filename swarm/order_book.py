@@ -83,7 +83,7 @@ class OrderBook:
 
     def stopped(self, vehicle: str) -> bool:
         """Whether a vehicle is to stand."""
-        return self.paused or self.about("vehicle", vehicle) is not None
+        return bool(self._orders) and (self.paused or self.about("vehicle", vehicle) is not None)
 
     def setting(self, name: str, usual: float) -> float:
         """A setting that may change while the swarm runs; `usual` is the scenario's."""

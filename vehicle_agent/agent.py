@@ -6,7 +6,6 @@ import math
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +28,9 @@ from vehicle_agent.local_map import LocalMap, meet
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
+from vehicle_agent.traffic.wishes import Wishes
 
 _LONGEST_STEP_S = 0.5
-_WISH_LASTS_NS = NS_PER_S
-"""A wish that has not changed is made anew so often, as it tells the vehicle's age."""
-_STAYS = Wish()
 _STALE_CELLS = 8
 """A route that ends so far from the newest pose of the target is of an older tree: ask again."""
 
@@ -66,7 +63,6 @@ class Agent:
     assigner   which target each vehicle goes for; evenly spread if not given
     dynamics   how fast vehicles drive; as the ground allows if not given
 
-    wishes     what to ask of wardens, as of the last `decide`
     stopped    whether an operator wants a vehicle to stand
     """
 
@@ -85,7 +81,6 @@ class Agent:
         self.vehicles: dict[str, Vehicle] = {}
         self.targets = list(plan.group.targets) or scenario.target_ids
         self.holdings = holdings
-        self.wishes: dict[str, Wish] = {}
         self.blocked_ticks = 0
         self.stopped: Callable[[str], bool] = lambda vehicle: False
         self._config = scenario.vehicles
@@ -96,9 +91,17 @@ class Agent:
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
-        self._steering = Steering(
-            *(grid, pace, scenario.planner, config.reserve_cells, chance, holdings.occupied, self.bodies),
-            local_map.climb,
+        climb = local_map.climb
+        self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.bodies, climb)
+        self._wishes = Wishes(
+            grid,
+            self._steering,
+            holdings,
+            self.bodies,
+            config.reserve_cells + 2,
+            self._target_cell,
+            self._in_reach,
+            f"{scenario.seed}/{plan.id}",
         )
         self._driver = Driver(local_map, holdings, self._steering.passable, dynamics)
         self.detours = Detours(grid, pace, self._steering.steps, self.bodies)
@@ -116,8 +119,6 @@ class Agent:
         self.seen_lethal: set[int] = set()
         """Cells in zones over which no way out leads, as vehicles have seen."""
         self._driven_ns: int | None = None
-        self._wished: dict[str, tuple[object, ...]] = {}
-        """Vehicle under way -> what its wish was made of."""
 
     # --- what operators order ---------------------------------------------------------------------------------
 
@@ -157,14 +158,14 @@ class Agent:
         """These leave the map: their cells are given back."""
         for id in vehicles:
             self.holdings.leave(id)
-            for known in (self.vehicles, self.wishes, self._wished):
-                known.pop(id, None)
+            self.vehicles.pop(id, None)
+            self._wishes.forget(id)
 
     def stand_down(self) -> None:
         """Another process drives the vehicles now."""
-        self.vehicles.clear()
-        self.wishes.clear()
-        self._wished.clear()
+        for id in list(self.vehicles):
+            del self.vehicles[id]
+            self._wishes.forget(id)
 
     def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
         """Cells that only an operator's zone closes, and how many steps it is from each out of it."""
@@ -176,10 +177,15 @@ class Agent:
         if ways_out == self._steering.ways_out:
             return
         self._steering.ways_out = ways_out
+        self._wishes.make_anew()
         for vehicle in self.vehicles.values():
             if vehicle.cell in ways_out:  # a step along the way before this one is not allowed any more
                 self._driver.end_path(vehicle)
-                self._wished.pop(vehicle.id, None)
+
+    @property
+    def wishes(self) -> Mapping[str, Wish]:
+        """What to ask of wardens for each vehicle, as of the last `decide`."""
+        return self._wishes.of
 
     @property
     def places(self) -> list[int]:
@@ -218,6 +224,7 @@ class Agent:
         changed  the windows with all cells that have changed
         look     another agent changed the map: compare what is in sight with it again
         """
+        self._wishes.ground_changed(changed)
         if not changed or not self.vehicles:
             return
         vehicles = list(self.vehicles.values())
@@ -230,22 +237,15 @@ class Agent:
             if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable_steps):
                 vehicle.cut_route(now_ns)
             self._driver.end_path(vehicle)
-            self._wished.pop(vehicle.id, None)
             if look:
                 self._driver.entered[vehicle.cell] = None
 
     def bodies_moved(self) -> None:
         """Let vehicles stop before cells that bodies close, or turn back. Called before they drive: what was
         granted since the last time may lie on closed cells, too."""
-        changed = self.bodies.take_changed()
-        if not self.vehicles or not (changed or self.bodies.any):
-            return
-        vehicles = list(self.vehicles.values())
-        for vehicle in vehicles:
-            self._driver.end_path(vehicle)
-        cells = np.array([divmod(vehicle.cell, self._map.grid.cols) for vehicle in vehicles], np.int64)
-        for index in np.flatnonzero(meet(np.hstack((cells, cells)), changed, self._sight_cells)):
-            self._wished.pop(vehicles[index].id, None)
+        if self.bodies.any:
+            for vehicle in self.vehicles.values():
+                self._driver.end_path(vehicle)
 
     # --- deciding -------------------------------------------------------------------------------------------
 
@@ -256,6 +256,7 @@ class Agent:
         self.blocked_ticks = 0
         lost = self._trackings.lost(now_ns)
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
+        driven: list[Vehicle] = []
         for vehicle in self.vehicles.values():
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
@@ -272,11 +273,11 @@ class Agent:
             if ask is not None:
                 asks.setdefault((ask.target, ask.force), []).append(ask)
             if stopped:
-                self.wishes[vehicle.id] = _STAYS
-                self._wished.pop(vehicle.id, None)
+                self._wishes.stay(vehicle.id)
                 continue
-            self._wish(vehicle, path, now_ns)
+            driven.append(vehicle)
             self.blocked_ticks += self._steering.blocked(vehicle, path, now_ns)
+        self._wishes.make(driven, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
             request = AskRoutes(
@@ -298,15 +299,9 @@ class Agent:
             actions.append(self._assignment.ask(self._requests, self.vehicles, now_ns))
         return actions
 
-    def _wish(self, vehicle: Vehicle, path: Sequence[int], now_ns: int) -> None:
-        """Say where the vehicle would go. While it is under way, only what is listed here can change that."""
-        pushed, route, second = self.holdings.pushed(vehicle.id), vehicle.route, now_ns // _WISH_LASTS_NS
-        made_of = (path[0], path[-1], route.changes, vehicle.target, vehicle.in_reach, pushed, second)
-        if len(path) > 1 and self._wished.get(vehicle.id) == made_of:
-            return
-        self._wished[vehicle.id] = made_of
-        in_reach = partial(self._in_reach, vehicle.target)
-        self.wishes[vehicle.id] = self._steering.wish(vehicle, path, pushed, in_reach, now_ns)
+    def _target_cell(self, target: str | None) -> int | None:
+        pose = self._poses.get(target) if target is not None else None
+        return None if pose is None else pose.cell
 
     def _in_reach(self, target: str | None, cell: int) -> bool:
         pose = self._poses.get(target) if target is not None else None

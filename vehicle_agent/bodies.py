@@ -63,6 +63,8 @@ class _Known:
 
     heard_ns  when it was heard; later where the process has not listened meanwhile, `came_ns` never
     cells     closed now; `ahead_m` is the length of the way to which they belong
+    coming    where it comes to within `MAKE_WAY_S`; None if it stands
+    window    holds all that it closes or comes to
     charge    cells of the box that holds all that it can ever close
     since_ns  since when the body has been near `anchor`
     """
@@ -121,7 +123,7 @@ class Bodies:
         return bool(self._known)
 
     def take_changed(self) -> list[Window]:
-        """Windows with all cells that were closed or opened since the last call."""
+        """Windows with all cells for which `closed` or `danger` may say something else than at the last call."""
         changed, self._changed = self._changed, []
         return changed
 
@@ -162,6 +164,7 @@ class Bodies:
         made.ghosts, known.ghosts = known.ghosts, []
         if leaps:
             made.ghosts.append(known)
+            self._changed.append(known.window)  # nothing comes from there any more
             far_m = math.hypot(x_m - known.report.x_m, y_m - known.report.y_m)
             self._complain(
                 "leaps", report.id, f"leaps {far_m:.0f} m: where it was stays closed until the lease of that ends"
@@ -283,9 +286,11 @@ class Bodies:
             return
         known.ahead_m = ahead_m
         capsule = self._capsule(report, ahead_m)
-        self._close(known, frozenset(capsule.cells(self._grid)), capsule.window(self._grid))
+        window = capsule.window(self._grid)
         if report.speed_m_per_s > 0.0:
             known.coming = self._capsule(report, report.speed_m_per_s * (age_s + MAKE_WAY_S))
+            window = window.union(known.coming.window(self._grid))
+        self._close(known, frozenset(capsule.cells(self._grid)), window)
 
     def _close(self, known: _Known, cells: frozenset[int], window: Window) -> None:
         closed = self._closed
@@ -296,8 +301,7 @@ class Bodies:
                 closed[cell] -= 1
             else:
                 del closed[cell]
-        if cells != known.cells:
-            self._changed.append(window.union(known.window))
+        self._changed.append(window.union(known.window))
         known.cells, known.window = cells, window
 
     def _capsule(self, report: Body, ahead_m: float) -> Capsule:

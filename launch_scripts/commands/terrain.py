@@ -136,7 +136,8 @@ def info(
     facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid), **rule}
     doubts = doubts_about(facts)
     if as_json:
-        console.print_json(json.dumps({**facts, "notes": terrain.notes, "doubts": doubts}))
+        zones = [zone.as_json(terrain.grid.cells) for zone in terrain.zones]
+        console.print_json(json.dumps({**facts, "zones": zones, "notes": terrain.notes, "doubts": doubts}))
         return
     table = Table(show_header=False, box=None)
     for key, value in facts.items():

@@ -31,9 +31,9 @@ def missing_files(scenario: Scenario) -> list[str]:
     """Files of the terrain which are missing on this machine, and cost layers whose module is."""
     terrain = scenario.terrain
     source = None if terrain.source in BUILT_IN_TERRAINS else terrain.source
-    masks = [zone.mask for zone in scenario.cost.zones]
+    zones = [zone.mask or zone.file for zone in scenario.cost.zones]
     codes = None if terrain.cover_codes in COVER_TABLES else terrain.cover_codes
-    named = [source, terrain.photo, terrain.labels, terrain.cover, codes, *masks]
+    named = [source, terrain.photo, terrain.labels, terrain.cover, codes, *zones]
     layers = [each.name for each in cost_layers_of(scenario) if not source_of(each, scenario.plugin_folder)]
     return [*(name for name in named if name is not None and not Path(name).is_file()), *layers]
 

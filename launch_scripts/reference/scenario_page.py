@@ -82,6 +82,7 @@ def _sections(root: Section) -> list[tuple[str, Section]]:
             if inner is not None and all(inner is not known for _, known in found):
                 several = typing.get_origin(_bare(hint)) is tuple
                 joined = f"{path.strip('[]')}.{key}" if path else key
+                joined += ".NAME" * (typing.get_origin(_bare(hint)) is dict)
                 found.append((f"[[{joined}]]" if several else f"[{joined}]", inner))
     return found
 
@@ -140,6 +141,8 @@ def _struct_in(hint: Any) -> Section | None:
     bare = _bare(hint)
     if typing.get_origin(bare) is tuple:
         bare = _bare(typing.get_args(bare)[0])
+    elif typing.get_origin(bare) is dict:
+        bare = _bare(typing.get_args(bare)[1])
     return bare if isinstance(bare, type) and issubclass(bare, msgspec.Struct) else None
 
 

@@ -125,6 +125,10 @@ class BodyReferee:
         if not 0 <= now_ns - self._swept_ns < NS_PER_S:
             self._sweep(now_ns)
 
+    def covers(self, cell: int) -> bool:
+        """Whether a body was on a cell lately."""
+        return cell in self._covers
+
     def check(self, stay: Stay) -> Iterator[BodyHit]:
         """What a vehicle's stay on a cell proves."""
         for cover in self._covers.get(stay.cell, ()):

@@ -85,12 +85,12 @@ class Referee:
         broken: list[Broken] = []
         for id, cell in zip(fleet.ids, column(fleet.cells, "<u4").tolist(), strict=True):
             if cell < len(self._truth_s_per_m):
-                broken.extend(self._report(id, cell, fleet))
+                self._report(id, cell, fleet, broken)
         if fleet.stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(fleet.stamp_ns)
         return broken
 
-    def _report(self, id: str, cell: int, fleet: Fleet) -> Iterator[Broken]:
+    def _report(self, id: str, cell: int, fleet: Fleet, broken: list[Broken]) -> None:
         stamp_ns = fleet.stamp_ns
         since_ns = 0
         known = self._vehicles.get(id)
@@ -103,7 +103,8 @@ class Referee:
             stay = known.stay
             if cell == stay.cell or gapless:
                 stay.end_ns = stamp_ns
-                yield from self._meetings(stay)
+                if self._bodies.covers(stay.cell) or len(self._stays.get(stay.cell, ())) > 1:
+                    broken.extend(self._meetings(stay))
             if cell == stay.cell:
                 return
         entered = Stay(id, cell, stamp_ns, stamp_ns, since_ns)
@@ -113,14 +114,11 @@ class Referee:
         else:
             known.stay = entered
         if not self._truth_s_per_m.item(cell) < math.inf:
-            yield LethalEntry(id, cell, stamp_ns)
+            broken.append(LethalEntry(id, cell, stamp_ns))
 
     def _meetings(self, stay: Stay) -> Iterator[Collision | BodyHit]:
         yield from self._bodies.check(stay)
-        here = self._stays.get(stay.cell, ())
-        if len(here) < 2:
-            return
-        for other in here:
+        for other in self._stays.get(stay.cell, ()):
             overlap_ns = min(stay.end_ns, other.end_ns) - max(stay.begin_ns, other.begin_ns)
             if other.vehicle == stay.vehicle or overlap_ns <= _SKEW_NS:
                 continue

@@ -7,8 +7,11 @@ The merge rule, per cell, in this order:
    No finite pace is above `PACE_MOST` or below `PACE_LEAST`.
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
    Then the scenario's own layers (`cost_layers`), one after the other; a void stays lethal.
-3. Zones in the order painted: a road sets the road pace (over cliffs and water too: a bridge, a cutting; not over a
-   void), preferred halves, rough doubles; then every forbidden zone is lethal, whatever else was painted there.
+3. Zones in the order written: a pace sets the pace of open ground, a factor multiplies it, preferred halves, rough
+   doubles, slow water multiplies; a road sets the road pace (over cliffs and the terrain's own water too: a
+   cutting, a causeway; not over a void), one of a file only where that is quicker. Then water that is lethal closes
+   what it touches, roads too; then bridges open the water beneath them; then every forbidden zone is lethal,
+   whatever else was painted there.
    Where `cost.directional`, each cell then pays what `cost.cross_slope_factor` asks for driving along its slope;
    steps that lead up or down get it back.
 4. This is the ground. The prior map is the ground with inflation: a cell is lethal where a vehicle of

@@ -37,6 +37,8 @@ class FileKind(Enum):
     IMAGE = ("image", 8 * MAX_CELLS, TerrainError)
     VIRTUAL_RASTER = ("raster", 4 << 20, TerrainError)
     FIELD = ("field", 9 * MAX_CELLS, TerrainError)
+    VECTORS = ("zone", 1 << 30, TerrainError)
+    VECTOR_TEXT = ("zone", 256 << 20, TerrainError)
     PREPARED = ("prepared terrain", 1 << 20, TerrainError)
     EXPORTED_MAP = ("exported map", 512 << 20, StoreError)
     TRACKS = ("tracks", 256 << 20, StoreError)

@@ -6,7 +6,6 @@ import ipaddress
 import re
 from collections import Counter
 from pathlib import Path
-from typing import get_args
 
 import msgspec
 
@@ -17,10 +16,8 @@ from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import (
     MOST_TARGETS,
     RESERVED_GROUP,
-    WHOLE_TREE_STRATEGIES,
     PlannerConfig,
     Scenario,
-    Strategy,
     TlsConfig,
     ZoneConfig,
     ids_of,
@@ -67,15 +64,7 @@ def _check(scenario: Scenario, source: str) -> None:
         ("terrain.hidden.zones", scenario.terrain.hidden.zones),
     ):
         for n, zone in enumerate(zones):
-            given = [name for name in ("polygon", "polygon_m", "mask") if getattr(zone, name) is not None]
-            if not given:
-                raise ConfigError(
-                    f"{source}: {key}[{n}]: missing required field `polygon` (or `polygon_m`, `mask`)"
-                )
-            if len(given) > 1:
-                raise ConfigError(f"{source}: {key}[{n}]: {given[0]} and {given[1]} exclude each other")
-            for corner in zone.polygon or ():
-                read_place(corner, f"{source}: {key}[{n}].polygon")
+            _check_zone(zone, f"{source}: {key}[{n}]")
     for n, target in enumerate(scenario.targets):
         if target.start is not None:
             read_place(target.start, f"{source}: targets[{n}].start")
@@ -114,13 +103,29 @@ def _check(scenario: Scenario, source: str) -> None:
             check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
 
 
+_VALUES = {"factor": "factor", "pace": "pace_s_per_m"}
+
+
+def _check_zone(zone: ZoneConfig, where: str) -> None:
+    given = [key for key in ("polygon", "polygon_m", "mask", "file") if getattr(zone, key) is not None]
+    if not given:
+        raise ConfigError(f"{where}: missing required field `polygon` (or `polygon_m`, `mask`, `file`)")
+    if len(given) > 1:
+        raise ConfigError(f"{where}: {given[0]} and {given[1]} exclude each other")
+    for corner in zone.polygon or ():
+        read_place(corner, f"{where}.polygon")
+    if zone.file is None:
+        of_files = [key for key in ("layer", "crs", "attribute", "width_m", "classes") if getattr(zone, key)]
+        if of_files:
+            raise ConfigError(f"{where}: {of_files[0]} goes with file only, found {given[0]}")
+        if zone.kind in _VALUES and zone.value is None:
+            raise ConfigError(f"{where}: missing required field `{_VALUES[zone.kind]}`")
+    for kind, key in _VALUES.items():
+        if getattr(zone, key) is not None and zone.kind != kind:
+            raise ConfigError(f"{where}: {key} goes with kind {kind}, found {zone.kind!r}")
+
+
 def _check_directional(planner: PlannerConfig, source: str) -> None:
-    if planner.strategy in get_args(Strategy) and planner.strategy not in WHOLE_TREE_STRATEGIES:
-        allowed = " or ".join(map(repr, WHOLE_TREE_STRATEGIES))
-        raise ConfigError(
-            f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
-            f" and corridors know one cost per cell; expected {allowed}, which grow whole trees"
-        )
     if planner.length_weight:
         raise ConfigError(
             f"{source}: planner.length_weight: {planner.length_weight:g} does not go with cost.directional = true;"
@@ -176,7 +181,12 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
 
 def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConfig, ...]:
     return tuple(
-        zone if zone.mask is None else msgspec.structs.replace(zone, mask=str(base / zone.mask)) for zone in zones
+        msgspec.structs.replace(
+            zone,
+            mask=zone.mask and str(base / zone.mask),
+            file=zone.file and str(base / zone.file),
+        )
+        for zone in zones
     )
 
 

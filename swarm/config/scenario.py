@@ -36,9 +36,6 @@ MOST_TARGETS = 1000
 Strategy = Literal[
     "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
 ]
-WHOLE_TREE_STRATEGIES: tuple[Strategy, ...] = ("auto", "full")
-"""Strategies which need no windows, and so go with `cost.directional`: a window knows one cost per cell."""
-
 SlopeRule = Literal[
     "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
 ]
@@ -88,22 +85,63 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Base of the sections of a scenario."""
 
 
-class ZoneConfig(Section, frozen=True, kw_only=True):
-    """A part of the terrain with a cost of its own. Give one of `polygon`, `polygon_m` and `mask`.
+class WayConfig(Section, frozen=True, kw_only=True):
+    """What a class of features in a file of zones is worth.
 
-    kind       forbidden is lethal; preferred halves the pace; road sets the road pace; rough doubles the pace
-    polygon    corners as places: "46.81,9.85" (latitude, longitude), "xy:779600,190400" in metres of the map,
-               "cell:40,200"
-    polygon_m  [east, south] corners in metres from the north-west corner of the terrain
-    mask       an image file with as many pixels as the terrain has cells: the zone is where it is not 0
-    name       how messages call the zone; its kind if empty
+    width_m  of its lines; a width that a line has of its own counts more
+    factor   pace relative to the road pace (kind road), or to the ground; "ignored" leaves such features out
     """
 
-    kind: Literal["forbidden", "preferred", "road", "rough"]
+    width_m: Annotated[float, Meta(ge=0, le=10_000)] | None = None
+    factor: Positive | Literal["lethal", "ignored"] = 1.0
+
+
+class ZoneConfig(Section, frozen=True, kw_only=True):
+    """A part of the terrain with a cost of its own. Give one of `polygon`, `polygon_m`, `mask` and `file`.
+
+    kind          forbidden is lethal; water is lethal or slow, by its class, and bridges cross it; road sets the
+                  road pace; pace sets the pace of open ground; factor multiplies it; preferred halves it; rough
+                  doubles it
+    polygon       corners as places: "46.81,9.85" (latitude, longitude), "xy:779600,190400" in metres of the map,
+                  "cell:40,200"
+    polygon_m     [east, south] corners in metres from the north-west corner of the terrain
+    mask          an image file with as many pixels as the terrain has cells: the zone is where it is not 0
+    file          a GeoJSON, GeoPackage or Shapefile (or a .zip of one), in any coordinate system; for pace and
+                  factor also a raster of them
+    layer         which layer of a file that has several
+    crs           coordinate system of the file, where it does not say it; "local": metres of the terrain's own map
+    attribute     column of the file with the pace, the factor, or the class of each feature; of roads and water
+                  that of OpenStreetMap is known
+    factor        of kind factor, where no column says it
+    pace_s_per_m  of kind pace, where no column says it
+    width_m       width of lines, where neither they nor their class say it
+    classes       class -> its width and factor, beside the built-in ones of roads and water
+    name          how messages call the zone; its kind if empty
+    """
+
+    kind: Literal["forbidden", "water", "road", "pace", "factor", "preferred", "rough"]
     polygon: Annotated[tuple[PlaceText, ...], Meta(min_length=3, max_length=10_000)] | None = None
     polygon_m: Polygon | None = None
     mask: str | None = None
+    file: str | None = None
+    layer: Annotated[str, Meta(max_length=200)] | None = None
+    crs: str | None = None
+    attribute: Annotated[str, Meta(max_length=200)] | None = None
+    factor: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
+    pace_s_per_m: Annotated[float, Meta(ge=0.003, le=100)] | None = None
+    width_m: Annotated[float, Meta(gt=0, le=10_000)] | None = None
+    classes: dict[Annotated[str, Meta(max_length=200)], WayConfig] = msgspec.field(default_factory=dict)
     name: str = ""
+
+    @property
+    def value(self) -> float | None:
+        """The factor or the pace, of these kinds."""
+        return {"factor": self.factor, "pace": self.pace_s_per_m}.get(self.kind)
+
+    @property
+    def called(self) -> str:
+        """How messages call it."""
+        return self.name or self.kind
 
 
 class HiddenConfig(Section, frozen=True, kw_only=True):
@@ -195,7 +233,7 @@ class CostConfig(Section, frozen=True, kw_only=True):
     road_speed_m_per_s      speed on roads
     slope_rule              what slope does to pace; `swarm terrain rules` shows all, and where they come from
     directional             uphill is not downhill: a step costs by what it climbs along its way, instead of a cell
-                            by how steep it is; the planner grows whole trees then (strategy auto or full)
+                            by how steep it is; every strategy of the planner goes with it
     steep_factor            linear, quadratic: pace at `max_slope_deg` over the flat pace
     rolling_resistance      energy: share of its weight that a vehicle needs to roll on level open ground
     power_reserve           energy: power of the motor over what it needs on level ground at the flat speed

@@ -33,6 +33,7 @@ class Wish:
 
 
 _NO_WISH = Wish()
+_NO_CELLS: Sequence[int] = []
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,7 @@ class _Said:
     """What is told of one vehicle while nothing about it changes: by plot a stand, and what of it is news."""
 
     wish: Wish
-    path: list[int]
+    path: Sequence[int]
     stands: list[tuple[int, Stand, object]]
 
 
@@ -104,14 +105,11 @@ class Holdings:
         self.plots: dict[int, None] = {}
         self._dead: list[int] = []
         self._paths: dict[str, list[int]] = {}
+        """Vehicle -> the cells that it holds, in driving order; another list when they change."""
         self._enters: dict[str, int] = {}
         """Vehicle that holds nothing -> the cell on which it would begin, until that is granted."""
         self._away: set[str] = set()
         """Vehicles that have left in this life: what is still granted to them is given back."""
-        self._cells: set[int] | None = None
-        """All cells of our paths; None when they have changed."""
-        self._others: set[int] | None = None
-        """The cells beside our vehicles that others hold; None when they have changed."""
         self._pushed: dict[str, int] | None = None
         """Vehicle -> the age with which it is asked to make way; None when a warden has spoken."""
         self._said: dict[str, _Said] = {}
@@ -130,7 +128,8 @@ class Holdings:
     # --- what is held ---------------------------------------------------------------------------------------
 
     def path(self, vehicle: str) -> Sequence[int]:
-        """The cells that a vehicle may stand on or enter, its own first; empty of one that has no place yet."""
+        """The cells that a vehicle may stand on or enter, its own first; empty of one that has no place yet. The
+        same object for as long as nothing has changed."""
         return self._paths.get(vehicle, ())
 
     def pushed(self, vehicle: str) -> int:
@@ -142,24 +141,23 @@ class Holdings:
                     self._pushed[id] = max(age, self._pushed.get(id, 0))
         return self._pushed.get(vehicle, 0)
 
-    def occupied(self, cell: int) -> bool:
-        """Whether a vehicle holds a cell to which one of ours at rest could go, as far as wardens tell."""
-        if self._cells is None:
-            self._cells = {cell for path in self._paths.values() for cell in path}
-        if self._others is None:
-            self._others = {cell for plot in self.plots for cell in self._views[plot].others}
-        return cell in self._cells or cell in self._others
+    def occupied(self) -> set[int]:
+        """The cells that vehicles hold, of all to which one of ours at rest could go, as far as wardens tell."""
+        occupied = {cell for path in self._paths.values() for cell in path}
+        for plot in self.plots:
+            occupied |= self._views[plot].others
+        return occupied
 
     def moved(self, vehicle: str, cell: int) -> None:
         """It has come to the next cell of its path."""
         path = self._paths[vehicle]
         self._paths[vehicle] = path[path.index(cell) :]
-        self._cells = None
 
     def give_back(self, vehicle: str, keep: int = 1) -> None:
         """Keep only the first cells of the path. The rest must not be entered any more."""
-        self._paths[vehicle] = self._paths[vehicle][: max(keep, 1)]
-        self._cells = None
+        keep = max(keep, 1)
+        if len(self._paths[vehicle]) > keep:
+            self._paths[vehicle] = self._paths[vehicle][:keep]
 
     def enter(self, vehicle: str, cell: int) -> None:
         """Ask for a first cell for a vehicle that holds none; the newest call counts. Where an earlier life of ours
@@ -175,7 +173,6 @@ class Holdings:
         self._paths.pop(vehicle, None)
         self._said.pop(vehicle, None)
         self._away.add(vehicle)
-        self._cells = None
 
     @property
     def gone(self) -> bool:
@@ -222,7 +219,7 @@ class Holdings:
         view.knows, view.heard = granted.stamp, granted.heard
         view.pushed = {id: age for id, age in granted.pushed.items() if id in self._paths}
         view.others = frozenset(granted.occupied)
-        self._cells = self._others = self._pushed = None
+        self._pushed = None
         return self._take(view, granted, place)
 
     def _take(self, view: _View, granted: Granted, place: Place) -> list[str]:
@@ -232,13 +229,14 @@ class Holdings:
             self._said.pop(vehicle, None)
         placed = []
         for vehicle, cells in granted.grants.items():
+            seen = before.get(vehicle, _NO_CELLS)
+            if cells == seen and vehicle in self._paths:
+                view.seen[vehicle] = cells
+                continue
             ours = self._vehicles is None or vehicle in self._vehicles
             if not ours or any(self._plots.of(cell) != granted.plot for cell in cells):
                 continue
             view.seen[vehicle] = cells
-            seen = before.get(vehicle, [])
-            if cells == seen and vehicle in self._paths:
-                continue
             self._said.pop(vehicle, None)
             if vehicle in self._paths:
                 self._extend(vehicle, cells, seen)
@@ -267,7 +265,7 @@ class Holdings:
         for cell in cells[after + 1 :]:
             if cell in seen or not self._plots.adjacent(path[-1], cell):
                 return
-            path.append(cell)
+            path = self._paths[vehicle] = [*path, cell]
 
     # --- what to say ----------------------------------------------------------------------------------------
 
@@ -279,7 +277,7 @@ class Holdings:
         for vehicle, path in self._paths.items():
             wish = wishes.get(vehicle, _NO_WISH)
             said = self._said.get(vehicle)
-            if said is None or said.wish is not wish or said.path != path:
+            if said is None or said.wish is not wish or said.path is not path:
                 said = self._said[vehicle] = self._say(vehicle, path, wish)
             for each in said.stands:
                 by_plot.setdefault(each[0], []).append(each)
@@ -335,7 +333,7 @@ class Holdings:
             holds = [cell for cell, of in zip(path, plots, strict=True) if of == plot]
             stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, asked.age_ms)
             stands.append((plot, stand, (vehicle, path[0], holds, ahead, better)))
-        return _Said(wish, list(path), stands)
+        return _Said(wish, path, stands)
 
     def _askable(self, vehicle: str, path: Sequence[int], wish: Wish) -> Wish:
         """Without cells that were left or given back while a table still grants them: granted anew, such a cell
@@ -362,4 +360,3 @@ class Holdings:
             or self._views[plot].heard < quiet
             or self._views[plot].seen
         }
-        self._others = None

@@ -23,6 +23,7 @@ class Plots:
         self.grid = grid
         self.agents = tuple(agents)
         self._side = side
+        self._cells, self._cols = grid.cells, grid.cols
         self._across = -(-grid.cols // side)
         self._members: dict[int, tuple[str, ...]] = {}
         self.count = self._across * -(-grid.rows // side)
@@ -30,10 +31,10 @@ class Plots:
 
     def of(self, cell: int) -> int:
         """The plot of a cell; -1 of a cell outside the grid."""
-        if not 0 <= cell < self.grid.cells:
+        if not 0 <= cell < self._cells:
             return -1
-        row, col = divmod(cell, self.grid.cols)
-        return row // self._side * self._across + col // self._side
+        cols, side = self._cols, self._side
+        return cell // cols // side * self._across + cell % cols // side
 
     def members(self, plot: int) -> tuple[str, ...]:
         members = self._members.get(plot)
@@ -49,6 +50,6 @@ class Plots:
 
     def adjacent(self, one: int, other: int) -> bool:
         """Whether one step leads from one cell to the other."""
-        rows = one // self.grid.cols - other // self.grid.cols
-        cols = one % self.grid.cols - other % self.grid.cols
-        return max(abs(rows), abs(cols)) == 1
+        cols = self._cols
+        south, east = one // cols - other // cols, one % cols - other % cols
+        return -1 <= south <= 1 and -1 <= east <= 1 and one != other

@@ -28,7 +28,8 @@ class Driver:
         dynamics: PluginDynamics | None,
     ) -> None:
         self.entered: dict[int, None] = {}
-        self._map = local_map
+        self._climb = local_map.climb
+        self._physics = local_map.physics.reshape(-1)
         self._holdings = holdings
         self._passable = passable
         self._dynamics = dynamics
@@ -55,8 +56,7 @@ class Driver:
 
     def _drive(self, vehicle: Vehicle, left_s: float, stopped: Callable[[str], bool]) -> float:
         """Drive one vehicle to its next cell at most. Returns the seconds that it has left then."""
-        motion = vehicle.motion
-        physics = self._map.physics.reshape(-1)
+        motion, climb = vehicle.motion, self._climb
         while left_s > 0.0:
             if motion.at_rest:
                 if stopped(vehicle.id):
@@ -65,19 +65,20 @@ class Driver:
                 if len(path) < 2 or not self._passable(path[0], path[1]):
                     return 0.0
                 motion.set_out(path[1])
-            before = vehicle.cell
-            pace_s_per_m = float(physics[motion.head])
-            if self._map.climb is not None:
-                pace_s_per_m *= self._map.climb.driven(motion.tail, motion.head)
+            before = motion.cell
+            pace_s_per_m = self._physics.item(motion.head)
+            if climb is not None:
+                pace_s_per_m *= climb.driven(motion.tail, motion.head)
             if self._dynamics is None:
                 left_s = motion.advance(left_s, pace_s_per_m)
             else:
                 path = self._holdings.path(vehicle.id)
                 left_s = self._dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m)
-            if vehicle.cell != before:
-                self._holdings.moved(vehicle.id, vehicle.cell)
-                vehicle.route.moved(vehicle.cell)
-                self.entered[vehicle.cell] = None
+            cell = motion.cell
+            if cell != before:
+                self._holdings.moved(vehicle.id, cell)
+                vehicle.route.moved(cell)
+                self.entered[cell] = None
                 # Even with no time left it has to look before it drives on.
                 return left_s
         return 0.0

@@ -12,15 +12,16 @@ class Follower:
     """The cells of a route and how far along it the vehicle is. Without a route no cell is ahead.
 
     changes  how often it has been another route: begun, dropped or cut
+    version  how often it, or how far along it the vehicle is, has changed
     """
 
-    __slots__ = ("_at", "_bounds", "_cells", "changes", "partial")
+    __slots__ = ("_at", "_bounds", "_cells", "changes", "partial", "version")
 
     def __init__(self) -> None:
         self._cells: list[int] = []
         self._at = 0
         self._bounds: tuple[int, int, int, int] | None = None
-        self.changes = 0
+        self.changes = self.version = 0
         self.partial = False
         """Whether the route ends before its target, because the planner gave a part of it."""
 
@@ -41,6 +42,7 @@ class Follower:
     def _set(self, cells: list[int], at: int) -> None:
         self._cells, self._at, self._bounds = cells, at, None
         self.changes += 1
+        self.version += 1
 
     def bounds(self, cols: int) -> tuple[int, int, int, int]:
         """The smallest (row, col) and the greatest of all its cells in a grid of so many columns; of no cells a
@@ -55,6 +57,7 @@ class Follower:
         """The vehicle has entered a cell: the next one of its route, or one further on, or none."""
         if cell in self._cells[self._at : self._at + _SKIPPED_CELLS]:
             self._at = self._cells.index(cell, self._at)
+            self.version += 1
 
     def after(self, cell: int, count: int) -> list[int]:
         """The next `count` cells behind a cell of the route; none if the cell is not on it."""
@@ -75,7 +78,8 @@ class Follower:
     @property
     def left(self) -> int:
         """How many cells are ahead."""
-        return max(len(self._cells) - self._at - 1, 0)
+        left = len(self._cells) - self._at - 1
+        return left if left > 0 else 0
 
     def cut(self, passable: Callable[[Sequence[int]], int]) -> bool:
         """End the route before the first step ahead that is not passable; True if there is one.

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -26,7 +25,6 @@ _OCCUPIED = 0.9
 """What it costs to push another vehicle, in cells: less than a step, so that one without another way pushes."""
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for so long on its way asks its planner for another route."""
-_MS = NS_PER_S // 1000
 _OLDEST_MS = 1 << 31
 
 
@@ -38,7 +36,6 @@ class Steering:
 
     pace         float32 (rows, cols), s/m; inf is lethal; read at each call
     reserve      cells ahead of itself that a vehicle may be granted
-    occupied     whether another vehicle holds a cell
     bodies       what speaks no right of way: its cells are passed as lethal ones are, but by routes
     climb        says which steps are too steep; None if none is
 
@@ -51,8 +48,6 @@ class Steering:
         pace: NDArray[np.float32],
         planner: PlannerConfig,
         reserve: int,
-        chance: random.Random,
-        occupied: Callable[[int], bool],
         bodies: Bodies,
         climb: Climb | None = None,
     ) -> None:
@@ -62,13 +57,9 @@ class Steering:
         self._diagonal = planner.neighbours == 8
         self._corner_cutting = planner.corner_cutting
         self._reserve = reserve
-        self._chance = chance
-        self._occupied = occupied
         self._bodies = bodies
         self._shut = bodies.closed
         self.ways_out: Mapping[int, int] = {}
-        self._since_ns: dict[str, int] = {}
-        """Vehicle -> since when it has been on its way to a target."""
         self._stood_ns: dict[str, tuple[int, int]] = {}
         """Vehicle -> the cell on which it waits, and since when."""
 
@@ -105,47 +96,55 @@ class Steering:
         return int(lethal.argmax()) if lethal.any() else len(cells) - 1
 
     def wish(
-        self, vehicle: Vehicle, path: Sequence[int], pushed_ms: int, in_reach: Callable[[int], bool], now_ns: int
+        self,
+        vehicle: Vehicle,
+        path: Sequence[int],
+        pushed_ms: int,
+        age_ms: int,
+        held: Container[int],
+        in_reach: Callable[[str | None, int], bool],
+        lot: int,
     ) -> Wish:
-        """What to ask for a vehicle that holds these cells.
+        """What to ask for a vehicle that holds these cells. Depends on nothing but its arguments, on ground and
+        bodies near the vehicle, and on `ways_out`.
 
         pushed_ms  the age with which it is to make way into another plot; 0 if it is not
-        in_reach   whether the target is within capture range of a cell
+        age_ms     for how long it has been on its way
+        held       the cells that vehicles hold
+        in_reach   whether a target is within capture range of a cell
+        lot        decides between cells that are as good as each other
         """
-        still = len(path) == 1
-        if path[0] in self.ways_out:
-            age_ms = (now_ns - self._since_ns.setdefault(vehicle.id, now_ns)) // _MS
-            wants = sorted(self.steps(path[0]) if still else (), key=self._occupied)
-            return Wish((), wants, len(wants), max(1, min(age_ms, _OLDEST_MS), pushed_ms))
+        here, still = path[0], len(path) == 1
+        age_ms = max(1, min(age_ms, _OLDEST_MS), pushed_ms)
+        if here in self.ways_out:
+            wants = sorted(self.steps(here) if still else (), key=held.__contains__)
+            return Wish((), wants, len(wants), age_ms)
         if vehicle.in_reach or vehicle.target is None:
-            self._since_ns[vehicle.id] = now_ns
-            steps = self.steps(path[0]) if still else []
-            flees = still and self.threatened(path[0])
+            steps = self.steps(here) if still else []
+            flees = still and self.threatened(here)
             if flees:
                 pushed_ms = _OLDEST_MS
             wants = sorted(
                 steps,
                 key=lambda cell: (
                     self._bodies.danger(cell) if flees else 0.0,
-                    not in_reach(cell),
-                    self._occupied(cell),
-                    self._chance.random(),
+                    not in_reach(vehicle.target, cell),
+                    cell in held,
+                    hash((lot, cell)),
                 ),
             )
             return Wish((), wants, len(wants) if pushed_ms else 0, pushed_ms)
-        age_ms = (now_ns - self._since_ns.setdefault(vehicle.id, now_ns)) // _MS
-        age_ms = max(1, min(age_ms, _OLDEST_MS), pushed_ms)
         ahead = self._ahead(vehicle, path)
         if not still:
             return Wish(ahead, (), 0, age_ms)
         near = self._places(vehicle.route.near(_NEAR_CELLS))
-        cost = {cell: self._cost(cell, near) + _OCCUPIED * self._occupied(cell) for cell in self.steps(path[0])}
-        if self.threatened(path[0]):
-            wants = sorted(cost, key=lambda cell: (self._bodies.danger(cell), cost[cell], self._chance.random()))
+        cost = {cell: self._cost(cell, near) + _OCCUPIED * (cell in held) for cell in self.steps(here)}
+        if self.threatened(here):
+            wants = sorted(cost, key=lambda cell: (self._bodies.danger(cell), cost[cell], hash((lot, cell))))
             return Wish(ahead, wants, len(wants), _OLDEST_MS)
-        wants = sorted(cost, key=lambda cell: (cost[cell], self._chance.random()))
-        here = self._cost(path[0], near)
-        better = len(wants) if pushed_ms else sum(each < here for each in cost.values())
+        wants = sorted(cost, key=lambda cell: (cost[cell], hash((lot, cell))))
+        stays = self._cost(here, near)
+        better = len(wants) if pushed_ms else sum(each < stays for each in cost.values())
         return Wish(ahead, wants, better, age_ms)
 
     def threatened(self, cell: int) -> bool:

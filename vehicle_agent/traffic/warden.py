@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from zlib import crc32
 
 from swarm.clock import NS_PER_S
@@ -31,6 +32,7 @@ MOST_CELLS_OF_GUEST = 1024
 """Cells of one plot that one guest holds."""
 MOST_CELLS_OF_GUESTS = 1 << 14
 """Cells of one plot that all guests together hold: a quarter of it."""
+_MOST_BESIDE = 1 << 12
 _MOST_CELLS = 64
 """Of one vehicle: what a `Grant` has room for."""
 
@@ -85,8 +87,6 @@ class Warden:
         self._plot = table.plot
         self._me = me
         self._fleets = fleets
-        cols = plots.grid.cols
-        self._steps = (-cols - 1, -cols, 1 - cols, -1, 1, cols - 1, cols, cols + 1)
         self._lives = dict(table.hosts)  # agent -> (life, seq) of the newest standing that counts
         self._grants: dict[str, tuple[list[int], Stamp]] = {
             vehicle: (list(grant.cells), grant.stamp) for vehicle, grant in table.grants.items()
@@ -98,6 +98,8 @@ class Warden:
             if agent_of(vehicle) not in fleets:
                 self._guests.setdefault(agent_of(vehicle), {})[vehicle] = len(cells)
         self._hosts: dict[str, _Host] = {}
+        self._beside: dict[int, tuple[int, ...]] = {}
+        """Cells beside which vehicles ended lately -> the cells beside them."""
         self._pushed: dict[str, int] = {}
         self._granted = True  # since the last table: something that a host waits for
         self._changed = False  # or anything else
@@ -212,6 +214,8 @@ class Warden:
     def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
         """Drop what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
         cells, stamp = self._grants[vehicle]
+        if cells == holds:
+            return
         if knows >= stamp:
             kept = [cell for cell in cells if cell in holds]
         elif holds and holds[0] in cells:
@@ -280,7 +284,7 @@ class Warden:
             grants = by_host[name]
             # Also around those under way: what they want once they come to rest depends on who is there.
             stands = () if host.standing is None else host.standing.vehicles
-            near = {stand.end + step for stand in stands for step in self._steps}
+            near = set(chain.from_iterable(map(self._around, {stand.end for stand in stands})))
             occupied = sorted(cell for cell in near & holders.keys() if holders[cell] not in grants)
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             says = (life, grants, pushed, occupied, 0 if stands else heard)
@@ -299,6 +303,17 @@ class Warden:
                 pushed=pushed,
                 occupied=occupied,
             )
+
+    def _around(self, cell: int) -> tuple[int, ...]:
+        """The cells beside a cell."""
+        around = self._beside.get(cell)
+        if around is None:
+            if len(self._beside) >= _MOST_BESIDE:
+                self._beside.clear()
+            north, south = cell - self._plots.grid.cols, cell + self._plots.grid.cols
+            around = north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1
+            self._beside[cell] = around
+        return around
 
     def _plan(self, now_ns: int) -> None:
         stands = self._stands(now_ns)

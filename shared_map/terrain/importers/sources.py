@@ -101,7 +101,7 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
     from shared_map.terrain.importers.plain_files import read_npz
-    from shared_map.terrain.synthetic.landscape import cover, flat_water
+    from shared_map.terrain.synthetic.landscape import cover
 
     plain = read_npz(_jacksboro_path())
     assert plain.heights is not None
@@ -109,11 +109,11 @@ def _jacksboro(config: TerrainConfig, seed: int) -> Source:
         plain.heights, plain.step, plain.west, plain.north, config, JACKSBORO_FILE
     )
     classes = cover(elevation_m, grid.resolution_m, seed)
-    # Lakes are level in the file's own whole metres, no longer after resampling.
-    wet = flat_water(plain.heights)
-    classes[wet[_nearest(wet.shape[0], wet.shape[1], grid)]] = TerrainClass.WATER
+    _, level, told = _looked_at(plain.heights, 1.0, config)
+    if config.level_is == "water":
+        classes[level[_nearest(level.shape[0], level.shape[1], grid)]] = TerrainClass.WATER
     origin = "Jacksboro fault, Tennessee: USGS 3 arc seconds, public domain, from matplotlib's sample data"
-    return Source(grid, elevation_m, classes, notes=(origin, note))
+    return Source(grid, elevation_m, classes, notes=(origin, note, *told))
 
 
 def _jacksboro_path() -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from shared_map.terrain.synthetic.noise import mountains
 from shared_map.terrain.terrain import build_terrain, load_prepared, save_prepared
 from swarm.config.agents import plan_agents
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import CostConfig, PlannerConfig, Scenario, TerrainConfig
+from swarm.config.scenario import CostConfig, PlannerConfig, Scenario, Strategy, TerrainConfig
 from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.right_of_way.holdings import Holdings
@@ -218,7 +219,7 @@ def test_after_marks_the_tree_is_one_grown_from_scratch_and_still_exact():
     tree.update(pace, 820, [], 0)
     for version, value in ((1, np.inf), (2, 0.05), (3, 0.4)):
         pace[5:9, 10:30] = value
-        assert tree.update(pace, 820, [Window(5, 10, 9, 30)], version).kind == "full"
+        assert tree.update(pace, 820, [Window(5, 10, 9, 30)], version).kind in ("repair", "full")
         fresh = TargetTree(climb.grid, PlannerConfig(), climb)
         fresh.update(pace, 820, [], 0)
         every = np.arange(1600)
@@ -237,14 +238,13 @@ def test_a_tree_grown_by_a_worker_is_the_same():
     np.testing.assert_allclose(tree.last_gaps, 1.0, rtol=1e-5)
 
 
-def test_auto_grows_whole_trees_however_dear_they_are():
-    climb = climb_on(ramp(30, 30))
-    pace = np.full((30, 30), 0.1, np.float32)
-    tree = TargetTree(climb.grid, PlannerConfig(cpu_budget=0.01), climb)
-    tree.observe_full_ns(10**12)
-    for step in range(5):
-        update = tree.update(pace, 400 + step, [], step)
-        assert (update.kind, update.wants_full) == ("full", False)
+def test_auto_grows_windows_where_whole_trees_are_too_dear():
+    climb = climb_on(ramp(60, 60))
+    pace = np.full((60, 60), 0.1, np.float32)
+    tree = TargetTree(climb.grid, PlannerConfig(cpu_budget=0.01, k_min=0), climb)
+    tree.observe_full_ns(10**9)
+    kinds = [tree.update(pace, 1830 + step, [], step).kind for step in range(5)]
+    assert kinds == ["full", *["window"] * 4]
 
 
 # --- in a run ---------------------------------------------------------------------------------------------------
@@ -276,13 +276,11 @@ def test_a_prepared_terrain_keeps_its_climb(tmp_path):
     assert loaded.climb.of_step(100, 101) == terrain.climb.of_step(100, 101)
 
 
-@pytest.mark.parametrize(
-    ("line", "says"),
-    [('strategy = "rotation"', "expected 'auto' or 'full'"), ("length_weight = 0.1", "leave it out")],
-)
-def test_what_does_not_go_with_direction_is_refused(line, says):
-    with pytest.raises(ConfigError, match=says):
-        parse_scenario(f"[cost]\ndirectional = true\n[planner]\n{line}")
+def test_every_strategy_goes_with_direction_and_a_price_of_length_does_not():
+    for strategy in get_args(Strategy):
+        parse_scenario(f'[cost]\ndirectional = true\n[planner]\nstrategy = "{strategy}"')
+    with pytest.raises(ConfigError, match="leave it out"):
+        parse_scenario("[cost]\ndirectional = true\n[planner]\nlength_weight = 0.1")
 
 
 def driven_s(start: int, target: int, elevation_m) -> tuple[float, float]:

@@ -124,5 +124,5 @@ def test_a_target_is_put_at_a_place(place: str) -> None:
     refusal = world.give(subject="target", name="y", at="47.5,9.0", new=True)
     assert "target y: at is '47.5,9.0', outside the terrain: latitude 46.9" in str(refusal)
     for wrong in ({"at": "there"}, {"at": "1,1", "cell": 3}, {}):
-        with pytest.raises(ValueError, match="at is 'there'|give either cell|or at"):
+        with pytest.raises(ValueError, match=r"at is 'there'|give either cell|or at"):
             GiveOrder(subject="target", name="x", **wrong).relate()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import random
 
 import msgpack
 import numpy as np
@@ -14,6 +13,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
+from swarm.right_of_way.holdings import Wish
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.bodies import Body
 from vehicle_agent.bodies import MOST_BODIES, Bodies
@@ -173,7 +173,7 @@ def test_whoever_has_just_begun_to_listen_drives_when_every_body_has_had_time_to
 
 
 def steering(bodies: Bodies, pace: np.ndarray) -> Steering:
-    return Steering(GRID, pace, PlannerConfig(), 4, random.Random(1), lambda cell: False, bodies)
+    return Steering(GRID, pace, PlannerConfig(), 4, bodies)
 
 
 def standing(bodies: Bodies, report: Body) -> None:
@@ -241,8 +241,12 @@ def test_a_vehicle_at_rest_makes_way_for_a_body_that_comes(bodies: Bodies) -> No
     pace = np.full((40, 40), 0.1, np.float32)
     bodies.hear(body(20.5, 10.5, radius_m=2.0, heading_rad=math.pi / 2, speed_m_per_s=20.0), NOW)
     bodies.tick(NOW)
-    wish = steering(bodies, pace).wish(Vehicle("a0-00", GRID, GRID.cell(20, 13)), [GRID.cell(20, 13)], 0, bool, 0)
+
+    def wish_at(cell: int) -> Wish:
+        vehicle = Vehicle("a0-00", GRID, cell)
+        return steering(bodies, pace).wish(vehicle, [cell], 0, 0, (), lambda target, cell: False, 1)
+
+    wish = wish_at(GRID.cell(20, 13))
     assert wish.better == len(wish.wants) == 8
     assert all(row != 20 for row, _ in (divmod(cell, 40) for cell in wish.wants[:2]))
-    aside = steering(bodies, pace).wish(Vehicle("a0-00", GRID, GRID.cell(25, 13)), [GRID.cell(25, 13)], 0, bool, 0)
-    assert aside.better == 0
+    assert wish_at(GRID.cell(25, 13)).better == 0

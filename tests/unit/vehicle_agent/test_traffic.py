@@ -97,7 +97,7 @@ def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(
     chance = random.Random(seed)
     pace = np.where([chance.random() < share for _ in range(GRID.cells)], np.inf, 0.1).astype(np.float32)
     rules = PlannerConfig(corner_cutting=corners)
-    steering = Steering(GRID, pace.reshape(8, 8), rules, 4, chance, lambda cell: False, Bodies(GRID))
+    steering = Steering(GRID, pace.reshape(8, 8), rules, 4, Bodies(GRID))
     cells = [chance.randrange(GRID.cells)]
     for _ in range(chance.randint(0, 20)):
         cells.append(chance.choice([other for _, other in GRID.neighbours(cells[-1])]))

@@ -1,0 +1,148 @@
+"""What an agent's vehicles ask of wardens, each kept until something that it was made of changes.
+
+`Steering.wish` is a function of its arguments, of the cells near the vehicle (ground, bodies, and what others hold)
+and of nothing else, so a wish that is kept is the one that would be made anew. What it is made of is found out in
+one place, `Wishes.make`: arguments are compared, and each kind of cell tells in which places it has changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from zlib import crc32
+
+import numpy as np
+
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec, Window
+from swarm.right_of_way.holdings import Holdings, Wish
+from vehicle_agent.bodies import Bodies
+from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.local_map import meet
+from vehicle_agent.traffic.steering import Steering
+
+_TURN_NS = 4 * NS_PER_S
+"""For a vehicle's wish time stands still for so long: then its age grows, by a step in which wardens compare ages.
+Each vehicle's turns begin at another time, so that no tick has all wishes to make."""
+_WAITING_TURN_NS = NS_PER_S
+"""The same for one that waits on its way: ties between cells fall another way more often."""
+_STAYS = Wish()
+
+
+class Wishes:
+    """Makes and keeps the wishes of vehicles.
+
+    near_cells   how far from a vehicle the ground may lie on which its wish depends
+    target_cell  the cell of a target, None where it is unknown
+    in_reach     whether a target is within capture range of a cell
+    seed         decides ties
+
+    of  vehicle -> its wish, as of the last call of `make` or `stay`; the same object while it says the same
+    """
+
+    def __init__(
+        self,
+        grid: GridSpec,
+        steering: Steering,
+        holdings: Holdings,
+        bodies: Bodies,
+        near_cells: int,
+        target_cell: Callable[[str | None], int | None],
+        in_reach: Callable[[str | None, int], bool],
+        seed: str,
+    ) -> None:
+        self.of: dict[str, Wish] = {}
+        self._cols = grid.cols
+        self._steering = steering
+        self._holdings = holdings
+        self._bodies = bodies
+        self._near_cells = near_cells
+        self._target_cell = target_cell
+        self._in_reach = in_reach
+        self._seed = seed
+        self._made_of: dict[str, tuple[object, ...]] = {}
+        """Vehicle -> what its wish was made of, but for the cells near it."""
+        self._beside: dict[str, frozenset[int]] = {}
+        """Vehicle at rest -> the cells on which it matters whether somebody holds them."""
+        self._changed: list[Window] = []
+        """Where the ground has changed since wishes were made."""
+        self._held: set[int] = set()
+        """The cells that vehicles held when wishes were made."""
+        self._since_ns: dict[str, int] = {}
+        """Vehicle -> since when it has been on its way."""
+        self._phases_ns: dict[str, int] = {}
+
+    def forget(self, vehicle: str) -> None:
+        """It is not driven any more."""
+        for known in (self.of, self._made_of, self._beside, self._since_ns, self._phases_ns):
+            known.pop(vehicle, None)
+
+    def ground_changed(self, windows: Iterable[Window]) -> None:
+        """The ground has changed in these windows."""
+        self._changed += windows
+
+    def make_anew(self) -> None:
+        """Keep nothing: at the next call of `make` all are made."""
+        self._made_of.clear()
+
+    def stay(self, vehicle: str) -> None:
+        """It is to stand where it is."""
+        self.of[vehicle] = _STAYS
+        self._made_of.pop(vehicle, None)
+
+    def make(self, vehicles: Sequence[Vehicle], now_ns: int) -> None:
+        """Make the wishes of these vehicles for which anything has changed. Called once in a tick, after all that
+        changes what is held."""
+        holdings, steering = self._holdings, self._steering
+        held = holdings.occupied()
+        changed = held ^ self._held
+        self._held = held
+        self._forget_near(vehicles)
+        for vehicle in vehicles:
+            id, route, target = vehicle.id, vehicle.route, vehicle.target
+            path, pushed_ms = holdings.path(id), holdings.pushed(id)
+            idle = (vehicle.in_reach or target is None) and path[0] not in steering.ways_out
+            turn_ns = _TURN_NS if idle or len(path) > 1 else _WAITING_TURN_NS
+            turn, began_ns = self._turn(id, turn_ns, now_ns)
+            age_ms = 0
+            if idle:
+                self._since_ns.pop(id, None)
+            else:
+                age_ms = max(began_ns - self._since_ns.setdefault(id, now_ns), 0) // (NS_PER_S // 1000)
+            place = self._target_cell(target) if vehicle.in_reach else None
+            ends = path[0], path[-1], len(path)
+            made_of = ends, route.version, target, vehicle.in_reach, place, pushed_ms, turn, age_ms
+            if self._made_of.get(id) == made_of and changed.isdisjoint(self._beside.get(id, ())):
+                continue
+            self._made_of[id] = made_of
+            if len(path) > 1:
+                self._beside.pop(id, None)
+            else:
+                self._beside[id] = self._around(path[0])
+            lot = crc32(f"{self._seed}/{id}/{turn}".encode())
+            wish = steering.wish(vehicle, path, pushed_ms, age_ms, held, self._in_reach, lot)
+            if wish != self.of.get(id):
+                self.of[id] = wish
+
+    def _forget_near(self, vehicles: Sequence[Vehicle]) -> None:
+        """Keep no wish of a vehicle near which the ground has changed, or what bodies close and threaten."""
+        changed = [*self._changed, *self._bodies.take_changed()]
+        self._changed = []
+        if not (changed and vehicles):
+            return
+        cells = np.fromiter((vehicle.cell for vehicle in vehicles), np.int64, len(vehicles))
+        places = np.stack(np.divmod(cells, self._cols), axis=1)
+        for index in np.flatnonzero(meet(np.hstack((places, places)), changed, self._near_cells)).tolist():
+            self._made_of.pop(vehicles[index].id, None)
+
+    def _turn(self, vehicle: str, turn_ns: int, now_ns: int) -> tuple[int, int]:
+        """The number of a vehicle's turn, and when that began."""
+        phase_ns = self._phases_ns.get(vehicle)
+        if phase_ns is None:
+            phase_ns = self._phases_ns[vehicle] = crc32(vehicle.encode()) % 4000 * (_TURN_NS // 4000)
+        turn = (now_ns + phase_ns) // turn_ns
+        return turn, turn * turn_ns - phase_ns
+
+    def _around(self, cell: int) -> frozenset[int]:
+        """The cells beside a cell; at a border of the grid also some that are far away, which does no harm."""
+        north, south = cell - self._cols, cell + self._cols
+        return frozenset((north - 1, north, north + 1, cell - 1, cell + 1, south - 1, south, south + 1))
