@@ -123,7 +123,7 @@ class KeptOrders:
         return order
 
     def _placed(self, given: GiveOrder) -> GiveOrder:
-        """With a cell instead of a place, or of row and column: outside the grid that is none. Raises ConfigError."""
+        """With a cell for a place, or for row and column: outside the grid that is none. Raises ConfigError."""
         grid = self._terrain.grid
         if given.at:
             return msgspec.structs.replace(given, cell=cell_of(given.at, MapFrame(grid), "at"), at="")
