@@ -20,6 +20,8 @@ _JOINED_SIDE = 1024
 """One-way steps are followed on terrains of up to the square of so many cells: a second or less."""
 _MUCH_LETHAL, _SCATTERED = 0.5, 0.8
 _STEEP_DEG = 60.0
+_LOWEST_LAND_M = -450.0
+"""The shore of the Dead Sea is at -430 m."""
 
 
 def facts_of(terrain: Terrain) -> dict[str, Any]:
@@ -40,6 +42,7 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
     stride = -(-max(grid.rows, grid.cols) // _MOST_SIDE)
     known = elevation_m[~np.isnan(elevation_m)]
     if known.size:
+        facts["below_sea_share"] = round(float(np.count_nonzero(known < 0) / elevation_m.size), 4)
         facts["lowest_m"], facts["highest_m"] = round(float(known.min()), 1), round(float(known.max()), 1)
         slopes = slope_deg(np.ascontiguousarray(elevation_m[::stride, ::stride]), grid.resolution_m * stride)
         for name, share in (("slope_median_deg", 50), ("slope_95_deg", 95), ("slope_max_deg", 100)):
@@ -139,6 +142,12 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
         doubts.append(
             f"half of the ground is steeper than {facts['slope_median_deg']:g} degrees; are heights in metres"
             " (terrain.height_scale), and cells (terrain.crs)?"
+        )
+    deep = facts.get("lowest_m", 0.0) < _LOWEST_LAND_M and not any(body in facts["crs"] for body in ("+a=", "+R="))
+    if deep and facts["class_shares"].get("water", 0.0) < facts.get("below_sea_share", 0.0):
+        doubts.append(
+            f"heights go down to {facts['lowest_m']:g} m, where no dry land is: a sea floor is ground here, unless"
+            " terrain.water_below_m = 0"
         )
     if facts.get("lowest_m") == facts.get("highest_m") and facts["voids"] < facts["rows"] * facts["cols"]:
         doubts.append("all heights are the same: slopes cost nothing here")
