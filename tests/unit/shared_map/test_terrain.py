@@ -25,7 +25,7 @@ from shared_map.terrain.terrain import (
     scenario_key,
     terrain_of_pace,
 )
-from swarm.config.load import load_scenario
+from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import CostConfig, Scenario, TerrainConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.runtime.role import RoleSetup
@@ -162,7 +162,9 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
 
     text = (Path(__file__).parents[3] / "docs" / "tutorial" / "terrain.md").read_text()
     blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    *blocks, of_a_file = blocks
     assert len(blocks) == 2
+    parse_scenario(of_a_file)
     (tmp_path / "mine.toml").write_text("".join(blocks))
     base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(5e5, 5e6, 20, 20)}
     with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
