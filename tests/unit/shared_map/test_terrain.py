@@ -158,6 +158,7 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     import re
 
     import rasterio
+    import rasterio.warp
     from rasterio.transform import from_origin
 
     text = (Path(__file__).parents[3] / "docs" / "tutorial" / "terrain.md").read_text()
@@ -166,7 +167,9 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     assert len(blocks) == 2
     parse_scenario(of_a_file)
     (tmp_path / "mine.toml").write_text("".join(blocks))
-    base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(5e5, 5e6, 20, 20)}
+    # The north-east corner of its no-go area, 900 m east and 100 m south of that of the terrain.
+    (x_m,), (y_m,) = rasterio.warp.transform("EPSG:4326", "EPSG:32632", [9.03], [46.93])
+    base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(x_m - 900, y_m + 100, 20, 20)}
     with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
         file.write(np.random.default_rng(1).uniform(0, 2, (60, 70)).astype(np.float32), 1)
     with rasterio.open(tmp_path / "photo.tif", "w", height=60, width=70, count=3, dtype="uint8", **base) as file:
