@@ -167,7 +167,7 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     assert len(blocks) == 2
     parse_scenario(of_a_file)
     (tmp_path / "mine.toml").write_text("".join(blocks))
-    # So that the north-east corner of its no-go area is 900 m east and 100 m south of the north-west one of the map.
+    # The north-east corner of its no-go area is then 900 m east and 100 m south of the north-west one of the map.
     (x_m,), (y_m,) = rasterio.warp.transform("EPSG:4326", "EPSG:32632", [9.03], [46.93])
     base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(x_m - 900, y_m + 100, 20, 20)}
     with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
