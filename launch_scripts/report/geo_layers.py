@@ -103,8 +103,8 @@ def mark_layer(
     codes[kinds == MarkKind.LETHAL] = 1
     paced = kinds == MarkKind.PACE
     codes[paced] = 2 + np.unique(_two_digits(paces[paced]), return_inverse=True)[1]
-    labelled = label(codes, background=0, connectivity=1)  # type: ignore[no-untyped-call]
-    numbers: NDArray[np.int32] = np.asarray(labelled, np.int32)
+    numbered: Any = label
+    numbers: NDArray[np.int32] = np.asarray(numbered(codes, background=0, connectivity=1), np.int32)
     flat, inside = numbers.reshape(-1), np.flatnonzero(numbers)
     many = int(numbers.max(initial=0)) + 1
     cells = np.bincount(flat, minlength=many)
@@ -176,8 +176,7 @@ def _json_features(layers: list[Layer], frame: MapFrame) -> Iterator[dict[str, A
                 case "LineString":
                     geometry = line(feature.parts[0], frame)
                 case "Point":
-                    x_m, y_m = feature.parts[0][0].tolist()
-                    geometry = point(x_m, y_m, frame)
+                    geometry = point(feature.parts[0], frame)
             values = {name: _iso(value) for name, value in feature.values.items()}
             properties: dict[str, Any] = {"layer": layer.name, **values}
             if feature.time_ns is not None:
