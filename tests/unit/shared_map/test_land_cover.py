@@ -338,6 +338,19 @@ def test_a_drawing_in_other_colours_is_refused_as_land_cover_and_not_read_as_a_p
     assert said(notes, "terrain.cover")
 
 
+@pytest.mark.parametrize("step", [13.0, 20.0, 31.0])
+def test_a_drawing_is_known_by_its_own_pixels_and_not_by_what_resampling_leaves(
+    tmp_path: Path, dem: Path, step: float
+) -> None:
+    path = drawn(tmp_path / "drawn.tif", patches([11, 31, 42]), "nlcd")
+    with rasterio.open(path, "r+") as file:
+        file.write(file.read()[::-1] // 2)
+        file.transform = from_origin(500_000, 5_000_000, step, step)
+    source = load(dem, photo=str(path))
+    assert said(source.notes, "the photo is a drawn map: it has 3 colours")
+    assert (source.classes == TerrainClass.UNKNOWN).all()
+
+
 # --- a land-cover map as the terrain ------------------------------------------------------------------------
 
 
