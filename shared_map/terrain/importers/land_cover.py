@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.importers.cover_recognition import (
+    MOST_COLOURS,
     NO_COLOUR,
     NOTHING,
     Evidence,
@@ -44,6 +45,7 @@ from swarm.grid import MAX_CELLS, GridSpec
 
 _READ_ROWS = 512
 _MOST_SAMPLED = 1 << 20
+_LOOK_CELLS = 256
 _TOLD_CODES = 6
 _NO_CODE = -1
 
@@ -240,11 +242,20 @@ def _palette_colours(found: Evidence) -> NDArray[np.int32]:
 
 
 def sampled_colours(dataset: Any) -> NDArray[np.int32]:
-    """Of some cells of an image, (cells,), red << 16 | green << 8 | blue; what it does not show left out."""
-    from rasterio.enums import Resampling
+    """Of some cells of an image, (cells,), red << 16 | green << 8 | blue; what it does not show left out.
 
+    None of an image that has too many colours for a drawing in its middle: a photo is not read twice.
+    """
+    from rasterio.enums import Resampling
+    from rasterio.windows import Window
+
+    none = np.zeros(0, np.int32)
     if any(dtype != "uint8" for dtype in dataset.dtypes[:3]):
-        return np.zeros(0, np.int32)
+        return none
+    rows, cols = min(dataset.height, _LOOK_CELLS), min(dataset.width, _LOOK_CELLS)
+    middle = Window((dataset.width - cols) // 2, (dataset.height - rows) // 2, cols, rows)
+    if np.unique(_joined(dataset.read((1, 2, 3), window=middle))).size > MOST_COLOURS:
+        return none
     every = max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0)
     shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
     rgb = dataset.read((1, 2, 3), out_shape=(3, *shape), resampling=Resampling.nearest)
