@@ -80,7 +80,7 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
 
 def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
     """The settings with a photo that is a drawn map of land cover named as such."""
-    from shared_map.terrain.importers.land_cover import is_drawn
+    from shared_map.terrain.importers.cover_meaning import is_drawn
 
     if config.photo is None or config.cover is not None or config.labels is not None:
         return config
