@@ -1,4 +1,4 @@
-"""What the values of a land-cover file stand for: by the scenario, by what the file shows, by a legend's colours."""
+"""What the values of a land-cover file stand for: as the scenario says, as the file shows, or by its colours."""
 
 from __future__ import annotations
 
