@@ -176,8 +176,7 @@ def _json_features(layers: list[Layer], frame: MapFrame) -> Iterator[dict[str, A
                 case "LineString":
                     geometry = line(feature.parts[0], frame)
                 case "Point":
-                    x_m, y_m = feature.parts[0][0].tolist()
-                    geometry = point(x_m, y_m, frame)
+                    geometry = point(feature.parts[0], frame)
             values = {name: _iso(value) for name, value in feature.values.items()}
             properties: dict[str, Any] = {"layer": layer.name, **values}
             if feature.time_ns is not None:

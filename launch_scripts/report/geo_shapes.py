@@ -67,12 +67,9 @@ def line(points: Ring, frame: MapFrame) -> dict[str, Any]:
     return {"type": "LineString", "coordinates": _rounded(points, frame)}
 
 
-def point(x_m: float, y_m: float, frame: MapFrame) -> dict[str, Any]:
-    """A GeoJSON point, as `polygon`."""
-    there = np.array([[x_m, y_m]])
-    if frame.grid.crs != "local":
-        there = in_degrees(there, frame)
-    return {"type": "Point", "coordinates": _rounded(there, frame)[0]}
+def point(there: Ring, frame: MapFrame) -> dict[str, Any]:
+    """A GeoJSON point of the first of `there`, as `polygon`."""
+    return {"type": "Point", "coordinates": line(there[:1], frame)["coordinates"][0]}
 
 
 def _rounded(points: Ring, frame: MapFrame) -> Any:
