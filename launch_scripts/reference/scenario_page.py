@@ -74,8 +74,8 @@ def schema(root: Section = Scenario) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The value with whole numbers as such. `typing` keeps one of two bounds that are equal, 10000 and 1e4, whichever
-    module is imported first."""
+    """The value with whole numbers as such. Of two bounds that are equal, 10000 and 1e4, `typing` keeps that of the
+    module that is imported first."""
     if isinstance(value, dict):
         return {name: _plain(each) for name, each in value.items()}
     if isinstance(value, list):
