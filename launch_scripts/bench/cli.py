@@ -220,7 +220,7 @@ def directed(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """A full tree where uphill is not downhill (cost.directional), beside one where it is."""
+    """Trees, windows and repairs where uphill is not downhill (cost.directional), beside those where it is."""
     from launch_scripts.bench.planning.directed import run
 
     show(run(numbers_of(sizes, "sizes", 16), repeats, seed), as_json)

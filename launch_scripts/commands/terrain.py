@@ -241,7 +241,10 @@ def rules(
     from launch_scripts.commands import slope_rules
 
     _check_target(picture, "--picture", ".png")
-    shown = slope_rules.of_all() if scenario is None else slope_rules.of_scenario(_scenario(scenario))
+    if scenario is None:
+        shown = slope_rules.of_all()
+    else:
+        shown = slope_rules.of_scenario(_scenario(scenario), Path(scenario).stem)
     if picture is not None:
         from launch_scripts.commands.slope_picture import draw_rules
 

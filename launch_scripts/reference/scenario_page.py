@@ -74,8 +74,8 @@ def schema(root: Section = Scenario) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The value with whole numbers as such. Of two bounds that are equal, 10000 and 1e4, `typing` keeps that of the
-    module that is imported first."""
+    """The value with whole numbers as such. `typing` keeps one of two bounds that are equal, 10000 and 1e4, by
+    which module is imported first."""
     if isinstance(value, dict):
         return {name: _plain(each) for name, each in value.items()}
     if isinstance(value, list):
@@ -195,7 +195,7 @@ def _bounds(meta: msgspec.Meta) -> str:
     if meta.min_length is not None:
         words.append("not empty" if meta.min_length == 1 else f"at least {meta.min_length}")
     if meta.pattern is not None:
-        words.append("of letters, digits, `_`, `.` and `-`")
+        words.append("of digits" if meta.pattern.startswith("^[0-9]{") else "of letters, digits, `_`, `.` and `-`")
     return ", ".join(words)
 
 

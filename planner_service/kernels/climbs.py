@@ -9,6 +9,7 @@ odd), which holds its length, too.
     scale   float32  (2,)              of straight and diagonal steps, entries of `prices` per metre of rise, from
                                        the middle on
     keys, best, codes  float32 (stride,)  scratch of a row: offers, s; the least of them; whose that is
+    entries            int32   (stride,)  the same: entries of `prices`
 """
 
 from __future__ import annotations
@@ -18,24 +19,32 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.compile import helper
 
-Climbs = tuple[NDArray[np.float32], ...]
-"""(height, prices, scale, keys, best, codes)."""
+Floats = NDArray[np.float32]
 
-CLIMBS = "UniTuple(f4[::1], 6)"
+Climbs = tuple[Floats, Floats, Floats, Floats, Floats, Floats, NDArray[np.int32]]
+"""(height, prices, scale, keys, best, codes, entries)."""
+
+CLIMBS = "Tuple((f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i4[::1]))"
 
 _HALF = np.float32(0.5)
 _LEVEL = np.float32(0.0)
 
 
 @helper
+def _entry(rise, scale, half, begin):
+    """int32: which of `prices`, from `begin` on, a rise (m) has."""
+    at = rise * scale
+    at = at if at == at else _LEVEL
+    return np.int32(min(max(at, -half), half) + half + _HALF) + begin
+
+
+@helper
 def step_price(climbs, v, u, odd):
     """What the step from v into its neighbour u costs, in cell costs of u; `odd` is 1 of a diagonal step."""
     height, prices, scale = climbs[0], climbs[1], climbs[2]
-    entries = prices.size >> 1
-    half = np.float32(entries >> 1)
-    at = (height[u] - height[v]) * scale[odd]
-    at = at if at == at else _LEVEL
-    return prices[np.uint64(odd * entries) + np.uint64(np.int64(min(max(at, -half), half) + half + _HALF))]
+    count = prices.size >> 1
+    begin = np.int32(odd * count)
+    return prices[np.uint64(_entry(height[u] - height[v], scale[odd], np.float32(count >> 1), begin))]
 
 
 @helper
@@ -50,24 +59,29 @@ def offered(base, own, climbs, v, u, odd, length):
 
 
 @helper
-def _rises_to_entries(height, scale, odd, half, first, n, o, entries):
-    """entries := as floats, so that it vectorises, the entry of `prices` of each step from v to v + o."""
-    length = scale[odd]
+def find_entries(rises, first, n, climbs, odd, entries):
+    """entries := int32, which of `prices` each of `n` rises (m) has. A loop of its own vectorises."""
+    prices, scale = climbs[1], climbs[2]
+    length, count = scale[odd], prices.size >> 1
+    half, begin = np.float32(count >> 1), np.int32(odd * count)
     for i in range(n):
-        v = first + i
-        at = (height[v + o] - height[v]) * length
-        at = at if at == at else _LEVEL
-        entries[i] = min(max(at, -half), half) + half + _HALF
+        entries[first + i] = _entry(rises[first + i], length, half, begin)
 
 
 @helper
 def offers_of_row(cell_cost, cost, climbs, odd, first, n, o):
-    """keys := what each of `n` cells from `first` on is offered by its neighbour o cells further (unsigned)."""
-    height, prices, scale, keys = climbs[0], climbs[1], climbs[2], climbs[3]
-    entries = prices.size >> 1
-    begin = np.uint64(odd * entries)
-    # In two loops: in one, nothing vectorises, and it takes three times as long.
-    _rises_to_entries(height, scale, odd, np.float32(entries >> 1), first, n, o, keys)
+    """keys := what each of `n` cells from `first` on is offered by its neighbour o cells further (unsigned).
+
+    In three loops, of which the first and the last vectorise: in one, it takes three times as long.
+    """
+    height, prices, scale, keys, _, _, entries = climbs
+    length, count = scale[odd], prices.size >> 1
+    half, begin = np.float32(count >> 1), np.int32(odd * count)
+    for i in range(n):
+        v = first + i
+        entries[i] = _entry(height[v + o] - height[v], length, half, begin)
+    for i in range(n):
+        keys[i] = prices[np.uint64(entries[i])]
     for i in range(n):
         u = first + i + o
-        keys[i] = cost[u] + cell_cost[u] * prices[begin + np.uint64(np.int32(keys[i]))]
+        keys[i] = cost[u] + cell_cost[u] * keys[i]

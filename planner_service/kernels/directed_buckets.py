@@ -9,6 +9,8 @@ Arrays, beside those of `layout` and `climbs`:
     touched  uint32  (8 * _PIECE + 1,) padded cells whose cost has fallen
     chosen   int32   (8 * _PIECE + 1,) their buckets
     batch    uint32  (8 * size + _AHEAD,) padded cells of the bucket that is being served
+    steps    float32, int32 (8 * _PIECE,)  of the steps into a piece's cells, a row for each direction: rise, m;
+                                           entry of `prices`
     queue    as of `chunked_buckets`
 
 While growing, the cost of a cell that was served is negative, so that no offer lowers it, and WALL on lethal cells.
@@ -20,33 +22,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
-from planner_service.kernels.climbs import CLIMBS, step_price
+from planner_service.kernels.climbs import CLIMBS, find_entries
 from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import BUCKETS, GRID, INF, RULE_FOUR, TOO_FINE, WALL
 from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
+_TWO, _THREE, _FOUR, _FIVE, _SIX, _SEVEN, _EIGHT = (np.uint64(n) for n in range(2, 9))
 _ZERO32 = np.float32(0.0)
 _AHEAD = 8
 """Cells of a batch between asking for one's memory and using it."""
-_PIECE = np.uint64(1 << 10)
+_PIECE = np.uint64(1 << 6)
 """Cells that make their offers before what these touched is put into the queue."""
 WIDTH = 0.9
-"""Of a bucket, in cheapest steps. A cell of a bucket that is being served must not be offered less by another of
-it, whatever the rounding: of the sum, of the product that finds the bucket, and of its factor, each at most 2^-24
+"""Of a bucket, in cheapest steps. A cell in a bucket that is being served must not be offered less by another,
+whatever the rounding: of the sum, of the product that finds the bucket, and of its factor, each at most 2^-24
 of the cost. Up to `_MOST_BUCKETS` that is a tenth of a bucket."""
 _MOST_BUCKETS = 1 << 19
-_SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], {QUEUE}))"
+_SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], Tuple((f4[::1], i4[::1])), {QUEUE}))"
 
-Scratch = tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.uint32], Queue]
+Steps = tuple[NDArray[np.float32], NDArray[np.int32]]
+Scratch = tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.uint32], Steps, Queue]
 
 
 def make_scratch(size: int, buckets: int) -> Scratch:
-    """(touched, chosen, batch, queue) for a growth over `size` padded cells, for the worst case."""
+    """(touched, chosen, batch, steps, queue) for a growth over `size` padded cells, for the worst case."""
     room = 8 * int(_PIECE) + 8
     batch = np.empty(8 * size + _AHEAD, np.uint32)
-    return np.empty(room, np.uint32), np.empty(room, np.int32), batch, make_queue(8 * size, buckets)
+    steps = np.empty(room, np.float32), np.empty(room, np.int32)
+    return np.empty(room, np.uint32), np.empty(room, np.int32), batch, steps, make_queue(8 * size, buckets)
 
 
 @helper
@@ -54,7 +59,8 @@ def _serve_once(cost, batch, n):
     """Keep those cells of a batch that were not served yet, and mark them. Returns how many."""
     kept = _ZERO
     for p in range(n):
-        prefetch(cost, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        ahead = np.uint64(batch[p + np.uint64(_AHEAD)])
+        prefetch(cost, ahead)
         u = np.uint64(batch[p])
         c = cost[u]
         batch[kept] = u
@@ -64,44 +70,70 @@ def _serve_once(cost, batch, n):
 
 
 @helper
-def _ask_for(cell_cost, cost, height, s, u):
-    prefetch(cell_cost, u)
-    prefetch(cost, u - s)
-    prefetch(cost, u + s)
-    prefetch(height, u - s)
-    prefetch(height, u)
-    prefetch(height, u + s)
+def _find_rises(height, s, straight_only, batch, first, n, rises):
+    """rises := m, of the steps into `n` cells of a batch from their neighbours, direction by direction."""
+    for i in range(n):
+        ahead = np.uint64(batch[first + i + np.uint64(_AHEAD)])
+        prefetch(height, ahead - s)
+        prefetch(height, ahead)
+        prefetch(height, ahead + s)
+        u = np.uint64(batch[first + i])
+        own = height[u]
+        rises[i] = own - height[u - s]
+        rises[n + i] = own - height[u - _ONE]
+        rises[n * _TWO + i] = own - height[u + _ONE]
+        rises[n * _THREE + i] = own - height[u + s]
+        if straight_only:
+            continue
+        rises[n * _FOUR + i] = own - height[u - s - _ONE]
+        rises[n * _FIVE + i] = own - height[u - s + _ONE]
+        rises[n * _SIX + i] = own - height[u + s - _ONE]
+        rises[n * _SEVEN + i] = own - height[u + s + _ONE]
 
 
 @helper
-def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, last, touched):
-    """Offer each cell's neighbours what a step into it costs. Writes those whose cost has fallen to `touched`;
-    returns how many times."""
+def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, steps, touched):
+    """Offer the neighbours of `n` cells what a step into them costs. Writes those whose cost has fallen to
+    `touched`; returns how many times."""
     count = _ZERO
-    height = climbs[0]
-    for p in range(first, last):
-        _ask_for(cell_cost, cost, height, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
-        u = np.uint64(batch[p])
+    height, prices = climbs[0], climbs[1]
+    rises, entries = steps
+    _find_rises(height, s, straight_only, batch, first, n, rises)
+    find_entries(rises, _ZERO, n * _FOUR, climbs, 0, entries)
+    if not straight_only:
+        find_entries(rises, n * _FOUR, n * _FOUR, climbs, 1, entries)
+    for i in range(n):
+        u = np.uint64(batch[first + i])
+        ahead = np.uint64(batch[first + i + np.uint64(_AHEAD)])
+        prefetch(cell_cost, ahead)
+        prefetch(cost, ahead - s)
+        prefetch(cost, ahead)
+        prefetch(cost, ahead + s)
         base = -cost[u]
         own = cell_cost[u]
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
-        for v, old in ((above, north), (u - _ONE, west), (u + _ONE, east), (below, south)):
-            key = base + own * step_price(climbs, v, u, 0)
+        for k, v, old in (
+            (_ZERO, above, north),
+            (_ONE, u - _ONE, west),
+            (_TWO, u + _ONE, east),
+            (_THREE, below, south),
+        ):
+            key = base + own * prices[np.uint64(entries[n * k + i])]
             cost[v] = min(old, key)
             touched[count] = v
             count += np.uint64(key < old)
         if straight_only:
             continue
-        for v, shut in (
-            (above - _ONE, min(north, west)),
-            (above + _ONE, min(north, east)),
-            (below - _ONE, min(south, west)),
-            (below + _ONE, min(south, east)),
+        for k, v, shut in (
+            (_FOUR, above - _ONE, min(north, west)),
+            (_FIVE, above + _ONE, min(north, east)),
+            (_SIX, below - _ONE, min(south, west)),
+            (_SEVEN, below + _ONE, min(south, east)),
         ):
             old = cost[v]
-            key = base + own * step_price(climbs, v, u, 1)
+            key = base + own * prices[np.uint64(entries[n * k + i])]
             key = key if corners or shut > WALL else INF
             cost[v] = min(old, key)
             touched[count] = v
@@ -127,7 +159,7 @@ def grow_directed_by_buckets(grid, cost, root, climbs, buckets, scratch):
     Returns the last bucket: no cost exceeds (last + 1) * width; or TOO_FINE.
     """
     cell_cost, _, stride, rule, corners = grid
-    touched, chosen, batch, queue = scratch
+    touched, chosen, batch, steps, queue = scratch
     width, circle = buckets
     empty(queue, circle)
     head, tail = queue[3], queue[4]
@@ -145,12 +177,14 @@ def grow_directed_by_buckets(grid, cost, root, climbs, buckets, scratch):
         n = _serve_once(cost, batch, n)
         first = _ZERO
         while first < n:
-            last = min(first + _PIECE, n)
-            count = _offer(cell_cost, cost, climbs, s, rule == RULE_FOUR, corners, batch, first, last, touched)
+            some = min(_PIECE, n - first)
+            count = _offer(
+                cell_cost, cost, climbs, s, rule == RULE_FOUR, corners, batch, first, some, steps, touched
+            )
             _choose(cost, inverse, np.int32(current + 1), touched, count, chosen)
             put(queue, touched, count, chosen, mask, _ZERO)
             waiting += count
-            first = last
+            first += some
         if waiting == _ZERO:
             break
         if current > _MOST_BUCKETS:

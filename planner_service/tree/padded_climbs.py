@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import RULE_FOUR, RULE_OCTILE, SQRT2
+from shared_map.arrays import Floats
 from shared_map.terrain.step_climb import Climb
 
 
@@ -23,17 +25,16 @@ def padded_climbs(climb: Climb, rule: int) -> tuple[Climbs, float]:
 
 def with_scratch(climbs: Climbs) -> Climbs:
     """The same, with rows of its own to write to: one thread's."""
-    height, prices, scale, keys, *_ = climbs
-    return height, prices, scale, *_rows(keys.size)
+    return *climbs[:3], *_rows(climbs[3].size)
 
 
-def _rows(stride: int) -> Climbs:
-    return tuple(np.empty(stride, np.float32) for _ in range(3))
+def _rows(stride: int) -> tuple[Floats, Floats, Floats, NDArray[np.int32]]:
+    keys, best, codes = np.empty((3, stride), np.float32)
+    return keys, best, codes, np.empty(stride, np.int32)
 
 
 def climbs_in(climbs: Climbs, stride: int, box: tuple[int, int, int, int]) -> Climbs:
     """Of a window, as a padded grid of its own."""
-    height, *others = climbs
     row0, col0, row1, col1 = box
-    part = height.reshape(-1, stride)[row0 : row1 + 2, col0 : col1 + 2]
-    return np.ascontiguousarray(part).reshape(-1), *others
+    part = climbs[0].reshape(-1, stride)[row0 : row1 + 2, col0 : col1 + 2]
+    return np.ascontiguousarray(part).reshape(-1), *climbs[1:]

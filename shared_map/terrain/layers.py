@@ -52,6 +52,8 @@ class TerrainClass(enum.IntEnum):
     ROAD = 6
     BUILT = 7
     SNOW = 8
+    SHRUB = 9
+    WETLAND = 10
 
 
 CLASS_FACTOR: Mapping[TerrainClass, float] = {
@@ -64,8 +66,11 @@ CLASS_FACTOR: Mapping[TerrainClass, float] = {
     TerrainClass.ROAD: 1.0,
     TerrainClass.BUILT: 3.0,
     TerrainClass.SNOW: 2.5,
+    TerrainClass.SHRUB: 1.5,
+    TerrainClass.WETLAND: 5.0,
 }
-"""Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`."""
+"""Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`. Shrub is the heavy
+brush of Soule and Goldman (1972), for people on foot; wetland is a judgement: vehicles get stuck there."""
 
 
 def gradient(elevation_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:

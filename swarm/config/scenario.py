@@ -69,11 +69,11 @@ def _plugin(built_in: Any = None) -> Meta:
 Options = dict[str, Any]
 """What is said to a plug-in: its own struct checks it."""
 
-ClassName = Literal["unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow"]
+ClassName = Literal[
+    "unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow", "shrub", "wetland"
+]
 
-CoverGround = (
-    Literal["unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow", "lethal"] | Positive
-)
+CoverGround = Literal[ClassName, "lethal"] | Positive
 """What a code of a land-cover map stands for: a class, or a pace relative to open ground."""
 
 CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}$")]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.importers.photo_roads import COARSEST_M, REACH, line_strength, long_lines
 from shared_map.terrain.layers import TerrainClass, grade_of_padded, spread
-from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress, padded_rows
 
 HALO = REACH
 """Rows around a band that its features look at."""
@@ -26,6 +26,8 @@ LEVEL_M, LEVEL_PER_CELL = 0.25, 0.025
 """Standard deviation of a lake's heights: metres of the survey, and per metre of cell for the bank in a cell at the
 shore. Lakes that were measured have at most nine tenths of it; the shadow of a cloud lies over more."""
 SMALLEST_LAKE = 12
+_LIGHT = np.array([0.299, 0.587, 0.114], np.float32)
+"""How bright red, green and blue are to the eye (Rec. 601)."""
 SHORE = (2, 2, 2)
 """Around lakes, as `spread` takes it: a beach is a bright line, too."""
 ROAD_GRADE = np.float32(0.5)
@@ -44,14 +46,14 @@ class Features:
     """
 
     def __init__(self, rgb: Bytes, grade: Floats) -> None:
-        from scipy import ndimage
-
         colour = rgb.astype(np.float32)
-        self.red, self.green, self.blue = (ndimage.uniform_filter(colour[..., n], 3) for n in range(3))
-        light = colour @ np.array([0.299, 0.587, 0.114], np.float32)
-        mean = ndimage.uniform_filter(light, 5)
-        square = ndimage.uniform_filter(light * light, 5)
-        self.light = ndimage.uniform_filter(light, 3)
+        # Sums of bytes are exact, and the light of a mean is the mean of the light.
+        near = box_sum(rgb.astype(np.uint16), 1).astype(np.float32) * np.float32(1 / 9)
+        self.red, self.green, self.blue = (np.ascontiguousarray(near[..., n]) for n in range(3))
+        light = colour @ _LIGHT
+        mean = box_sum(light, 2) * np.float32(1 / 25)
+        square = box_sum(light * light, 2) * np.float32(1 / 25)
+        self.light = near @ _LIGHT
         self.around = mean
         self.texture = np.sqrt(np.maximum(square - mean * mean, np.float32(0)))
         brightest = np.maximum(np.maximum(self.red, self.green), self.blue)
@@ -68,6 +70,20 @@ class Features:
             *(self.red / total, self.green / total, self.blue / total, self.grade),
         )
         return np.stack([part.reshape(-1) for part in parts], axis=1).astype(np.float32)
+
+
+def box_sum(values: NDArray[Any], reach: int) -> NDArray[Any]:
+    """Sums over squares of `reach` cells to each side; the border is mirrored. Of the type of `values`."""
+    pads = [(reach, reach), (reach, reach), (0, 0)][: values.ndim]
+    padded = np.pad(values, pads, mode="symmetric")
+    rows, cols = values.shape[:2]
+    down = padded[:rows].copy()
+    for n in range(1, 2 * reach + 1):
+        down += padded[n : n + rows]
+    across = down[:, :cols].copy()
+    for n in range(1, 2 * reach + 1):
+        across += down[:, n : n + cols]
+    return across
 
 
 def by_rules(
@@ -191,8 +207,8 @@ def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats | None, resoluti
     from scipy import ndimage
 
     labels, count = ndimage.label(likely)
-    sizes = np.bincount(labels.reshape(-1))
-    certain = np.bincount(labels[(wetness & CERTAIN) > 0], minlength=count + 1)
+    sizes = counted(labels, count + 1)
+    certain = counted(labels, count + 1, (wetness & CERTAIN) > 0)
     wet = (sizes >= SMALLEST_LAKE) & (5 * certain >= sizes)
     wet[0] = False
     tilted = np.zeros(count + 1, np.bool_)
@@ -202,7 +218,7 @@ def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats | None, resoluti
         mean = np.bincount(of_cell, heights, count + 1) / np.maximum(sizes, 1)
         variance = np.bincount(of_cell, (heights - mean[of_cell]) ** 2, count + 1) / np.maximum(sizes, 1)
         tilted = wet & (variance > (LEVEL_M + LEVEL_PER_CELL * resolution_m) ** 2)
-    return np.asarray((wet & ~tilted)[labels], np.bool_), np.asarray(tilted[labels], np.bool_)
+    return looked_up(wet & ~tilted, labels), looked_up(tilted, labels)
 
 
 # --- learnt -------------------------------------------------------------------------------------------------

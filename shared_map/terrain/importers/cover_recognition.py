@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.terrain.importers.cover_tables import TABLES, CoverTable, Rgb
+from shared_map.terrain.importers.cover_tables import OTHERS, TABLES, CoverTable, Rgb
 from swarm.errors import TerrainError
 
 SAME_COLOUR = 5
@@ -149,23 +149,30 @@ def recognise(found: Evidence, what: str) -> Recognised | None:
     """
     fits = [table for table in TABLES.values() if _fits(found, table)]
     # Whole numbers from 1 on, in colours that are not CORINE's, are anybody's codes.
-    by_codes = [table for table in fits if table.gappy or not found.palette]
+    by_codes = [
+        table
+        for table in fits
+        if found.counts.keys() <= {*table.grounds, *table.nothing} and (table.gappy or not found.palette)
+    ]
     for how, chosen in (
         ("its palette", [table for table in fits if _alike(found, table)]),
         ("the names of its categories", [table for table in fits if _called(found, table)]),
         ("its name or metadata", [table for table in fits if any(word in found.text for word in table.words)]),
         ("its codes", by_codes),
     ):
-        if len(chosen) == 1:
-            return Recognised(chosen[0], how)
+        others = [title for title, codes in OTHERS.items() if how == "its codes" and found.counts.keys() <= codes]
         near = [table for table in chosen if _is_there(found, table)]
-        if len(near) == 1:
+        if len(chosen) == 1 and not others:
+            return Recognised(chosen[0], how)
+        if len(near) == 1 and not others:
             return Recognised(near[0], f"{how} and where it lies")
         if chosen:
             keys = " or ".join(repr(table.key) for table in chosen)
-            titles = " and ".join(table.title for table in chosen)
+            titles = ", and of ".join([*(table.title for table in chosen), *others])
+            csv = ", or a CSV file of code and class" if others else ""
             raise TerrainError(
-                f"{what}: its codes ({some(found.counts)}) are those of {titles}; set terrain.cover_codes = {keys}"
+                f"{what}: its codes ({some(found.counts)}) are those of {titles}; set terrain.cover_codes ="
+                f" {keys}{csv}"
             )
     return None
 

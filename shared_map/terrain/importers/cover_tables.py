@@ -68,7 +68,11 @@ class CoverTable:
         """The table with other meanings of some codes."""
         if not own:
             return self
-        return replace(self, grounds={**self.grounds, **own}, nothing=self.nothing - own.keys())
+        named = {
+            code: replace(ground, name=self.grounds[code].name) if code in self.grounds else ground
+            for code, ground in own.items()
+        }
+        return replace(self, grounds={**self.grounds, **named}, nothing=self.nothing - own.keys())
 
 
 def ground_of(value: CoverGround, name: str = "", colour: Rgb | None = None) -> Ground:
@@ -98,18 +102,18 @@ def _rows(text: str) -> Iterable[tuple[int, Ground]]:
         yield int(code), ground_of(_parsed(value), name, (red, green, blue))
 
 
-# Factors beside classes are of ours: brush as Soule and Goldman (1972) have it for people on foot (1.2 light, 1.5
-# heavy, 2.1 loose sand); wetland 5, as vehicles get stuck there; mangroves are flooded forest.
+# Paces beside classes are of ours: 1.2 light brush and 2.1 loose sand as Soule and Goldman (1972) have them for
+# people on foot; mangroves are flooded forest.
 _WORLDCOVER = """
 10  forest 006400 Tree cover
-20  1.5    ffbb22 Shrubland
+20  shrub ffbb22 Shrubland
 30  grass  ffff4c Grassland
 40  soil   f096ff Cropland
 50  built  fa0000 Built-up
 60  soil   b4b4b4 Bare / sparse vegetation
 70  snow   f0f0f0 Snow and ice
 80  water  0064c8 Permanent water bodies
-90  5      0096a0 Herbaceous wetland
+90  wetland 0096a0 Herbaceous wetland
 95  lethal 00cf75 Mangroves
 100 1.2    fae6a0 Moss and lichen
 """
@@ -127,7 +131,7 @@ _CORINE = """
 142 grass ffe6ff Sport and leisure facilities
 211 soil  ffffa8 Non-irrigated arable land
 212 soil  ffff00 Permanently irrigated land
-213 5     e6e600 Rice fields
+213 wetland e6e600 Rice fields
 221 2     e68000 Vineyards
 222 1.5   f2a64d Fruit trees and berry plantations
 223 1.5   e6a600 Olive groves
@@ -140,17 +144,17 @@ _CORINE = """
 312 forest 00a600 Coniferous forest
 313 forest 4dff00 Mixed forest
 321 grass ccf24d Natural grasslands
-322 1.5   a6ff80 Moors and heathland
-323 1.5   a6e64d Sclerophyllous vegetation
-324 1.8   a6f200 Transitional woodland-shrub
+322 shrub a6ff80 Moors and heathland
+323 shrub a6e64d Sclerophyllous vegetation
+324 shrub a6f200 Transitional woodland-shrub
 331 2.1   e6e6e6 Beaches, dunes, sands
 332 rock  cccccc Bare rocks
 333 soil  ccffcc Sparsely vegetated areas
 334 soil  000000 Burnt areas
 335 snow  a6e6cc Glaciers and perpetual snow
-411 5     a6a6ff Inland marshes
-412 5     4d4dff Peat bogs
-421 5     ccccff Salt marshes
+411 wetland a6a6ff Inland marshes
+412 wetland 4d4dff Peat bogs
+421 wetland ccccff Salt marshes
 422 water e6e6ff Salines
 423 water a6a6e6 Intertidal flats
 511 water 00ccf2 Water courses
@@ -171,16 +175,16 @@ _NLCD = """
 41 forest 68ab5f Deciduous Forest
 42 forest 1c5f2c Evergreen Forest
 43 forest b5c58f Mixed Forest
-51 1.5    af963c Dwarf Scrub
-52 1.5    ccb879 Shrub/Scrub
+51 shrub af963c Dwarf Scrub
+52 shrub ccb879 Shrub/Scrub
 71 grass  dfdfc2 Grassland/Herbaceous
 72 grass  d1d182 Sedge/Herbaceous
 73 1.2    a3cc51 Lichens
 74 1.2    82ba9e Moss
 81 grass  dcd939 Pasture/Hay
 82 soil   ab6c28 Cultivated Crops
-90 5      b8d9eb Woody Wetlands
-95 5      6c9fb8 Emergent Herbaceous Wetlands
+90 wetland b8d9eb Woody Wetlands
+95 wetland 6c9fb8 Emergent Herbaceous Wetlands
 """
 _LEVEL3 = dict(_rows(_CORINE))
 _EUROPE = (-35.0, 25.0, 50.0, 75.0)
@@ -219,6 +223,15 @@ TABLES: Mapping[str, CoverTable] = {
     )
 }
 """Built-in tables by what the setting calls them. A new product is a row, and a text of its codes."""
+OTHERS: Mapping[str, frozenset[int]] = {
+    "GlobeLand30": frozenset((0, *range(10, 101, 10), 255)),
+    "ESA CCI": frozenset(
+        (0, *range(10, 13), *range(20, 61, 10), 61, 62, *range(70, 73), *range(80, 83), *range(90, 121, 10), 121)
+    ).union((122, *range(130, 151, 10), 151, 152, 153, *range(160, 201, 10), 201, 202, 210, 220)),
+    "a map whose codes are counted from 1": frozenset(range(31)),
+}
+"""Codes of maps that are not built in, and that built-in ones are not to be taken for by their codes alone: 60 is
+water in one of them and bare ground in the other."""
 
 
 def own_grounds(classes: Mapping[str, CoverGround]) -> dict[int, Ground]:

@@ -88,8 +88,9 @@ def is_plausible(rgb: NDArray[np.uint8], shown: NDArray[np.bool_], encoding: Enc
         rough_m += float(rise_m[beside].sum())
         pairs += float(beside.sum())
     # Noise differs from cell to cell by as much as from one end to the other.
+    # One colour is no landscape.
     spread_m = float(known.std())
-    return torn <= _MOST_TORN * steps and (spread_m == 0 or rough_m / max(pairs, 1.0) <= _MOST_ROUGH * spread_m)
+    return spread_m > 0 and torn <= _MOST_TORN * steps and rough_m <= _MOST_ROUGH * spread_m * pairs
 
 
 def encodings_of(dataset: Any) -> list[Encoding]:

@@ -307,7 +307,7 @@ _STRANGE, _EMPTY = HIGHEST_CODE + 1, HIGHEST_CODE + 2
 def _entries(codes: NDArray[Any]) -> NDArray[np.intp]:
     """Where each value is looked up: a code at itself, what is none at _STRANGE, no data at _EMPTY."""
     with np.errstate(invalid="ignore"):
-        empty = ~(codes >= 0) | (codes == NOTHING)
+        empty = ~(codes >= 0) | (codes == NOTHING) | (codes == np.inf)
         strange = ~empty & (codes > HIGHEST_CODE)
         at: NDArray[np.intp] = np.where(empty | strange, 0, codes).astype(np.intp)
     at[strange], at[empty] = _STRANGE, _EMPTY

@@ -6,6 +6,8 @@ Cell coordinates are (column, row) from the north-west corner: cell (r, c) is th
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,7 +66,8 @@ class Placing:
         self.grid, self.layer = grid, layer
         self._target, self._crs = _systems(grid, layer, crs)
         self._margin_cells = margin_m / grid.resolution_m + 2.0
-        self._box = self._extent()
+        with self._reprojecting():
+            self._box = self._extent()
         self.shifts = [0.0]
         if self._crs is not None and self._crs.is_geographic:
             self.shifts = [0.0, -360.0, 360.0]
@@ -122,6 +125,10 @@ class Placing:
 
     def place(self, features: Features, box: Box, shift: float) -> Shapes:
         """Features that were read from a box, in cells."""
+        with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
+            return self._place(features, box, shift)
+
+    def _place(self, features: Features, box: Box, shift: float) -> Shapes:
         import shapely
 
         geometries = features.geometries
@@ -144,11 +151,25 @@ class Placing:
         if self._crs is not None and self._crs != self._target:
             unit_m = _DEG_M if self._crs.is_geographic else float(self._crs.linear_units_factor[1])
             shapes = shapely.segmentize(shapes, _STEP_M / unit_m)
-        shapes = shapely.transform(shapes, lambda points: self._to_cells(points, shift))
+        with self._reprojecting():
+            shapes = shapely.transform(shapes, lambda points: self._to_cells(points, shift))
         shapes, within = _simple(shapes)
         of = of[within]
         good = np.isfinite(shapely.bounds(shapes)).all(axis=1)
         return Shapes(shapes[good], of[good], mended, unusable, int(lacking.sum()))
+
+    @contextmanager
+    def _reprojecting(self) -> Iterator[None]:
+        """Makes what PROJ says of systems that do not go together a TerrainError."""
+        from rasterio._err import CPLE_BaseError
+        from rasterio.errors import RasterioError
+
+        try:
+            yield
+        except (RasterioError, CPLE_BaseError) as error:
+            raise TerrainError(
+                f"{self.layer.what} cannot be brought from {self.crs} to the terrain's system; is crs right?"
+            ) from error
 
     def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
         from rasterio.warp import transform as to_crs

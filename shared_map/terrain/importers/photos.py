@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
-from shared_map.terrain.importers.georeference import bounds_in, crs_of, resampling
+from shared_map.terrain.importers.georeference import bounds_in, crs_name, crs_of, resampling
 from shared_map.terrain.importers.rasters import opened
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
@@ -84,7 +84,16 @@ def transform_of(grid: GridSpec) -> Any:
 
 def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
     """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
-    west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+    except (RasterioError, CPLE_BaseError) as error:
+        names = crs_name(crs), crs_name(target)
+        raise TerrainError(
+            f"{what} is in {names[0]}, from which no way leads to the terrain's {names[1]}"
+        ) from error
     grid_east = grid.west_m + grid.cols * grid.resolution_m
     grid_south = grid.north_m - grid.rows * grid.resolution_m
     wide = min(east, grid_east) - max(west, grid.west_m)

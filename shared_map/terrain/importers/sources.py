@@ -193,7 +193,8 @@ def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
     """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
-    from shared_map.terrain.importers.level_ground import looked_at, without
+    from shared_map.terrain.importers.level_ground import looked_at
+    from shared_map.terrain.importers.voids import without
 
     voids, level, told = looked_at(stored.astype(np.float32), config, scale)
     return without(stored.astype(np.float32), voids) * np.float32(scale), level, told

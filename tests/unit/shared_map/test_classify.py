@@ -13,10 +13,11 @@ from scipy import ndimage
 from skimage.draw import line
 
 from shared_map.arrays import Bytes
-from shared_map.terrain.importers.classify import by_rules, confusion, held_out, learnt
+from shared_map.terrain.importers.classify import box_sum, by_rules, confusion, held_out, learnt
 from shared_map.terrain.importers.labels import Labels, read_labels
 from shared_map.terrain.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.row_bands import counted, looked_up
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from shared_map.terrain.synthetic.noise import fractal
 from swarm.config.scenario import TerrainConfig
@@ -213,3 +214,21 @@ def test_bad_labels_are_refused_with_a_sentence(tmp_path: Path, text: str, words
         labels_file(tmp_path, text)
     with pytest.raises(TerrainError, match="cannot read labels"):
         read_labels(tmp_path / "nowhere.toml", GridSpec(2, 2, 1.0))
+
+
+@pytest.mark.parametrize("reach", [1, 2])
+def test_means_of_bytes_are_those_of_scipy(reach: int) -> None:
+    photo = np.random.default_rng(1).integers(0, 256, (40, 33, 3)).astype(np.uint8)
+    side = 2 * reach + 1
+    found = box_sum(photo.astype(np.uint16), reach) / side**2
+    expected = ndimage.uniform_filter(photo.astype(np.float64), (side, side, 1))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_labels_are_counted_and_looked_up_band_by_band() -> None:
+    rng = np.random.default_rng(2)
+    labels = rng.integers(0, 9, (300, 17)).astype(np.int32)
+    where, flags = rng.random((300, 17)) < 0.3, rng.random(9) < 0.5
+    np.testing.assert_array_equal(counted(labels, 9), np.bincount(labels.ravel(), minlength=9))
+    np.testing.assert_array_equal(counted(labels, 9, where), np.bincount(labels[where], minlength=9))
+    np.testing.assert_array_equal(looked_up(flags, labels), flags[labels])

@@ -97,7 +97,7 @@ def test_water_is_lethal_and_no_two_colours_of_a_legend_are_taken_for_each_other
 def test_codes_of_each_table_become_its_grounds(tmp_path: Path, dem: Path, key: str, dtype: str) -> None:
     codes = patches(list(TABLES[key].grounds))
     path = written(tmp_path / "cover.tif", codes, dtype, crs=EUROPE)
-    source = load(dem, cover=str(path), cover_codes=None if key != "nlcd" else "nlcd")
+    source = load(dem, cover=str(path), cover_codes=None if key == "worldcover" else key)
     kinds, factors = expected(codes, key)
     np.testing.assert_array_equal(source.classes, kinds)
     np.testing.assert_allclose(source.factor, factors)
@@ -128,8 +128,17 @@ def test_an_ambiguous_map_is_asked_for_and_the_place_may_answer(tmp_path: Path) 
         read_cover(nowhere, GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000), TerrainConfig())
     assert "\n" not in str(asked.value)
     both = written(tmp_path / "c.tif", patches([10, 20, 30, 40]), "uint8", crs=EUROPE)
-    with pytest.raises(TerrainError, match="are those of ESA WorldCover and CORINE"):
+    with pytest.raises(
+        TerrainError, match=r"are those of ESA WorldCover, and of CORINE .*, and of GlobeLand30, and of"
+    ):
         read_cover(both, GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000, EUROPE), TerrainConfig())
+
+
+@pytest.mark.parametrize("codes", [[80], [1, 2], [1, 2, 3, 4, 5, 6, 7, 8, 9], [10, 20, 30, 60, 80, 100]])
+def test_codes_that_other_maps_have_too_are_asked_for(tmp_path: Path, dem: Path, codes: list[int]) -> None:
+    cover = written(tmp_path / "a.tif", patches(codes), "uint8")
+    with pytest.raises(TerrainError, match=r"set terrain\.cover_codes = .*, or a CSV file of code and class$"):
+        load(dem, cover=str(cover))
 
 
 @pytest.mark.parametrize("evidence", ["palette", "names", "attributes", "metadata", "file name"])
@@ -166,11 +175,11 @@ def test_what_the_table_lacks_is_named_with_its_share_and_so_is_no_data(tmp_path
     codes = patches(list(TABLES["worldcover"].grounds))
     codes[:4], codes[4:10] = 77, 0
     cover = written(tmp_path / "cover.tif", codes, "uint8")
-    source = load(dem, cover=str(cover))
+    source = load(dem, cover=str(cover), cover_codes="worldcover")
     assert said(source.notes, "codes 77 on 2.0% of the terrain are not in the table")
     assert said(source.notes, "no data on 3.0% of the terrain")
     assert (source.classes[:10] == TerrainClass.UNKNOWN).all()
-    own = load(dem, cover=str(cover), cover_classes={"77": "rock", "0": "lethal"})
+    own = load(dem, cover=str(cover), cover_codes="worldcover", cover_classes={"77": "rock", "0": "lethal"})
     assert (own.classes[:4] == TerrainClass.ROCK).all()
     assert np.isinf(own.factor[4:10]).all()
     strange = written(tmp_path / "strange.tif", patches([3, 600, 601, 602]), "uint16")
@@ -250,14 +259,14 @@ def test_no_code_is_made_up_by_resampling(tmp_path: Path, system: str, step: flo
 
 
 def test_what_lies_beside_the_map_or_under_its_mask_is_unknown(tmp_path: Path, dem: Path) -> None:
-    codes = patches([10, 30, 50, 60, 80])
+    codes = patches([10, 30, 50, 60, 80], seed=3)
     place = from_origin(502_000, 5_000_000, 20, 20)
     path = written(tmp_path / "cover.tif", codes, "uint8", transform=place)
     with rasterio.open(path, "r+") as file:
         mask = np.full((SIDE, SIDE), 255, np.uint8)
         mask[:50] = 0
         file.write_mask(mask)
-    cover = read_cover(path, load(dem).grid, TerrainConfig())
+    cover = read_cover(path, load(dem).grid, TerrainConfig(cover_codes="worldcover"))
     assert not cover.known[:, :100].any()
     assert not cover.known[:50].any()
     assert cover.known[50:, 100:].all()
@@ -266,7 +275,10 @@ def test_what_lies_beside_the_map_or_under_its_mask_is_unknown(tmp_path: Path, d
     assert said(cover.notes, "no data on 62.5%")
     far = written(tmp_path / "far.tif", codes, "uint8", transform=from_origin(900_000, 5_000_000, 20, 20))
     with pytest.raises(TerrainError, match="does not overlap the terrain"):
-        read_cover(far, load(dem).grid, TerrainConfig())
+        read_cover(far, load(dem).grid, TerrainConfig(cover_codes="worldcover"))
+    moon = written(tmp_path / "moon.tif", codes, "uint8", crs="+proj=longlat +R=1737400 +no_defs")
+    with pytest.raises(TerrainError, match="from which no way leads to the terrain's EPSG:32632"):
+        read_cover(moon, load(dem).grid, TerrainConfig(cover_codes="worldcover"))
 
 
 def test_land_cover_wins_over_level_ground_and_says_so(tmp_path: Path) -> None:

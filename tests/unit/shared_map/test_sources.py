@@ -252,8 +252,8 @@ def a_folder(folder: Path) -> dict[str, Any]:
 
 
 def strange_ending(folder: Path) -> dict[str, Any]:
-    (folder / "a.xyz").write_text("1 2 3")
-    return {"source": folder / "a.xyz"}
+    (folder / "a.qqq").write_text("1 2 3")
+    return {"source": folder / "a.qqq"}
 
 
 def wrong_crs(folder: Path) -> dict[str, Any]:
@@ -316,7 +316,7 @@ def photo_of_nan(folder: Path) -> dict[str, Any]:
         (no_raster, "no raster"),
         (missing, "nowhere.tif does not exist"),
         (a_folder, "is a folder"),
-        (strange_ending, ".xyz is unknown; give .tif"),
+        (strange_ending, ".qqq is unknown; give .tif"),
         (wrong_crs, "'EPSG:banana' is no coordinate system"),
         (coarser_than_all, "no cell of 5000 m fits"),
         (labels_without_photo, "needs a photo"),
