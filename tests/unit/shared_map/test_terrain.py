@@ -180,7 +180,10 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
         tmp_path / "roads.png", "w", driver="PNG", height=60, width=70, count=1, dtype="uint8"
     ) as file:
         file.write(roads, 1)
-    river = shapely.to_wkb(np.array([shapely.LineString([(x_m - 790, y_m), (x_m - 790, y_m - 800)])]))
+    # A river along the sixth column, from the sixth row to the 45th.
+    west_m, north_m = x_m - 900, y_m + 100
+    course = [(west_m + 110, north_m - 100), (west_m + 110, north_m - 900)]
+    river = shapely.to_wkb(np.array([shapely.LineString(course)]))
     columns = {"field_data": [np.array(["river"])], "fields": ["waterway"], "geometry_type": "LineString"}
     write(tmp_path / "extract.gpkg", geometry=river, layer="lines", crs="EPSG:32632", **columns)
     terrain = build_terrain(load_scenario(tmp_path / "mine.toml"))
