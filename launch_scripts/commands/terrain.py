@@ -423,18 +423,25 @@ def _compare(terrain: Terrain, path: Path) -> None:
 
 
 def _print_confusion(title: str, counts: Any) -> None:
+    labelled = [kind for kind in TerrainClass if counts[kind].any()]
     present = [kind for kind in TerrainClass if counts[kind].any() or counts[:, kind].any()]
+    unknown = counts[:, TerrainClass.UNKNOWN].sum() / counts.sum()
+    right = np.trace(counts) / counts.sum()
     table = Table(
-        title=f"{title}: {np.trace(counts) / counts.sum():.1%} of the labelled cells", title_justify="left"
+        title=f"{title}: {right:.1%} of the labelled cells, {unknown:.1%} unknown, {1 - right - unknown:.1%} wrong",
+        title_justify="left",
     )
     table.add_column("labelled")
     for kind in present:
         table.add_column(kind.name.lower(), justify="right")
     table.add_column("IoU", justify="right")
-    for kind in present:
+    overlaps = []
+    for kind in labelled:
         union = counts[kind].sum() + counts[:, kind].sum() - counts[kind, kind]
         cells = [str(counts[kind, other]) for other in present]
-        table.add_row(kind.name.lower(), *cells, f"{counts[kind, kind] / union:.2f}")
+        overlaps.append(counts[kind, kind] / union)
+        table.add_row(kind.name.lower(), *cells, f"{overlaps[-1]:.2f}")
+    table.caption = f"mean IoU {np.mean(overlaps):.2f}"
     console.print(table)
 
 

@@ -74,7 +74,11 @@ def classified(source: Source, config: TerrainConfig, seed: int, progress: Progr
         return replace(source, notes=(*source.notes, note))
     if config.labels is None:
         classes = by_rules(*inputs, source.seen, progress)
-        note = "classes from the photo, by rules"
+        doubtful = float((classes[seen] == TerrainClass.UNKNOWN).mean()) if seen.any() else 0.0
+        note = (
+            f"classes from the photo, by rules; {doubtful:.0%} of what it shows would be another class in a photo"
+            " exposed a little differently, and is unknown: see terrain.labels and cost.class_factor.unknown"
+        )
     else:
         from shared_map.terrain.importers.labels import read_labels
 

@@ -5,6 +5,7 @@ Codes are never interpolated: a cell takes the nearest code, or the most frequen
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -34,7 +35,7 @@ from shared_map.terrain.importers.cover_tables import (
 )
 from shared_map.terrain.importers.georeference import crs_of, resampling
 from shared_map.terrain.importers.photos import overlap, transform_of
-from shared_map.terrain.importers.rasters import opened
+from shared_map.terrain.importers.rasters import opened, thinned
 from shared_map.terrain.importers.source import Source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, bands, no_progress
@@ -218,13 +219,10 @@ def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> Meaning | None
 
 def sampled_codes(dataset: Any, what: str) -> NDArray[Any]:
     """Values of some cells, (cells,), as stored, no-data left out. Raises TerrainError if they are not whole."""
-    from rasterio.enums import Resampling
-
     kind = np.dtype(dataset.dtypes[0]).kind
-    every = max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0)
-    shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
-    values: NDArray[Any] = dataset.read(1, out_shape=shape, resampling=Resampling.nearest)
-    values = values[dataset.read_masks(1, out_shape=shape, resampling=Resampling.nearest) > 0]
+    every = math.ceil(max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0))
+    values = thinned(dataset.read, dataset, 1, every)
+    values = values[thinned(dataset.read_masks, dataset, 1, every) > 0]
     if kind == "f":
         values = values[np.isfinite(values)]
     if kind not in "iuf" or (kind == "f" and (values % 1 != 0).any()):
@@ -241,14 +239,11 @@ def _palette_colours(found: Evidence) -> NDArray[np.int32]:
 
 def sampled_colours(dataset: Any) -> NDArray[np.int32]:
     """Of some cells of an image, (cells,), red << 16 | green << 8 | blue; what it does not show left out."""
-    from rasterio.enums import Resampling
-
     if any(dtype != "uint8" for dtype in dataset.dtypes[:3]):
         return np.zeros(0, np.int32)
-    every = max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0)
-    shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
-    rgb = dataset.read((1, 2, 3), out_shape=(3, *shape), resampling=Resampling.nearest)
-    shown: Bools = dataset.dataset_mask(out_shape=shape, resampling=Resampling.nearest) > 0
+    every = math.ceil(max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0))
+    rgb = thinned(dataset.read, dataset, (1, 2, 3), every)
+    shown: Bools = thinned(lambda _, **window: dataset.dataset_mask(**window), dataset, None, every) > 0
     return _joined(rgb)[shown]
 
 
