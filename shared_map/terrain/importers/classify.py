@@ -54,13 +54,16 @@ class Features:
         colour = rgb.astype(np.float32)
         # Sums of bytes are exact, and the light of a mean is the mean of the light.
         near = box_sum(rgb.astype(np.uint16), 1).astype(np.float32) * np.float32(1 / 9)
+        self.red: Floats
+        self.green: Floats
+        self.blue: Floats
         self.red, self.green, self.blue = (np.ascontiguousarray(near[..., n]) for n in range(3))
         light = colour @ _LIGHT
         mean = box_sum(light, 2) * np.float32(1 / 25)
         square = box_sum(light * light, 2) * np.float32(1 / 25)
-        self.light = near @ _LIGHT
-        self.around = mean
-        self.texture = np.sqrt(np.maximum(square - mean * mean, np.float32(0)))
+        self.light = np.asarray(near @ _LIGHT, np.float32)
+        self.around: Floats = mean
+        self.texture = np.asarray(np.sqrt(np.maximum(square - mean * mean, np.float32(0))), np.float32)
         self.saturation = _saturation(self.red, self.green, self.blue)
         self.grade = grade
         self.sharp, self.rgb = colour, rgb
@@ -68,13 +71,10 @@ class Features:
     def exposed(self, gain: float, warm: float) -> Features:
         """The means as they would be if the photo were brighter, and redder than blue, by these factors."""
         other = copy.copy(self)
-        gains = [np.float32(each) for each in (gain * warm, gain, gain / warm)]
-        other.red, other.green, other.blue = (
-            each * by for each, by in zip((self.red, self.green, self.blue), gains, strict=True)
-        )
-        other.light, other.around, other.texture = (
-            each * np.float32(gain) for each in (self.light, self.around, self.texture)
-        )
+        by = np.float32(gain)
+        other.red, other.green, other.blue = self.red * (by * np.float32(warm)), self.green * by, self.blue * by
+        other.blue /= np.float32(warm)
+        other.light, other.around, other.texture = self.light * by, self.around * by, self.texture * by
         other.saturation = _saturation(other.red, other.green, other.blue)
         return other
 
@@ -91,8 +91,7 @@ class Features:
 def _saturation(red: Floats, green: Floats, blue: Floats) -> Floats:
     brightest = np.maximum(np.maximum(red, green), blue)
     darkest = np.minimum(np.minimum(red, green), blue)
-    saturation: Floats = (brightest - darkest) / np.maximum(brightest, np.float32(1))
-    return saturation
+    return np.asarray((brightest - darkest) / np.maximum(brightest, np.float32(1)), np.float32)
 
 
 def box_sum(values: NDArray[Any], reach: int) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from shared_map.terrain.importers.cover_recognition import (
     some,
 )
 from shared_map.terrain.importers.cover_tables import TABLES, CoverTable, own_grounds, table_named
-from shared_map.terrain.importers.rasters import opened
+from shared_map.terrain.importers.rasters import opened, thinned
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 
@@ -82,13 +83,10 @@ def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> Meaning | None
 
 def sampled_codes(dataset: Any, what: str) -> NDArray[Any]:
     """Values of some cells, (cells,), as stored, no-data left out. Raises TerrainError if they are not whole."""
-    from rasterio.enums import Resampling
-
     kind = np.dtype(dataset.dtypes[0]).kind
-    every = max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0)
-    shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
-    values: NDArray[Any] = dataset.read(1, out_shape=shape, resampling=Resampling.nearest)
-    values = values[dataset.read_masks(1, out_shape=shape, resampling=Resampling.nearest) > 0]
+    every = math.ceil(max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0))
+    values = thinned(dataset.read, dataset, 1, every)
+    values = values[thinned(dataset.read_masks, dataset, 1, every) > 0]
     if kind == "f":
         values = values[np.isfinite(values)]
     if kind not in "iuf" or (kind == "f" and (values % 1 != 0).any()):
@@ -108,7 +106,6 @@ def sampled_colours(dataset: Any) -> NDArray[np.int32]:
 
     None of an image that has too many colours for a drawing in its middle: a photo is not read twice.
     """
-    from rasterio.enums import Resampling
     from rasterio.windows import Window
 
     none = np.zeros(0, np.int32)
@@ -118,10 +115,9 @@ def sampled_colours(dataset: Any) -> NDArray[np.int32]:
     middle = Window((dataset.width - cols) // 2, (dataset.height - rows) // 2, cols, rows)
     if np.unique(joined(dataset.read((1, 2, 3), window=middle))).size > MOST_COLOURS:
         return none
-    every = max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0)
-    shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
-    rgb = dataset.read((1, 2, 3), out_shape=(3, *shape), resampling=Resampling.nearest)
-    shown: Bools = dataset.dataset_mask(out_shape=shape, resampling=Resampling.nearest) > 0
+    every = math.ceil(max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0))
+    rgb = thinned(dataset.read, dataset, (1, 2, 3), every)
+    shown: Bools = thinned(lambda _, **window: dataset.dataset_mask(**window), dataset, None, every) > 0
     return joined(rgb)[shown]
 
 

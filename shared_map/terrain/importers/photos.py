@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
 from shared_map.terrain.importers.georeference import bounds_in, crs_name, crs_of, resampling
-from shared_map.terrain.importers.rasters import opened
+from shared_map.terrain.importers.rasters import opened, thinned
 from shared_map.terrain.importers.true_colour import MOST_SIDE, why_drawn
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
@@ -238,8 +238,8 @@ def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float,
     """Darkest and brightest of a photo that is not in bytes; (0, 0) for bytes."""
     if all(dataset.dtypes[index - 1] == "uint8" for index in indexes):
         return 0.0, 0.0
-    shape = (len(indexes), min(dataset.height, 512), min(dataset.width, 512))
-    sample = dataset.read(indexes, out_shape=shape).astype(np.float64)
+    every = -(-max(dataset.height, dataset.width) // 512)
+    sample = thinned(dataset.read, dataset, indexes, every).astype(np.float64)
     sample = sample[np.isfinite(sample) & (sample != (0 if dataset.nodata is None else dataset.nodata))]
     if sample.size == 0:
         return 0.0, 1.0

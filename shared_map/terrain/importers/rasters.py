@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -237,14 +237,25 @@ def _plain_unit(text: str) -> str:
 def _sampled(dataset: Any) -> Floats:
     """The first band, or of a large one so many of its cells as fit, float32, as stored; NaN where no height is
     declared."""
-    from rasterio.enums import Resampling
-
-    every = math.sqrt(max(dataset.height * dataset.width / MOST_SAMPLED, 1.0))
-    shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
-    known = dataset.read_masks(1, out_shape=shape, resampling=Resampling.nearest) > 0
-    sample: Floats = dataset.read(1, out_shape=shape, resampling=Resampling.nearest).astype(np.float32)
+    every = math.ceil(math.sqrt(max(dataset.height * dataset.width / MOST_SAMPLED, 1.0)))
+    sample: Floats = thinned(dataset.read, dataset, 1, every).astype(np.float32)
+    known = thinned(dataset.read_masks, dataset, 1, every) > 0
     sample[~(known & np.isfinite(sample))] = np.nan
     return sample
+
+
+def thinned(read: Callable[..., NDArray[Any]], dataset: Any, bands_read: Any, every: int) -> NDArray[Any]:
+    """Every so many rows and columns of what `read` gives of a dataset. GDAL's own way to read fewer cells unpacks
+    a tile again and again: 6 s for a band of 4096 x 4096 that takes 0.1 s as a whole."""
+    from rasterio.windows import Window
+
+    if every == 1:
+        return np.asarray(read(bands_read))
+    parts = []
+    for row0, row1 in bands(dataset.height, every * max(_READ_ROWS // every, 1)):
+        window = Window(0, row0, dataset.width, row1 - row0)
+        parts.append(read(bands_read, window=window)[..., ::every, ::every].copy())
+    return np.concatenate(parts, axis=-2)
 
 
 def _heights_without(dataset: Any, voids: Sequence[float], path: Path) -> Floats:

@@ -59,8 +59,6 @@ def test_the_shadows_of_the_ridges_do_not_become_water(davos: tuple[Source, Labe
     classes = by_rules(source.photo, source.elevation_m, 10.0)
     assert (classes[95:150, 130:330] == TerrainClass.WATER).sum() == 0
     assert (classes[220:300, 0:210] == TerrainClass.WATER).sum() == 0
-    # The heights show a pond there, which is too dark for the rules.
-    assert (source.classes[145:153, 161:167] == TerrainClass.WATER).mean() > 0.7
 
 
 def test_rules_agree_with_the_labels_of_davos(davos: tuple[Source, Labels]) -> None:
