@@ -333,6 +333,7 @@ _mount(
 )
 _mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swarm terrain --help`.")
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
+_mount("report", "launch_scripts.commands.report", "What runs have left. See `swarm report --help`.")
 _mount("zone", "launch_scripts.commands.zone", "Close areas while the swarm runs. See `swarm zone --help`.")
 _mount("target", "launch_scripts.commands.target", "Add, move and remove targets. See `swarm target --help`.")
 _mount("vehicle", "launch_scripts.commands.guests", "Add, remove and stop vehicles. See `swarm vehicle --help`.")

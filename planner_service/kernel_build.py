@@ -1,9 +1,10 @@
 """Compiling kernels: what a first route needs before the rest, by several processes, into numba's cache on disk.
 
-    python -m planner_service.kernel_build
+    python -m planner_service.kernel_build [--directed]
 
-is one builder. Any number of them, started by whomever, share the work: each claims a kernel by a lock on a file
-beside numba's, compiles it and writes it there, where planners find it. A builder that dies leaves its claim.
+is one builder, for maps where uphill is not downhill or, without the option, for the others. Any number of them,
+started by whomever, share the work: each claims a kernel by a lock on a file beside numba's, compiles it and writes
+it there, where planners find it. A builder that dies leaves its claim.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from planner_service.kernels import (
     bucket_queue,
     cell_costs,
     corridor_growth,
+    directed_buckets,
     directed_growth,
     lower_bounds,
     parents,
@@ -31,16 +33,16 @@ from planner_service.kernels import (
     repair,
     route_walk,
 )
-from planner_service.kernels.compile import cache_folder, is_loaded, is_on_disk, load
+from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
 Kernel = Any
 """What `kernels.compile.kernel` makes; numba has no types."""
 
-FIRST: tuple[Kernel, ...] = (
+FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
-    bucket_queue.grow_by_buckets,
+    StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    radix_heap.grow_by_radix_heap,
+    StepKernel(radix_heap.grow_by_radix_heap, directed_growth.grow_directed),
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
@@ -52,7 +54,7 @@ FIRST: tuple[Kernel, ...] = (
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
 takes longest comes first, so that builders end together."""
 
-LATER: tuple[Kernel, ...] = (
+LATER: tuple[Kernel | StepKernel, ...] = (
     repair.repair,
     corridor_growth.grow_corridors,
     lower_bounds.bound_by_heuristic,
@@ -65,17 +67,31 @@ LATER: tuple[Kernel, ...] = (
 )
 """For windows, repairs and corridors, which save growing whole trees."""
 
-DIRECTED: tuple[Kernel, ...] = (directed_growth.grow_directed,)
-"""To grow trees where uphill is not downhill."""
-
 _POLL_S = 0.1
 _BUILDERS = "builders.lock"
 """Each builder holds this lock shared, so that others see that one is at work."""
 
 
-def first_kernels(directed: bool) -> tuple[Kernel, ...]:
+def first_kernels(directed: bool) -> list[Kernel]:
     """What a planner's first route takes. directed: its terrain is one where uphill is not downhill."""
-    return (*DIRECTED, *FIRST) if directed else FIRST
+    return _of_kind(FIRST, directed)
+
+
+def later_kernels(directed: bool) -> list[Kernel]:
+    """What a planner takes beside these."""
+    return _of_kind(LATER, directed)
+
+
+def all_kernels() -> list[Kernel]:
+    """Of both kinds of map, each once: those that are asked for more often come first."""
+    every = [kernel for directed in (False, True) for part in (FIRST, LATER) for kernel in _of_kind(part, directed)]
+    return list({name_of(kernel): kernel for kernel in every}.values())
+
+
+def _of_kind(kernels: Iterable[Kernel | StepKernel], directed: bool) -> list[Kernel]:
+    return [
+        (each.directed if directed else each.alike) if isinstance(each, StepKernel) else each for each in kernels
+    ]
 
 
 def name_of(kernel: Kernel) -> str:
@@ -96,14 +112,14 @@ def can_build() -> bool:
 def load_what_is_there() -> None:
     """Make ready what is on disk; or all, compiled here, where nothing can be kept."""
     if can_build():
-        missing((*FIRST, *LATER, *DIRECTED))
+        missing(all_kernels())
     else:
         load_all()
 
 
-def load_all() -> None:
-    """Make all kernels ready in this process, compiling them here where they are not on disk."""
-    for kernel in (*FIRST, *LATER, *DIRECTED):
+def load_all(directed: bool = False) -> None:
+    """Make all kernels for one kind of map ready in this process, compiled here where they are not on disk."""
+    for kernel in (*first_kernels(directed), *later_kernels(directed)):
         load(kernel)
 
 
@@ -155,9 +171,10 @@ class KernelLoader:
 
     def __init__(self, directed: bool, whole: bool) -> None:
         first = first_kernels(directed)
-        self._kernels = (*first, *LATER)
+        self._directed = directed
+        self._kernels = [*first, *later_kernels(directed)]
         self._first = self._kernels if whole else first
-        self._missing = self._kernels
+        self._missing = list(self._kernels)
         self._asked_s = -math.inf
         self.builders: list[subprocess.Popen[bytes]] = []
         """Those that were started because nobody was compiling."""
@@ -172,7 +189,7 @@ class KernelLoader:
         """Wait until a first route can be planned; what comes after it is loaded as it is there. `tell` is handed a
         sentence now and then."""
         if not can_build():
-            load_all()
+            load_all(self._directed)
         began_s = told_s = time.monotonic()
         while waiting := missing(self._first):
             self._have_built()
@@ -181,7 +198,7 @@ class KernelLoader:
                 told_s = now_s
                 tell(f"compiling kernels: {len(waiting)} of {len(self._first)} left, {now_s - began_s:.0f} s")
             time.sleep(_POLL_S)
-        self._missing = tuple(missing(self._kernels))
+        self._missing = missing(self._kernels)
         if self._missing:
             self._thread.start()
 
@@ -194,21 +211,22 @@ class KernelLoader:
         while self._missing:
             self._have_built()
             time.sleep(5 * _POLL_S)
-            self._missing = tuple(missing(self._missing))
+            self._missing = missing(self._missing)
 
     def _have_built(self) -> None:
         """See to it that somebody compiles what is missing."""
         now_s = time.monotonic()
         if now_s - self._asked_s > 20.0 and not is_building():
             self._asked_s = now_s
-            command = [sys.executable, "-m", "planner_service.kernel_build"]
+            command = [sys.executable, "-m", "planner_service.kernel_build", *["--directed"] * self._directed]
             self.builders = [subprocess.Popen(command) for _ in range(min(len(os.sched_getaffinity(0)), 8))]
 
 
 def main() -> None:
-    """Compile all kernels, those of a first route before the others."""
+    """Compile all kernels for one kind of map, those of a first route before the others."""
     os.nice(5)
-    build([kernel for kernel in (*FIRST, *LATER, *DIRECTED) if not is_loaded(kernel)])
+    directed = "--directed" in sys.argv[1:]
+    build([each for each in (*first_kernels(directed), *later_kernels(directed)) if not is_loaded(each)])
 
 
 if __name__ == "__main__":

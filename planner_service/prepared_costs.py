@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.tree import corridors
-from planner_service.tree.directed_cost_grid import cost_grid_of
+from planner_service.tree.cost_grid import CostGrid
 from shared_map import arrays
 from shared_map.arrays import Floats, open_array, private_copy, save_array
 from shared_map.source_digest import source_digest
@@ -37,7 +37,7 @@ class PreparedCosts:
     """
 
     def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig, kept: str | None = None) -> None:
-        cost_grid = cost_grid_of(terrain.grid, config, terrain.climb)
+        cost_grid = CostGrid(terrain.grid, config, terrain.climb)
         of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.terms}"
         of_ways = f"{of_costs} {cost_grid.rule} {cost_grid.corners} {corridors.LEAST} {corridors.SAMPLES}"
         self._size = cost_grid.size

@@ -202,5 +202,5 @@ def _checked(row: object) -> StrategyRow:
 
 
 def whole_trees_only(row: StrategyRow) -> StrategyRow:
-    """A row where uphill is not downhill, or other kernels are not compiled yet: only whole trees are grown."""
+    """A row until other kernels are compiled: only whole trees are grown."""
     return replace(STAGES["exact"], renews_loose_bounds=row.renews_loose_bounds)

@@ -27,9 +27,8 @@ from planner_service.strategy import (
 )
 from planner_service.tree.bounds import LowerBounds
 from planner_service.tree.corridors import CorridorGraph, CorridorSearch, CorridorShelf, CorridorUpkeep
-from planner_service.tree.cost_grid import Changes
+from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.directed_cost_grid import cost_grid_of
 from planner_service.tree.route_reading import read_routes
 from planner_service.tree.windows import AHEAD, WindowSchedule, block_half
 from planner_service.update import Update
@@ -90,7 +89,7 @@ class TargetTree:
         self._side = max(grid.rows, grid.cols)
         self._has_worker = has_worker
         # The cell costs of the map as it was last told, and whether it was told at all.
-        self._costs = cost_grid_of(grid, config, climb)
+        self._costs = CostGrid(grid, config, climb)
         self._loaded = False
         self._tree = CostToGoTree(self._costs)
         # The tree is of no use and must be grown: before the first, and when the map changed without a target.
@@ -119,8 +118,7 @@ class TargetTree:
     @property
     def strategy(self) -> StrategyRow:
         """The row in force now; it changes with `observe_full_ns`, as under `auto`."""
-        only_whole = self._costs.directed or not self._all_kernels()
-        return whole_trees_only(self._row) if only_whole else self._row
+        return self._row if self._all_kernels() else whole_trees_only(self._row)
 
     def set_budget(self, cpu_budget: float) -> None:
         """The share of one core that this tree may take from now on, under `auto`."""

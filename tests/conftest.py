@@ -1,4 +1,5 @@
-"""Order of the tests: those of the network last. `--seeds` lets tests that replay seeded histories run others."""
+"""Order of the tests: those of the network last. `--seeds` lets tests that replay seeded histories run others;
+`--thorough` adds those of which the others show enough for each commit."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import pytest
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--seeds", metavar="A:B", help="these histories instead of the ones that tests name")
+    parser.addoption("--thorough", action="store_true", help="also the tests marked thorough")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -19,5 +21,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("seed", range(int(first), int(end)))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    left = [] if config.getoption("--thorough") else [each for each in items if each.get_closest_marker("thorough")]
+    if left:
+        config.hook.pytest_deselected(items=left)
+        items[:] = [each for each in items if each not in set(left)]
     items.sort(key=lambda item: item.get_closest_marker("network") is not None)

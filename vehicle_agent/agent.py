@@ -92,7 +92,8 @@ class Agent:
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
         grid, pace = local_map.grid, local_map.pace
-        self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.bodies)
+        climb = local_map.climb
+        self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.bodies, climb)
         self._wishes = Wishes(
             grid,
             self._steering,

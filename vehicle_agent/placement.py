@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import CellsOf, private_copy
 from shared_map.terrain.homes import homes_of
+from shared_map.terrain.places import MapFrame
 from swarm.config.agents import AddedAgent, plan_agents
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
+from swarm.places import cell_of, written
 
 _STREAM = 77
 """Stream of the scenario's seed: terrain and targets draw from others."""
@@ -67,9 +69,7 @@ def entry_cells(added: AddedAgent, grid: GridSpec, homes: NDArray[np.bool_], see
     tries = min(_TRIES * added.plan.count, len(free))
     if added.at is None:
         return [int(cell) for cell in np.random.default_rng([seed, _STREAM]).choice(free, tries, replace=False)]
-    row, col = added.at
-    if not grid.inside(row, col):
-        raise ConfigError(f"cell [{row}, {col}] is outside the terrain of {grid.rows} x {grid.cols} cells")
+    row, col = grid.row_col(cell_of(added.at, MapFrame(grid), "--at"))
     apart = np.hypot(free // grid.cols - row, free % grid.cols - col)
     return [int(cell) for cell in free[np.argsort(apart, kind="stable")[:tries]]]
 
@@ -91,13 +91,14 @@ def _explicit_cells(
     if len(group.cells) > group.vehicles:
         raise ConfigError(f"groups: {group.name}: {len(group.cells)} cells for {group.vehicles} vehicles")
     cells = []
-    for row, col in group.cells:
-        if not grid.inside(row, col):
-            shape = f"{grid.rows} x {grid.cols}"
-            raise ConfigError(f"groups: {group.name}: cell [{row}, {col}] is outside the terrain of {shape} cells")
+    frame = MapFrame(grid)
+    for place in group.cells:
+        cell = cell_of(place, frame, f"groups: {group.name}: cell")
+        row, col = grid.row_col(cell)
         if not (np.isfinite(prior[row, col]) and np.isfinite(truth[row, col])):
-            raise ConfigError(f"groups: {group.name}: cell [{row}, {col}] is lethal; choose a passable cell")
-        cells.append(grid.cell(row, col))
+            lethal = written(frame, cell)
+            raise ConfigError(f"groups: {group.name}: cell {lethal} is lethal; choose a passable cell")
+        cells.append(cell)
     return cells
 
 

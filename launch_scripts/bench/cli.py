@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typing
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -219,7 +220,7 @@ def directed(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """A full tree where uphill is not downhill (cost.directional), beside one where it is."""
+    """Trees, windows and repairs where uphill is not downhill (cost.directional), beside those where it is."""
     from launch_scripts.bench.planning.directed import run
 
     show(run(numbers_of(sizes, "sizes", 16), repeats, seed), as_json)
@@ -260,6 +261,32 @@ def terrain(
     with progress_of("terrain") as progress:
         report = run(size, repeats, degrees=degrees, progress=progress)
     show(report, as_json)
+
+
+@app.command()
+def water(
+    dem: Annotated[Path | None, typer.Option(help="A height model of your own instead of the made ones.")] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="What its cells are, as `swarm terrain classify --out` writes it: 0 not known, 1 water."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """How much water is taken for ground, and dry ground for water, where only heights are known.
+
+    \b
+    swarm bench water
+    swarm bench water --dem dem.tif --truth classes.tif
+
+    The made models have coasts, lakes, reservoirs, rivers and deltas as surveys
+    store them: levelled, rounded, warped, packed, and rough by a laser; and dry
+    ground that is as level. Columns "off shore" leave out cells at a shore.
+    """
+    from launch_scripts.bench.water import run, run_on, tables
+
+    if (dem is None) != (truth is None):
+        raise ConfigError("--dem and --truth: found one of them, expected both or none")
+    show(run() if dem is None or truth is None else run_on(dem, truth), as_json, tables)
 
 
 @app.command()

@@ -35,16 +35,23 @@ def add(
         str,
         typer.Option("--id", help="Name of the agent that hosts them; if not given, added0 or the next free one."),
     ] = "",
-    at: Annotated[str | None, typer.Option(help="ROW,COL near which they enter; anywhere if not given.")] = None,
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="PLACE", help="LAT,LON, xy:X,Y or cell:ROW,COL near which they enter; else anywhere."),
+    ] = None,
 ) -> None:
     """Drive more vehicles in a running swarm, until all have left or this is stopped.
 
     They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If this is
     killed they stay where they are; the same command finds them again.
 
-    swarm vehicle add my.toml --group all --count 5 --at 40,200
+    swarm vehicle add my.toml --group all --count 5 --at 36.41,-84.29
     """
-    run_role("agent", id, part, tls, joins=Joins(group, count, _cell_of(at)))
+    from swarm.places import read_place
+
+    if at is not None:
+        read_place(at, "--at")
+    run_role("agent", id, part, tls, joins=Joins(group, count, at))
 
 
 @app.command()
@@ -158,14 +165,3 @@ def _remove(bus: Bus, agent: str, vehicles: list[str]) -> Removed:
     if said is None:
         raise BusError(f"agent {agent} does not answer")
     return said
-
-
-def _cell_of(at: str | None) -> tuple[int, int] | None:
-    from swarm.errors import ConfigError
-
-    if at is None:
-        return None
-    parts = at.split(",")
-    if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
-        raise ConfigError(f"--at {at}: expected ROW,COL, two numbers of cells from the north-west corner")
-    return int(parts[0]), int(parts[1])

@@ -10,11 +10,14 @@ from typing import Annotated
 import typer
 
 from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.report.geo_layers import Layer, mark_layer, write_layers
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.places import MapFrame
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
+from swarm.places import extent_of, fields_of, written
 from swarm.wire.messages.marks import MarkSet
 
 app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is_help=True)
@@ -22,6 +25,7 @@ app = typer.Typer(help="Look at shared maps and the keeper's store.", no_args_is
 Store = Annotated[Path, typer.Argument(help="A keeper's store, such as runs/LAST/map.sqlite; it may be in use.")]
 _TEXT = (".json",)
 _PIXELS = (".tif", ".tiff")
+_SHAPES = (".geojson", ".gpkg")
 
 
 def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
@@ -42,6 +46,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         authors.setdefault(each.author, []).append(each)
     with KeeperStore(store, read_only=True) as kept:
         seen = kept.sightings()
+    frame = MapFrame(grid)
     found = {
         "store": str(store),
         "terrain": terrain,
@@ -62,6 +67,7 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         "sightings": {
             each.target: {
                 "row_col": list(divmod(each.cell, grid.cols)),
+                "at": fields_of(frame, each.cell),
                 "uncertainty_m": each.uncertainty_m,
                 "author": each.author,
                 "stamp_ns": each.stamp_ns,
@@ -74,19 +80,23 @@ def inspect(store: Store, as_json: AsJson = False) -> None:
         print(json.dumps(found, indent=2))
         return
     print(f"{store}: terrain {terrain}, {grid.rows} x {grid.cols} cells of {grid.resolution_m:g} m")
+    if grid.crs != "local":
+        print(f"it lies at {extent_of(frame, 'latlon')}")
     print(f"{found['marks']} marks in {len(sets)} sets; {found['cells_with_marks']} cells marked, "
           f"{found['cells_lethal']} of them lethal")  # fmt: skip
     for author, of in sorted(authors.items()):
         print(f"  {author:40} {sum(len(each.kinds) for each in of):7} marks in {len(of):5} tiles")
     for sighted in seen:
-        row, col = divmod(sighted.cell, grid.cols)
-        where = f"row {row}, col {col}, within {sighted.uncertainty_m:.0f} m"
+        where = f"{written(frame, sighted.cell)}, within {sighted.uncertainty_m:.0f} m"
         print(f"  target {sighted.target} was last seen at {where}, by {sighted.author}")
 
 
 @app.command()
-def export(store: Store, out: Annotated[Path, typer.Argument(help=".json: every set; .tif: the winners.")]) -> None:
-    """Write the marks of a store as JSON, which can be imported again, or as a GeoTIFF of pace and kind."""
+def export(
+    store: Store,
+    out: Annotated[Path, typer.Argument(help=".json: every set; .tif, .gpkg, .geojson: the winners.")],
+) -> None:
+    """Write the marks of a store: all of them as JSON, which can be imported; the winners as pixels or polygons."""
     terrain, grid, sets = _read(store)
     kind_of_file = out.suffix.lower()
     try:
@@ -94,11 +104,24 @@ def export(store: Store, out: Annotated[Path, typer.Argument(help=".json: every 
             out.write_text(stored_marks.to_json(terrain, grid, sets), encoding="utf-8")
         elif kind_of_file in _PIXELS:
             _write_tiff(out, terrain, grid, sets)
+        elif kind_of_file in _SHAPES:
+            write_layers(out, [_layer(grid, sets)], MapFrame(grid))
         else:
-            raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS)}")
+            raise StoreError(f"{out}: the name must end in {', '.join(_TEXT + _PIXELS + _SHAPES)}")
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
     print(f"{out}: {sum(len(each.kinds) for each in sets)} marks in {len(sets)} sets")
+
+
+def marks_of(store: Path) -> tuple[GridSpec, Layer]:
+    """The grid of a store, and its winning marks as polygons."""
+    _, grid, sets = _read(store)
+    return grid, _layer(grid, sets)
+
+
+def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:
+    pace, kind, stamps_ns = stored_marks.to_cells(grid, sets, time.time_ns())
+    return mark_layer(grid, kind, pace, stamps_ns)
 
 
 @app.command("import")

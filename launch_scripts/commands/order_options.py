@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from launch_scripts.commands.query import Where
     from launch_scripts.commands.shared_options import Tls
     from swarm.orders import Acknowledged
+    from swarm.places import Place
     from swarm.wire.messages.base import Message
     from swarm.wire.messages.orders import GiveOrder
 
@@ -31,24 +32,37 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
         raise ConfigError(f"the order is not possible: {field_fault(error, given)}") from None
 
 
-def give(orders: list[GiveOrder], where: Where, tls: Tls, as_json: bool) -> None:
-    """Give orders, one after the other, and print who obeys. Exit code 1 if somebody has not said so."""
+def give(orders: list[GiveOrder], where: Where, tls: Tls, as_json: bool, at: Place | None = None) -> None:
+    """Give orders, one after the other, and print who obeys. Exit code 1 if somebody has not said so.
+
+    at  the place that they are about, if any: becomes their `cell`
+    """
     import msgspec
 
+    from launch_scripts.commands.run_frame import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
     from swarm.orders import Operator
+    from swarm.places import cell_of, fields_of, written
 
     silent = False
     printed: list[dict[str, Any]] = []
     with open_bus(where.network(tls)) as bus:
         operator = Operator(bus)
+        frame = None if at is None else frame_of_run(bus, where)
+        cell = None if at is None or frame is None else cell_of(at, frame, "--at")
         for order in orders:
+            if cell is not None:
+                order = msgspec.structs.replace(order, cell=cell)
             given, acknowledged = operator.give(order)
             silent = silent or bool(acknowledged.silent)
             if as_json:
-                fields = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
+                fields: dict[str, Any] = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
+                if frame is not None and cell is not None:
+                    fields["at"] = fields_of(frame, cell)
                 printed.append({"given": msgspec.to_builtins(given), **fields})
             else:
+                if frame is not None and cell is not None:
+                    typer.echo(f"{order.subject} {order.name} is put at {written(frame, cell)}")
                 print_obeyed(acknowledged)
     if as_json:
         typer.echo(json.dumps(printed[0] if len(printed) == 1 else printed, indent=2))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -12,18 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.commands.shared_options import AsJson, Tls, spread
+from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, spread
+from swarm.places import extent_of, fields_of, written
 
 if TYPE_CHECKING:
+    from shared_map.terrain.places import MapFrame
     from swarm.config.scenario import NetworkConfig
-    from swarm.wire.messages.planning import CostReply, PlannerStatus, RouteReply
+    from swarm.wire.messages.planning import PlannerStatus
     from swarm.wire.messages.processes import RunInfo, Stats
 
 app = typer.Typer()
 
 _PANEL = "Ask a running swarm"
 _CONNECT_S = 3.0
-_ROUTE_TIMEOUT_S = 5.0
 _STATUS_LISTEN_S = 1.5
 
 
@@ -63,150 +63,89 @@ def route(
         str | None, typer.Option(help="Without a swarm: on this terrain file, scenario or built-in scenario.")
     ] = None,
     start: Annotated[
-        str | None, typer.Option("--from", help="With --terrain: LAT,LON, xy:X,Y in metres or cell:ROW,COL.")
+        str | None,
+        typer.Option(
+            "--from", metavar="PLACE", help="LAT,LON, xy:X,Y in metres or cell:ROW,COL; instead of --row and --col."
+        ),
     ] = None,
-    end: Annotated[str | None, typer.Option("--to", help="With --terrain: where to, as --from.")] = None,
-    out: Annotated[Path | None, typer.Option(help="With --terrain: write .geojson, .gpx, .kml or .csv.")] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", metavar="PLACE", help="With --terrain: where to, as --from.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Write .geojson, .gpx, .kml or .csv; with --terrain also .png, a picture.")
+    ] = None,
+    preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
-    """Ask a planner for the cheapest route from a cell to its target; or find one on a terrain, without a swarm.
+    """Ask a planner for the cheapest route from a place to its target; or find one on a terrain, without a swarm.
 
     swarm route --target t3 --row 40 --col 200
 
-    swarm route --target t3 --row 40 --col 200 --steps 1
+    swarm route --target t3 --from 36.41,-84.29 --steps 1
 
     swarm route --target t3 --row 40 --col 200 --json | jq .routes[0].cost_s
 
-    swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --out way.gpx
+    swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --preset hiker --out way.gpx
     """
+    from launch_scripts.commands.route_files import check_route_file
     from swarm.errors import ConfigError
+    from swarm.places import read_place
 
     if terrain is not None:
         if start is None or end is None or target is not None or row is not None or col is not None:
             raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
-        _route_on_terrain(terrain, start, end, out, as_json)
+        check_route_file(out)
+        _route_on_terrain(terrain, start, end, preset, out, as_json)
         return
-    if target is None or row is None or col is None or start is not None or end is not None or out is not None:
-        raise ConfigError("give --target, --row and --col to ask a swarm, or --terrain, --from and --to")
-    from swarm.bus.bus import AskEnded, Replied
-    from swarm.bus.zenoh_bus import open_bus
-    from swarm.errors import BusError
-    from swarm.runtime.inbox import Inbox
-    from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
-    from swarm.wire.readable import encode_readable
-    from swarm.wire.topics import COST, ROUTE
+    if preset is not None:
+        raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
+    by_cell = row is not None and col is not None
+    if target is None or (start is None) == (not by_cell) or end is not None or (cost and out is not None):
+        raise ConfigError(
+            "give --target, --row and --col (or --from) to ask a swarm, or --terrain, --from and --to without one"
+        )
+    check_route_file(out)
+    place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
+    from launch_scripts.commands import swarm_route
 
-    network = where.network(tls)
-    inbox = Inbox()
-    reply: RouteReply | CostReply | None = None
-    failure: str | None = None
-    began_s = time.monotonic()
-    with open_bus(network) as bus:
-        topic = COST if cost else ROUTE
-        request = CostRequest(row=row, col=col) if cost else RouteRequest(row=row, col=col, max_cells=steps)
-        bus.ask(topic, request, inbox.post, tag="route", timeout_s=_ROUTE_TIMEOUT_S, target=target)
-        while time.monotonic() < began_s + _ROUTE_TIMEOUT_S + 2.0:
-            match inbox.take(0.5):
-                case Replied(message=(RouteReply() | CostReply()) as found):
-                    reply = found
-                case AskEnded(failure=failure):
-                    break
-        took_ms = (time.monotonic() - began_s) * 1e3
-    if reply is None:
-        if failure is not None and failure != "timeout":
-            raise ConfigError(failure)
-        raise BusError(f"no planner of target {target!r} answers {where}")
+    answer = swarm_route.ask_planner(where.network(tls), where, target, place, cost=cost, steps=steps)
+    if out is not None:
+        swarm_route.write(answer, out)
     if as_json:
-        typer.echo(encode_readable(reply).decode())
-        return
-    if isinstance(reply, CostReply):
-        _print_cost(reply, row, col)
+        typer.echo(swarm_route.as_json(answer))
     else:
-        _print_route(reply, took_ms)
+        swarm_route.show(answer)
 
 
-def _route_on_terrain(terrain: str, start: str, end: str, out: Path | None, as_json: bool) -> None:
-    from launch_scripts.commands.route_on_terrain import find_route, profile_of, write_route
+def _route_on_terrain(
+    terrain: str, start: str, end: str, preset: str | None, out: Path | None, as_json: bool
+) -> None:
+    from launch_scripts.commands.route_files import profile_of, write_route
+    from launch_scripts.commands.route_on_terrain import find_route
+    from shared_map.terrain.places import MapFrame
+    from swarm.places import written
 
-    found = find_route(terrain, start, end)
+    found = find_route(terrain, start, end, preset)
     if out is not None:
         write_route(found, out)
     facts = found.facts()
     if as_json:
         typer.echo(json.dumps(facts))
         return
-    above, climbed = max(found.found.gap - 1, 0), f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
+    frame = MapFrame(found.grid)
+    typer.echo(f"from {written(frame, int(found.cells[0]))}")
+    typer.echo(f"to {written(frame, int(found.cells[-1]))}")
+    above, climbed = max(found.gap - 1, 0), f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
     typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} cells")
     typer.echo(f"proven to be at most {above:.2%} above the optimum")
     typer.echo(profile_of(found))
-
-
-def _print_cost(reply: CostReply, row: int, col: int) -> None:
-    from swarm.wire.fields import column
-
-    cost_s = float(column(reply.cost_to_go_s, "<f4")[0])
-    if reply.target_cell is None:
-        typer.echo("no_target: the planner does not know where its target is")
-    elif math.isfinite(cost_s):
-        typer.echo(f"from row {row}, col {col} to {reply.target} in {cost_s:.1f} s")
-        _print_pose(reply)
-    else:
-        typer.echo(
-            f"unreachable: row {row}, col {col} has no way to {reply.target}, is lethal or outside of the terrain"
-        )
-
-
-def _print_route(reply: RouteReply, took_ms: float) -> None:
-    from swarm.wire.routes import RouteStatus
-
-    (found,) = reply.routes
-    row, col = divmod(found.start, reply.cols) if found.start >= 0 else (None, None)
-    if found.status is not RouteStatus.OK:
-        meaning = {
-            RouteStatus.UNREACHABLE: "there is no way from there",
-            RouteStatus.OUTSIDE: f"the cell is outside the terrain of {reply.rows} x {reply.cols} cells",
-            RouteStatus.LETHAL_START: "the cell is lethal, no vehicle can stand on it",
-            RouteStatus.NO_TARGET: "the planner does not know where its target is",
-        }[found.status]
-        typer.echo(f"{found.status.value}: {meaning}")
-        return
-    gap = f"proven within {100 * (found.gap - 1):.2f} % of the best" if math.isfinite(found.gap) else "gap unknown"
-    typer.echo(f"from row {row}, col {col} to {reply.target} in {found.cost_s:.1f} s, {gap}")
-    rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
-    many = len(found.directions)
-    typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
-    typer.echo(
-        f"tree {reply.tree_age_ms:.0f} ms old, map version {reply.map_version}, answered in {took_ms:.1f} ms"
-    )
-    _print_pose(reply)
-
-
-def _print_pose(reply: RouteReply | CostReply) -> None:
-    """Say how old the pose is that the answer goes by."""
-    if reply.pose_age_s is None:
-        return
-    if reply.tracker_lost:
-        where = f"{reply.target} is lost: nobody tracks it, and this is where it was {reply.pose_age_s:.1f} s ago"
-        typer.secho(where, fg="yellow")
-    else:
-        typer.echo(f"pose {reply.pose_age_s:.1f} s old")
-
-
-def _strides(directions: bytes) -> str:
-    """Runs of equal steps: 12 N, 3 NE, ..."""
-    from itertools import groupby
-
-    from swarm.wire.readable import COMPASS
-
-    return (
-        ", ".join(f"{len(list(steps))} {COMPASS[code]}" for code, steps in groupby(directions)) or "already there"
-    )
 
 
 @app.command(rich_help_panel=_PANEL)
 @spread
 def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Show who takes part in the running swarm and how the planners are doing."""
+    from launch_scripts.commands.run_frame import frame_of_members
     from launch_scripts.launcher.watcher import ask_run
     from swarm.bus.bus import Heard
     from swarm.bus.zenoh_bus import open_bus
@@ -249,13 +188,14 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     found.sort(key=lambda info: (not info.run_id, info.role, info.id))
     strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
     members = [info for info in found if info not in strangers]
+    frame = frame_of_members(members)
     if as_json:
-        fields = _status_fields(members, stats, planners, leads)
+        fields = _status_fields(members, stats, planners, leads, frame)
         fields["orders"] = book.standing
         fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
         typer.echo(json.dumps(fields, indent=2))
     else:
-        _print_status(members, stats, planners, leads)
+        _print_status(members, stats, planners, leads, frame)
         for ordered in book.standing:
             typer.secho(f"ordered: {ordered}", fg="yellow")
         for info in strangers:
@@ -270,8 +210,16 @@ def _status_fields(
     stats: dict[tuple[str, str], Stats],
     planners: dict[str, PlannerStatus],
     leads: dict[tuple[str, str], bool],
+    frame: MapFrame | None,
 ) -> dict[str, Any]:
     import msgspec
+
+    def planner_fields(planner: PlannerStatus) -> dict[str, Any]:
+        cell = _target_cell(planner, frame)
+        return {
+            **msgspec.to_builtins(planner),
+            "target_at": None if frame is None or cell is None else fields_of(frame, cell),
+        }
 
     return {
         "run_id": members[0].run_id,
@@ -288,8 +236,15 @@ def _status_fields(
             }
             for info in members
         ],
-        "planners": [msgspec.to_builtins(planners[target]) for target in sorted(planners)],
+        "crs": None if frame is None else frame.grid.crs,
+        "planners": [planner_fields(planners[target]) for target in sorted(planners)],
     }
+
+
+def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
+    """Where the planner's target is; None if that is not known, or not on this terrain."""
+    cell = planner.target_cell
+    return cell if frame is not None and cell is not None and 0 <= cell < frame.grid.cells else None
 
 
 def _throttled(stats: dict[tuple[str, str], Stats]) -> list[str]:
@@ -305,6 +260,7 @@ def _print_status(
     stats: dict[tuple[str, str], Stats],
     planners: dict[str, PlannerStatus],
     leads: dict[tuple[str, str], bool],
+    frame: MapFrame | None,
 ) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -316,6 +272,8 @@ def _print_status(
     else:
         run = "no run yet: only routers answer"
     console.print(run, highlight=False)
+    if frame is not None and frame.grid.crs != "local":
+        console.print(f"terrain: {extent_of(frame, 'latlon')}", highlight=False)
     now_ns = time.time_ns()
     crew = Table("process", "up s", "messages out", "in", "dropped", pad_edge=False)
     for info in members:
@@ -350,3 +308,8 @@ def _print_status(
                 style="yellow" if planner.tracker_lost else None,
             )
         console.print(trees)
+        for id, planner in sorted(planners.items()):
+            cell = _target_cell(planner, frame)
+            if frame is not None and cell is not None:
+                was = "was" if planner.tracker_lost else "is"
+                console.print(f"{id} {was} at {written(frame, cell)}", highlight=False, soft_wrap=True)

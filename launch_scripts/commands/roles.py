@@ -50,7 +50,7 @@ class Joins:
 
     group: str
     count: int
-    at: tuple[int, int] | None
+    at: str | None
 
 
 @app.command(rich_help_panel=_PANEL)

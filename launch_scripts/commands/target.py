@@ -12,7 +12,9 @@ from launch_scripts.commands.shared_options import AsJson, Tls, spread
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 Id = Annotated[str, typer.Argument(metavar="ID", help="The target, such as t3.")]
-At = Annotated[str, typer.Option(metavar="ROW,COL", help="Its cell, counted from the north-west corner.")]
+At = Annotated[
+    str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
+]
 
 
 @app.callback()
@@ -33,16 +35,18 @@ def add(
 ) -> None:
     """Add a target. A launcher starts its planner; groups that may chase every target chase it.
 
-    swarm target add x --at 40,200 --walk evade
+    swarm target add x --at 36.41,-84.29 --walk evade
+
+    swarm target add x --at cell:40,200
     """
-    _give({"name": id, "new": True, "walk": walk, "speed_m_per_s": speed, **_place(at)}, where, tls, as_json)
+    _give({"name": id, "new": True, "walk": walk, "speed_m_per_s": speed}, where, tls, as_json, at)
 
 
 @app.command()
 @spread
 def move(id: Id, at: At, where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Put a target somewhere else; it goes on from there."""
-    _give({"name": id, **_place(at)}, where, tls, as_json)
+    _give({"name": id}, where, tls, as_json, at)
 
 
 @app.command()
@@ -52,17 +56,11 @@ def remove(id: Id, where: Where, tls: Tls, as_json: AsJson = False) -> None:
     _give({"name": id, "off": True}, where, tls, as_json)
 
 
-def _give(fields: dict[str, Any], where: Where, tls: Tls, as_json: bool) -> None:
+def _give(fields: dict[str, Any], where: Where, tls: Tls, as_json: bool, at: str | None = None) -> None:
+    from swarm.places import read_place
     from swarm.wire.messages.orders import GiveOrder
 
-    give([checked(GiveOrder, {"subject": "target", **fields})], where, tls, as_json)
-
-
-def _place(at: str) -> dict[str, int]:
-    from swarm.errors import ConfigError
-
-    try:
-        row, col = (int(number) for number in at.split(","))
-    except ValueError:
-        raise ConfigError(f"--at: {at!r} is no cell, expected row and column such as 40,200") from None
-    return {"row": row, "col": col}
+    place = None if at is None else read_place(at, "--at")
+    # The cell is known once the swarm has said where its terrain lies; all else is checked before it is asked.
+    cell = {} if place is None else {"cell": 0}
+    give([checked(GiveOrder, {"subject": "target", **fields, **cell})], where, tls, as_json, at=place)

@@ -13,12 +13,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.commands.shared_options import AsJson, PresetOption
 from launch_scripts.commands.terrain_files import write_geotiff
 from launch_scripts.launcher.progress import progress
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass
-from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.config.cost_rules import cost_of_preset
+from swarm.config.scenario import ElevationEncoding, Scenario, TerrainConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ app = typer.Typer(
     swarm terrain info dem.tif
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain classify dem.tif photo.tif --picture classes.png
+    swarm terrain rules --picture rules.png
     swarm terrain synth --out dem.tif --photo photo.tif
 
     Where to get an elevation model, and the rule for cost: docs/terrain.md.
@@ -55,6 +57,13 @@ Scale = Annotated[
 Fill = Annotated[
     bool, typer.Option("--fill", help="Fill voids from their surroundings instead of forbidding them.")
 ]
+Cover = Annotated[str | None, typer.Option(help="A raster of land-cover codes on the same ground.")]
+CoverCodes = Annotated[
+    str | None, typer.Option(help="What its codes mean: worldcover, corine, corine-level-3, nlcd, or a CSV file.")
+]
+Encoding = Annotated[
+    ElevationEncoding | None, typer.Option(help="What stands for a height, where the file does not show it.")
+]
 _TIFF = (".tif", ".tiff")
 PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
 
@@ -71,10 +80,10 @@ def _check_target(path: Path | None, option: str, *endings: str) -> None:
         raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
 
 
-def _scenario(name: str) -> Scenario:
+def _scenario(name: str, preset: str | None = None) -> Scenario:
     from launch_scripts.launcher.options import find_scenario
 
-    return find_scenario(name)
+    return find_scenario(name, preset)
 
 
 @app.command()
@@ -84,25 +93,32 @@ def info(
     resolution_m: Resolution = None,
     height_scale: Scale = None,
     fill: Fill = False,
+    cover: Cover = None,
+    cover_codes: CoverCodes = None,
+    elevation_encoding: Encoding = None,
+    preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what a terrain file or a scenario holds, and what was done to bring it onto a metric grid.
 
     Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2, .nc, .vrt, one of
-    these in a .zip, .asc, .npz, MovingAI .map, ROS map_server .yaml or .yml,
-    and .png with --resolution-m and --height-scale. The lines after the table
+    these in a .zip, .asc, .npz, .csv and .xyz grids, Terrain-RGB and
+    Terrarium tiles, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map,
+    ROS map_server .yaml or .yml, and .png with --resolution-m and
+    --height-scale. The lines after the table
     say what was done to the file, and what you should know about it; those
     with a ! what looks wrong. Costs are those of the scenario, of a file
-    those of an empty one.
+    those of an empty one or of a preset.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
+    swarm terrain info dem.tif --cover worldcover.tif
     """
     from shared_map.terrain.terrain import build_terrain
     from shared_map.terrain.terrain_report import doubts_about, facts_of
 
     if file.endswith(".toml"):
-        scenario = _scenario(file)
+        scenario = _scenario(file, preset)
     else:
         nodata = "fill" if fill else "lethal"
         raw = {
@@ -111,14 +127,19 @@ def info(
             "resolution_m": resolution_m,
             "height_scale": height_scale,
             "nodata": nodata,
+            "cover": cover,
+            "cover_codes": cover_codes,
+            "elevation_encoding": elevation_encoding,
         }
-        scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig))
+        scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig), cost=cost_of_preset(preset))
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
-    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid)}
+    rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
+    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid), **rule}
     doubts = doubts_about(facts)
     if as_json:
-        console.print_json(json.dumps({**facts, "notes": terrain.notes, "doubts": doubts}))
+        zones = [zone.as_json(terrain.grid.cells) for zone in terrain.zones]
+        console.print_json(json.dumps({**facts, "zones": zones, "notes": terrain.notes, "doubts": doubts}))
         return
     table = Table(show_header=False, box=None)
     for key, value in facts.items():
@@ -148,6 +169,7 @@ def cost(
     ],
     out: Annotated[Path | None, typer.Option(help="Write seconds per metre as GeoTIFF; lethal is -1.")] = None,
     picture: PictureOption = None,
+    preset: PresetOption = None,
 ) -> None:
     """Build the prior cost map of a scenario; write it and a picture of it.
 
@@ -162,7 +184,7 @@ def cost(
 
     _check_target(out, "--out", *_TIFF)
     _check_target(picture, "--picture", ".png")
-    loaded = _scenario(scenario)
+    loaded = _scenario(scenario, preset)
     with progress() as tell:
         started = time.perf_counter()
         terrain = build_terrain(loaded, tell)
@@ -200,6 +222,40 @@ def _print_shares(classes: Bytes) -> None:
     counts = np.bincount(classes.reshape(-1), minlength=max(TerrainClass) + 1)
     shares = [f"{kind.name.lower()} {counts[kind] / classes.size:.1%}" for kind in TerrainClass if counts[kind]]
     console.print("classes: " + ", ".join(shares), highlight=False)
+
+
+@app.command()
+def rules(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(help="A scenario file or the name of a built-in one: show its rule alone, in m/s."),
+    ] = None,
+    picture: PictureOption = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the rules by which slope becomes pace, and the presets of vehicle classes.
+
+    A rule is chosen by cost.slope_rule, a class of vehicles by cost.preset,
+    whose settings stand for those that the scenario does not give.
+
+    swarm terrain rules --picture rules.png
+    swarm terrain rules mine.toml
+    """
+    from launch_scripts.commands import slope_rules
+
+    _check_target(picture, "--picture", ".png")
+    if scenario is None:
+        shown = slope_rules.of_all()
+    else:
+        shown = slope_rules.of_scenario(_scenario(scenario), Path(scenario).stem)
+    if picture is not None:
+        from launch_scripts.commands.slope_picture import draw_rules
+
+        draw_rules(shown, picture)
+    if as_json:
+        console.print_json(json.dumps(shown.facts()))
+        return
+    slope_rules.show(shown, console)
 
 
 @app.command()
@@ -255,38 +311,54 @@ def synth(
 @app.command()
 def reach(
     terrain: Annotated[str, typer.Argument(help="A terrain file, a scenario file or a built-in scenario.")],
-    to: Annotated[str, typer.Option(help="Where to: LAT,LON, xy:X,Y in metres or cell:ROW,COL.")],
+    to: Annotated[str, typer.Option(metavar="PLACE", help="Where to: LAT,LON, xy:X,Y in metres or cell:ROW,COL.")],
+    start: Annotated[
+        str | None,
+        typer.Option("--from", metavar="PLACE", help="Only where good ways from there lead: a corridor."),
+    ] = None,
+    slack: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="With --from: a way may take this share longer than the best.")
+    ] = 0.05,
     out: Annotated[
         Path | None, typer.Option(help="Write .tif (seconds, -1 where there is no way) or .geojson (areas).")
     ] = None,
     every_s: Annotated[
         float, typer.Option(min=0.001, max=1e9, help="How far apart the areas of a .geojson are, in seconds.")
     ] = 600.0,
+    preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
     """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as GeoJSON.
 
-    swarm terrain reach dem.tif --to 46.78,9.87 --out seconds.tif
+    With --from: the corridor of near-optimal ways between two places. Each of
+    its cells has the time of the best way that passes it; the areas of a
+    .geojson are seconds lost against the best way of all.
+
+    swarm terrain reach dem.tif --to 46.78,9.87 --preset hiker --out seconds.tif
     swarm terrain reach mine.toml --to cell:40,200 --out areas.geojson --every-s 300
+    swarm terrain reach dem.tif --from 46.81,9.84 --to 46.78,9.87 --slack 0.1 --out corridor.tif
     """
+    from launch_scripts.commands.reach import corridor, write_reach
     from launch_scripts.commands.reach import reach as reach_of
-    from launch_scripts.commands.reach import write_reach
 
     _check_target(out, "--out", *_TIFF, ".geojson")
-    found = reach_of(terrain, to)
+    found = reach_of(terrain, to, preset) if start is None else corridor(terrain, start, to, slack, preset)
     if out is not None:
         write_reach(found, out, every_s)
     median_s, longest_s = found.quantiles_s()
     if as_json:
         facts = {"share": round(found.share, 4), "median_s": round(median_s, 2), "longest_s": round(longest_s, 2)}
+        if found.fastest_s is not None:
+            facts["fastest_s"] = round(found.fastest_s, 2)
         console.print_json(json.dumps(facts))
         return
-    console.print(
-        f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {longest_s:.0f} s from"
-        " the furthest",
-        highlight=False,
-        soft_wrap=True,
-    )
+    if found.fastest_s is not None:
+        best = f"the best takes {found.fastest_s:.0f} s"
+        said = f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}"
+    else:
+        furthest = f"{longest_s:.0f} s from the furthest"
+        said = f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}"
+    console.print(said, highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -355,18 +427,25 @@ def _compare(terrain: Terrain, path: Path) -> None:
 
 
 def _print_confusion(title: str, counts: Any) -> None:
+    labelled = [kind for kind in TerrainClass if counts[kind].any()]
     present = [kind for kind in TerrainClass if counts[kind].any() or counts[:, kind].any()]
+    unknown = counts[:, TerrainClass.UNKNOWN].sum() / counts.sum()
+    right = np.trace(counts) / counts.sum()
     table = Table(
-        title=f"{title}: {np.trace(counts) / counts.sum():.1%} of the labelled cells", title_justify="left"
+        title=f"{title}: {right:.1%} of the labelled cells, {unknown:.1%} unknown, {1 - right - unknown:.1%} wrong",
+        title_justify="left",
     )
     table.add_column("labelled")
     for kind in present:
         table.add_column(kind.name.lower(), justify="right")
     table.add_column("IoU", justify="right")
-    for kind in present:
+    overlaps = []
+    for kind in labelled:
         union = counts[kind].sum() + counts[:, kind].sum() - counts[kind, kind]
         cells = [str(counts[kind, other]) for other in present]
-        table.add_row(kind.name.lower(), *cells, f"{counts[kind, kind] / union:.2f}")
+        overlaps.append(counts[kind, kind] / union)
+        table.add_row(kind.name.lower(), *cells, f"{overlaps[-1]:.2f}")
+    table.caption = f"mean IoU {np.mean(overlaps):.2f}"
     console.print(table)
 
 

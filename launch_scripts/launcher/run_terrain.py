@@ -14,7 +14,7 @@ from shared_map.keeper.base_map_transfer import Fetching, fetch_base_map
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.terrain import build_truth, load_prepared, save_prepared, scenario_key
 from swarm.bus.zenoh_bus import open_bus
-from swarm.config.load import BUILT_IN_TERRAINS
+from swarm.config.load import BUILT_IN_TERRAINS, COVER_TABLES
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError, TerrainError
@@ -31,8 +31,9 @@ def missing_files(scenario: Scenario) -> list[str]:
     """Files of the terrain which are missing on this machine, and cost layers whose module is."""
     terrain = scenario.terrain
     source = None if terrain.source in BUILT_IN_TERRAINS else terrain.source
-    masks = [zone.mask for zone in scenario.cost.zones]
-    named = [source, terrain.photo, terrain.labels, *masks]
+    zones = [zone.mask or zone.file for zone in scenario.cost.zones]
+    codes = None if terrain.cover_codes in COVER_TABLES else terrain.cover_codes
+    named = [source, terrain.photo, terrain.labels, terrain.cover, codes, *zones]
     layers = [each.name for each in cost_layers_of(scenario) if not source_of(each, scenario.plugin_folder)]
     return [*(name for name in named if name is not None and not Path(name).is_file()), *layers]
 

@@ -140,21 +140,21 @@ def _find_nothing(tell: Connection, _: bool) -> None:
 
 def _find_missing(tell: Connection, directed: bool) -> None:
     """Tell the names of kernels that are not compiled: of those for a first route, and of the others."""
-    from planner_service.kernel_build import LATER, can_build, first_kernels, missing, name_of
+    from planner_service.kernel_build import can_build, first_kernels, later_kernels, missing, name_of
 
     if not can_build():
         tell.send(((), ()))
         return
-    first, later = missing(first_kernels(directed)), missing(LATER)
+    first, later = missing(first_kernels(directed)), missing(later_kernels(directed))
     tell.send((list(map(name_of, first)), list(map(name_of, later))))
 
 
 def _build(tell: Connection, directed: bool) -> None:
     """Compile what is missing, together with the other builders."""
-    from planner_service.kernel_build import LATER, build, first_kernels, name_of
+    from planner_service.kernel_build import build, first_kernels, later_kernels, name_of
 
     threading.Thread(target=_end_with_launcher, daemon=True).start()
-    for kernels, niceness in ((first_kernels(directed), 0), (LATER, _BACKGROUND)):
+    for kernels, niceness in ((first_kernels(directed), 0), (later_kernels(directed), _BACKGROUND)):
         os.nice(niceness)
         build(kernels, lambda kernel: tell.send(name_of(kernel)))
 

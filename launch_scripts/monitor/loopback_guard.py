@@ -48,6 +48,8 @@ class BoundedServer(socketserver.ThreadingTCPServer):
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
+    # Of more that come at once the system forgets the first knock, and they knock again after a second, or seven.
+    request_queue_size = 4 * MOST_CONNECTIONS
     lasts_s = 60.0
 
     def __init__(self, port: int, handler: type[socketserver.BaseRequestHandler]) -> None:

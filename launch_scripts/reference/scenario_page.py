@@ -70,7 +70,17 @@ def schema(root: Section = Scenario) -> str:
         for key, value in definition["properties"].items():
             value["description"] = said[key]
     found = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "terrain-swarm scenario", **found}
-    return json.dumps(found, indent=1) + "\n"
+    return json.dumps(_plain(found), indent=1) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """The value with whole numbers as such. `typing` keeps one of two bounds that are equal, 10000 and 1e4, by
+    which module is imported first."""
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _sections(root: Section) -> list[tuple[str, Section]]:
@@ -82,6 +92,7 @@ def _sections(root: Section) -> list[tuple[str, Section]]:
             if inner is not None and all(inner is not known for _, known in found):
                 several = typing.get_origin(_bare(hint)) is tuple
                 joined = f"{path.strip('[]')}.{key}" if path else key
+                joined += ".NAME" * (typing.get_origin(_bare(hint)) is dict)
                 found.append((f"[[{joined}]]" if several else f"[{joined}]", inner))
     return found
 
@@ -140,6 +151,8 @@ def _struct_in(hint: Any) -> Section | None:
     bare = _bare(hint)
     if typing.get_origin(bare) is tuple:
         bare = _bare(typing.get_args(bare)[0])
+    elif typing.get_origin(bare) is dict:
+        bare = _bare(typing.get_args(bare)[1])
     return bare if isinstance(bare, type) and issubclass(bare, msgspec.Struct) else None
 
 
@@ -182,7 +195,7 @@ def _bounds(meta: msgspec.Meta) -> str:
     if meta.min_length is not None:
         words.append("not empty" if meta.min_length == 1 else f"at least {meta.min_length}")
     if meta.pattern is not None:
-        words.append("of letters, digits, `_`, `.` and `-`")
+        words.append("of digits" if meta.pattern.startswith("^[0-9]{") else "of letters, digits, `_`, `.` and `-`")
     return ", ".join(words)
 
 

@@ -40,6 +40,14 @@ class Tracks:
             self._count = sum(len(keys) for _, keys, _ in self._samplings)
             self._interval_ns *= 2
 
+    def times_ns(self) -> dict[TrackKey, NDArray[np.int64]]:
+        """When each place of `lines` was sampled."""
+        times: dict[TrackKey, list[int]] = {}
+        for now_ns, keys, _ in self._samplings:
+            for key in keys:
+                times.setdefault(key, []).append(now_ns)
+        return {key: np.array(each, np.int64) for key, each in times.items()}
+
     def lines(self) -> dict[TrackKey, NDArray[np.float32]]:
         """Places per key in order of time: rows (east, south), in metres."""
         points: dict[TrackKey, list[NDArray[np.float32]]] = {}

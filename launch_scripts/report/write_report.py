@@ -1,4 +1,4 @@
-"""Writes `report.json` and `report.png`."""
+"""Writes what a run leaves behind: `report.json`, `tracks.npz` and `report.png`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.track_file import TRACKS_FILE, packed_tracks
 from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain_report import bounds_deg
 from swarm.errors import StoreError
 
 log = logging.getLogger(__name__)
@@ -34,6 +36,10 @@ def make_report(recorder: Recorder, terrain: Terrain, **measured: Any) -> dict[s
             "rows": terrain.grid.rows,
             "cols": terrain.grid.cols,
             "resolution_m": terrain.grid.resolution_m,
+            "west_m": terrain.grid.west_m,
+            "north_m": terrain.grid.north_m,
+            "crs": terrain.grid.crs,
+            **bounds_deg(terrain.grid),
             "notes": list(terrain.notes),
         },
         "series": recorder.series(),
@@ -48,7 +54,7 @@ def write_report(
     *,
     truth: NDArray[np.float32] | None = None,
 ) -> None:
-    """Writes both files. Raises StoreError if the folder cannot be written.
+    """Writes `report.json`, the tracks and `report.png`. Raises StoreError if the folder cannot be written.
 
     truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
     """
@@ -56,6 +62,10 @@ def write_report(
         _write(folder / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     except OSError as error:
         raise StoreError(f"cannot write {folder / 'report.json'}: {error.strerror or error}") from error
+    try:
+        _write(folder / TRACKS_FILE, packed_tracks(recorder))
+    except OSError as error:
+        raise StoreError(f"cannot write {folder / TRACKS_FILE}: {error.strerror or error}") from error
     _draw(folder / "report.png", recorder, report, terrain, truth)
 
 

@@ -17,12 +17,14 @@ from launch_scripts.world.rovers import Rovers
 from launch_scripts.world.walks import Budget, TrueTerrain, Walker, WalkWorld, far_place, slowness_of, walk_of
 from shared_map.arrays import Floats, private_copy
 from shared_map.terrain.layers import inflate, inflation_halves
+from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.config.plugin_names import walk_named_by
 from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.errors import ConfigError
 from swarm.order_book import OrderBook
+from swarm.places import cell_of, written
 from swarm.plugins.find import find_plugin
 from swarm.runtime.tracking import Trackings
 from swarm.wire.fields import column
@@ -132,13 +134,12 @@ class TargetWorld:
         chance = random.Random(f"{scenario.seed}/{id}")
         if config.start is None:
             cell = self._terrain.random_home(chance)
-        elif not self._grid.inside(*config.start):
-            shape = f"{self._grid.rows} x {self._grid.cols}"
-            raise ConfigError(f"target {id}: start {list(config.start)} is outside the terrain of {shape} cells")
         else:
-            cell = self._grid.cell(*config.start)
+            frame = MapFrame(self._grid)
+            cell = cell_of(config.start, frame, f"target {id}: start")
             if self._terrain.lethal(cell):
-                raise ConfigError(f"target {id}: start {list(config.start)} is lethal; choose a passable cell")
+                place = written(frame, cell)
+                raise ConfigError(f"target {id}: start {place} is lethal; choose a passable cell")
         # An order names a built-in walk by its type: nothing that comes over the network is imported.
         plugin = find_plugin(walk_named_by(config, key), scenario.plugin_folder)
         world = WalkWorld(id, self._terrain, chance, self._budget)

@@ -8,13 +8,7 @@ key is ever decreased. Octile steps make two keys per cell, straight and diagona
 Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)      padded cells that got their cost from the last bucket
     batch    uint32  (size + _AHEAD,) padded cells of the bucket that is being served
-    queue    a queue of cells in buckets, in chunks of 2**_CHUNK_BITS cells; `make_scratch` says how large:
-        pool    uint32  the chunks
-        link    uint32  of each full chunk, the next one of its bucket
-        spare   uint32  a stack of chunks that were emptied
-        head    uint64  of each bucket, the position of its first cell: the start of a chunk
-        tail    uint64  of each bucket, the position behind its last cell, in a chunk with room for one
-        counts  uint64  how many are spare; how many were ever used
+    queue    as of `chunked_buckets`; `make_scratch` says how large
 
 What the loops look like was measured, and small changes cost much: cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
@@ -27,11 +21,10 @@ meets only uint64 here, because with an int64 it would silently become float64.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import BUCKETS, GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, TOO_FINE, WALL
 from planner_service.kernels.prefetch import prefetch
@@ -40,11 +33,9 @@ _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
-_CHUNK_BITS = 6
-_SHIFT = np.uint64(_CHUNK_BITS)
 _AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048."""
-_SCRATCH = "Tuple((u4[::1], u4[::1], Tuple((u4[::1], u4[::1], u4[::1], u8[::1], u8[::1], u8[::1]))))"
+_SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
 
 
 @helper
@@ -62,32 +53,16 @@ def _close_costs(cost):
         cost[i] = c if c >= _ZERO32 else INF
 
 
-Scratch = tuple[NDArray[np.uint32], NDArray[np.uint32], tuple[NDArray[Any], ...]]
+Scratch = tuple[NDArray[np.uint32], NDArray[np.uint32], Queue]
 
 
 def make_scratch(size: int, rule: int, buckets: int) -> Scratch:
     """(touched, batch, queue) for a growth over `size` padded cells, for the worst case: the system keeps no page
     that was not written."""
     kinds = 2 if rule == RULE_OCTILE else 1
-    buckets *= kinds
-    chunks = buckets + (kinds * size >> _CHUNK_BITS) + 1
     # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
     touched, batch = np.empty(size + 1, np.uint32), np.empty(size + _AHEAD, np.uint32)
-    pool = np.empty(chunks << _CHUNK_BITS, np.uint32)
-    link, spare = np.empty(chunks, np.uint32), np.empty(chunks, np.uint32)
-    head, tail = np.empty(buckets, np.uint64), np.empty(buckets, np.uint64)
-    return touched, batch, (pool, link, spare, head, tail, np.empty(2, np.uint64))
-
-
-@helper
-def _empty(queue, buckets):
-    """Let nothing wait in a queue of so many buckets."""
-    _, _, _, head, tail, counts = queue
-    for b in range(np.uint64(buckets)):
-        head[b] = b << _SHIFT
-        tail[b] = b << _SHIFT
-    counts[0] = _ZERO
-    counts[1] = np.uint64(buckets)
+    return touched, batch, make_queue(kinds * size, kinds * buckets)
 
 
 @helper
@@ -96,52 +71,6 @@ def _choose(cell_cost, cost, length, inverse, least, cells, count, buckets):
     for i in range(count):
         v = np.uint64(cells[i])
         buckets[i] = max(np.int32((cost[v] + cell_cost[v] * length) * inverse), least)
-
-
-@helper
-def _put(queue, cells, count, buckets, mask, first):
-    """Put cells into the queue, each into its bucket, modulo the length of the circular queue that begins at
-    bucket `first`; `mask` is that length less one."""
-    pool, link, spare, _, tail, counts = queue
-    low = (_ONE << _SHIFT) - _ONE
-    for i in range(count):
-        b = (np.uint64(buckets[i]) & mask) + first
-        t = tail[b]
-        pool[t] = cells[i]
-        t += _ONE
-        if t & low == _ZERO:
-            if counts[0] == _ZERO:
-                chunk = counts[1]
-                counts[1] += _ONE
-            else:
-                counts[0] -= _ONE
-                chunk = np.uint64(spare[counts[0]])
-            link[(t - _ONE) >> _SHIFT] = chunk
-            t = chunk << _SHIFT
-        tail[b] = t
-
-
-@helper
-def _take(queue, b, batch):
-    """Move all cells of a bucket to `batch`. Returns how many."""
-    pool, link, spare, head, tail, counts = queue
-    size = _ONE << _SHIFT
-    position = head[b]
-    end = tail[b]
-    n = _ZERO
-    while position >> _SHIFT != end >> _SHIFT:
-        for i in range(size):
-            batch[n + i] = pool[position + i]
-        n += size
-        chunk = position >> _SHIFT
-        spare[counts[0]] = chunk
-        counts[0] += _ONE
-        position = np.uint64(link[chunk]) << _SHIFT
-    for i in range(end - position):
-        batch[n + i] = pool[position + i]
-    head[b] = position
-    tail[b] = position
-    return n + (end - position)
 
 
 @helper
@@ -250,7 +179,7 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
     cell_cost, _, stride, rule, corners = grid
     touched, batch, queue = scratch
     width, circle = buckets
-    _empty(queue, 2 * circle if rule == RULE_OCTILE else circle)
+    empty(queue, 2 * circle if rule == RULE_OCTILE else circle)
     head, tail = queue[3], queue[4]
     s = np.uint64(stride)
     length = np.uint64(circle)
@@ -269,11 +198,11 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
         waiting += count
         following = np.int32(current + 1)
         _choose(cell_cost, cost, _ONE32, inverse, following, touched, count, batch)
-        _put(queue, touched, count, batch, mask, _ZERO)
+        put(queue, touched, count, batch, mask, _ZERO)
         if rule == RULE_OCTILE:
             waiting += count
             _choose(cell_cost, cost, SQRT2, inverse, following, touched, count, batch)
-            _put(queue, touched, count, batch, mask, length)
+            put(queue, touched, count, batch, mask, length)
         if waiting == _ZERO:
             _close_costs(cost)
             return current
@@ -284,14 +213,14 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
         while head[b] == tail[b] and head[b + second] == tail[b + second]:
             current = np.int32(current + 1)
             b = np.uint64(current) & mask
-        n = _take(queue, b, batch)
+        n = take(queue, b, batch)
         waiting -= n
         if rule == RULE_PAPER:
             count = _offer_around(cell_cost, cost, s, corners, batch, n, touched)
         else:
             count = _offer_straight(cell_cost, cost, s, batch, n, touched)
         if rule == RULE_OCTILE:
-            n = _take(queue, b + length, batch)
+            n = take(queue, b + length, batch)
             waiting -= n
             count = _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
 

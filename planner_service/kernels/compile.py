@@ -13,8 +13,10 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numba
@@ -84,6 +86,38 @@ def kernel(signature: str) -> Callable[[Any], Any]:
             compiled._compile_for_args = lambda *_: _load(compiled)  # numba's name for the first call
         KERNELS[function.__name__] = compiled
         return compiled
+
+    return declare
+
+
+@dataclass(frozen=True, slots=True)
+class StepKernel:
+    """One search over steps, compiled for either kind of map; called with `climbs` as its second argument.
+
+    alike     where entering a cell costs the same from everywhere: `climbs` is None, and no code for it is left
+    directed  where a step costs by what it climbs, too
+    """
+
+    alike: Any
+    directed: Any
+
+    def __call__(self, grid: Any, climbs: Any, *others: Any) -> Any:
+        return (self.alike if climbs is None else self.directed)(grid, climbs, *others)
+
+
+def step_kernel(signature: str, climbs: str) -> Callable[[Any], StepKernel]:
+    """As `kernel`, for both kinds of map: `CLIMBS` in the signature stands for `climbs`, or for nothing."""
+
+    def declare(function: Any) -> StepKernel:
+        # A function of another name, as a cache and a builder's claim are found by that.
+        name = f"{function.__name__}_directed"
+        directed = FunctionType(function.__code__, function.__globals__, name, function.__defaults__)
+        directed.__qualname__, directed.__doc__ = name, function.__doc__
+        directed.__module__ = function.__module__
+        return StepKernel(
+            kernel(signature.replace("CLIMBS", "none"))(function),
+            kernel(signature.replace("CLIMBS", climbs))(directed),
+        )
 
     return declare
 

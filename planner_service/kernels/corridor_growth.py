@@ -20,8 +20,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.layout import BOX, GRID, INF, LABELS, NONE, RULE_FOUR, RULE_OCTILE, SQRT2, check_cells
+from planner_service.kernels.climbs import CLIMBS, offered
+from planner_service.kernels.compile import helper, kernel, step_kernel
+from planner_service.kernels.layout import BOX, GRID, INF, LABELS, NONE, RULE_FOUR, check_cells, step_length
 
 Heap = tuple[NDArray[np.float32], NDArray[np.int64]]
 
@@ -91,7 +92,7 @@ def mark_levels(parent, offsets, least, level, children, traffic):
 
 
 @helper
-def _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail):
+def _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trail):
     """As `tighten`, for one padded cell. Returns cells visited."""
     many = 0
     while stamp[v] < now and parent[v] != NONE:
@@ -104,14 +105,15 @@ def _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail):
         v = np.int64(trail[j])
         k = parent[v]
         u = v + offsets[k]
-        driven = cost[u] + (cell_cost[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else cell_cost[u])
+        odd = np.int64(k & 1)
+        driven = offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd))
         cost[v] = min(cost[v], driven)
         stamp[v] = now
     return many
 
 
-@kernel(f"({GRID}, {LABELS}, u1[::1], i8, i8[::1], u4[::1])")
-def tighten(grid, labels, stamp, now, cells, trail):
+@step_kernel(f"({GRID}, CLIMBS, {LABELS}, u1[::1], i8, i8[::1], u4[::1])", CLIMBS)
+def tighten(grid, climbs, labels, stamp, now, cells, trail):
     """Lower costs, which are upper bounds, to what is driven along the parents, less the tree's offset: of `cells`
     (int64, padded) and of all on their ways to the root.
 
@@ -124,7 +126,7 @@ def tighten(grid, labels, stamp, now, cells, trail):
     visited = 0
     stamp[root] = now
     for i in range(cells.size):
-        visited += _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, cells[i], trail)
+        visited += _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, cells[i], trail)
     return visited
 
 
@@ -141,8 +143,10 @@ def larger_heap(heap: Heap) -> Heap:
     return np.concatenate((keys, np.empty_like(keys))), np.concatenate((items, np.empty_like(items)))
 
 
-@kernel(f"({GRID}, {LABELS}, u1[::1], u1[::1], i8, {BOX}, i8, Tuple((f4[::1], i8[::1])), i8, u4[::1])")
-def grow_corridors(grid, labels, level, stamp, now, box, inner, heap, waiting, trail):
+@step_kernel(
+    f"({GRID}, CLIMBS, {LABELS}, u1[::1], u1[::1], i8, {BOX}, i8, Tuple((f4[::1], i8[::1])), i8, u4[::1])", CLIMBS
+)
+def grow_corridors(grid, climbs, labels, level, stamp, now, box, inner, heap, waiting, trail):
     """Let the costs on the rim of a window around the root spread outward over the cells that carry the traffic.
 
     box    the window, whose costs are new
@@ -175,18 +179,22 @@ def grow_corridors(grid, labels, level, stamp, now, box, inner, heap, waiting, t
         while away > inner:
             away >>= 1
             least += 1
-        straight = key + cell_cost[u]
-        diagonal = key + (cell_cost[u] * SQRT2 if rule == RULE_OCTILE else cell_cost[u])
         for k in range(0, 8, 2 if rule == RULE_FOUR else 1):
             v = u + offsets[k]
-            offer = diagonal if k & 1 else straight
-            if level[v] < least or not cell_cost[v] < INF or not (stamp[v] <= now or offer < cost[v]):
+            odd = k & 1
+            offer = offered(key, cell_cost[u], climbs, v, u, odd, step_length(rule, odd))
+            if (
+                not offer < INF
+                or level[v] < least
+                or not cell_cost[v] < INF
+                or not (stamp[v] <= now or offer < cost[v])
+            ):
                 continue
             shut = max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) == INF
-            if k & 1 and not corners and shut:
+            if odd and not corners and shut:
                 continue
             if stamp[v] < now:
-                visited += _tighten(cell_cost, cost, parent, stamp, now, offsets, rule, v, trail)
+                visited += _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trail)
             stamp[v] = now + 1
             if offer < cost[v]:
                 cost[v] = offer

@@ -16,26 +16,16 @@ Arrays, beside those of `layout`:
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from planner_service.kernels.climbs import CLIMBS, step_price
 from planner_service.kernels.compile import kernel
-from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, RULE_FOUR, RULE_OCTILE, SQRT2
+from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, RULE_FOUR
 
 _NOBODY = np.int32(-1)
 _OUT = np.int32(-2)
 
 
-Climbs = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-"""What steps cost by their difference in height: (height, factors, scale).
-
-height   float32  (size,)       m, padded; NaN is a void, and a step from or to it is level
-factors  float32  (2 * n + 1,)  what a step of each rise costs, relative to the cheapest; its least value is 1
-scale    float32  (2,)          of straight and diagonal steps, entries of `factors` per metre of rise, counted from
-                                the middle
-"""
-
-
-@kernel(f"({GRID}, {LABELS}, UniTuple(f4[::1], 3), {BUCKETS}, i4[:, ::1], i4[::1])")
+@kernel(f"({GRID}, {LABELS}, {CLIMBS}, {BUCKETS}, i4[:, ::1], i4[::1])")
 def grow_directed(grid, labels, climbs, buckets, links, first):
     """The tree of cheapest ways to a padded, passable root. Costs and parents are written whole; returns the
     largest cost.
@@ -49,7 +39,6 @@ def grow_directed(grid, labels, climbs, buckets, links, first):
     """
     cell_cost, offsets, _, rule, corners = grid
     cost, parent, root = labels
-    height, factors, scale = climbs
     width, count = buckets
     for i in range(cell_cost.size):
         cost[i] = INF
@@ -59,7 +48,6 @@ def grow_directed(grid, labels, climbs, buckets, links, first):
         first[i] = _NOBODY
     mask = count - 1
     inverse = 1.0 / np.float64(width)
-    half = np.float32(factors.size // 2)
     every = 2 if rule == RULE_FOUR else 1
     cost[root] = np.float32(0.0)
     first[0] = root
@@ -94,10 +82,7 @@ def grow_directed(grid, labels, climbs, buckets, links, first):
                 and max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) == INF
             ):
                 continue
-            at = (height[u] - height[v]) * scale[odd]
-            at = at if at == at else np.float32(0.0)
-            step = cell_cost[u] * factors[np.int64(min(max(at, -half), half) + half + np.float32(0.5))]
-            new = base + (step * SQRT2 if odd and rule == RULE_OCTILE else step)
+            new = base + cell_cost[u] * step_price(climbs, v, u, odd)
             if not new < old:
                 continue
             cost[v] = new

@@ -80,6 +80,12 @@ def diagonal_length(rule):
 
 
 @helper
+def step_length(rule, odd):
+    """float32: length of a step in straight ones; `odd` is 1 of a diagonal one."""
+    return SQRT2 if odd and rule == RULE_OCTILE else np.float32(1.0)
+
+
+@helper
 def check_cells(cells, size):
     """Raises ValueError unless these are padded cells (int64): indices into arrays of so many. Called by kernels
     that are handed cells, because from Python it would take a microsecond."""

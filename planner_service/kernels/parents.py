@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.climbs import CLIMBS, offers_of_row
+from planner_service.kernels.compile import helper, step_kernel
 from planner_service.kernels.layout import BOX, GRID, HUGE, INF, NONE, RULE_FOUR, diagonal_length
 
 _ONE = np.uint64(1)
@@ -68,24 +69,65 @@ def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent):
 
 
 @helper
-def point_row_to_parents(grid, cost, first, last, parent):
+def _take_less(climbs, n, code):
+    """Where a row's offer is less than the best so far, take it, and whose it is."""
+    keys, best, codes = climbs[3], climbs[4], climbs[5]
+    for i in range(n):
+        codes[i] = code if keys[i] < best[i] else codes[i]
+        best[i] = min(best[i], keys[i])
+
+
+@helper
+def _shut_diagonals(cell_cost, climbs, first, n, one, other):
+    """No offer where one of the cells beside a diagonal step, so many further (unsigned), is lethal."""
+    keys = climbs[3]
+    for i in range(n):
+        v = first + i
+        keys[i] = keys[i] if max(cell_cost[v + one], cell_cost[v + other]) < INF else INF
+
+
+@helper
+def _parents_by_climb(grid, climbs, cost, first, last, parent):
+    """As the others here, direction by direction, so that it vectorises."""
+    cell_cost, offsets, _, rule, corners = grid
+    best, codes = climbs[4], climbs[5]
+    n = last - first
+    for i in range(n):
+        best[i] = INF
+        codes[i] = np.float32(NONE)
+    for j in range(4 if rule == RULE_FOUR else 8):
+        # Straight steps come first, of equals.
+        k = 2 * j if j < 4 else 2 * j - 7
+        offers_of_row(cell_cost, cost, climbs, k & 1, first, n, np.uint64(offsets[k]))
+        if k & 1 and not corners:
+            one, other = np.uint64(offsets[k - 1]), np.uint64(offsets[(k + 1) & 7])
+            _shut_diagonals(cell_cost, climbs, first, n, one, other)
+        _take_less(climbs, n, np.float32(k))
+    for i in range(n):
+        parent[first + i] = np.uint8(codes[i]) if cost[first + i] < INF else NONE
+
+
+@helper
+def point_row_to_parents(grid, climbs, cost, first, last, parent):
     """As `point_to_parents`, for the padded cells first <= cell < last of one row; the root is not left out."""
     cell_cost, _, stride, rule, corners = grid
     s, begin, end = np.uint64(stride), np.uint64(first), np.uint64(last)
-    if rule == RULE_FOUR:
+    if climbs is not None:
+        _parents_by_climb(grid, climbs, cost, begin, end, parent)
+    elif rule == RULE_FOUR:
         _parents_of_four(cell_cost, cost, s, begin, end, parent)
     else:
         limit = INF if corners else HUGE
         _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent)
 
 
-@kernel(f"({GRID}, f4[::1], i8, {BOX}, u1[::1])")
-def point_to_parents(grid, cost, root, box, parent):
+@step_kernel(f"({GRID}, CLIMBS, f4[::1], i8, {BOX}, u1[::1])", CLIMBS)
+def point_to_parents(grid, climbs, cost, root, box, parent):
     """Write the parents of the cells of a window: the neighbour with the smallest exit key; of equals the first of
     north, east, south, west, then of the diagonals clockwise."""
     row0, col0, row1, col1 = box
     stride = grid[2]
     for row in range(row0, row1):
         start = (row + 1) * stride + 1
-        point_row_to_parents(grid, cost, start + col0, start + col1, parent)
+        point_row_to_parents(grid, climbs, cost, start + col0, start + col1, parent)
     parent[root] = NONE

@@ -26,13 +26,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.climbs import CLIMBS, offered
+from planner_service.kernels.compile import helper, step_kernel
 from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, diagonal_length
 from planner_service.kernels.parents import point_row_to_parents
 
 _NOBODY = np.int32(-1)
 _ONE = np.uint64(1)
 _FINE = np.uint64(44)
+_STRAIGHT = np.float32(1.0)
 
 
 Rows = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -119,7 +121,13 @@ def _span(first, last, stride, row):
 
 
 @helper
-def _best_offers(cell_cost, cost, s, begin, end, diagonal, corners, best):
+def _key(cell_cost, cost, climbs, v, u, odd, length):
+    """What v is offered by its neighbour u."""
+    return offered(cost[u], cell_cost[u], climbs, v, u, odd, length)
+
+
+@helper
+def _best_offers(cell_cost, cost, climbs, s, begin, end, diagonal, corners, best):
     """best[0 : end - begin] := the smallest exit key among the neighbours of each cell of a part of a row.
 
     Free of branches, so that it vectorises; `diagonal`, the length of such a step, is inf where there is none.
@@ -130,21 +138,28 @@ def _best_offers(cell_cost, cost, s, begin, end, diagonal, corners, best):
         south = cell_cost[i + s]
         west = cell_cost[i - _ONE]
         least = min(
-            min(cost[i - s] + north, cost[i + _ONE] + east), min(cost[i + s] + south, cost[i - _ONE] + west)
+            min(
+                _key(cell_cost, cost, climbs, i, i - s, 0, _STRAIGHT),
+                _key(cell_cost, cost, climbs, i, i + _ONE, 0, _STRAIGHT),
+            ),
+            min(
+                _key(cell_cost, cost, climbs, i, i + s, 0, _STRAIGHT),
+                _key(cell_cost, cost, climbs, i, i - _ONE, 0, _STRAIGHT),
+            ),
         )
-        key = cost[i - s + _ONE] + cell_cost[i - s + _ONE] * diagonal
+        key = _key(cell_cost, cost, climbs, i, i - s + _ONE, 1, diagonal)
         least = min(least, key if corners or max(north, east) < INF else INF)
-        key = cost[i + s + _ONE] + cell_cost[i + s + _ONE] * diagonal
+        key = _key(cell_cost, cost, climbs, i, i + s + _ONE, 1, diagonal)
         least = min(least, key if corners or max(south, east) < INF else INF)
-        key = cost[i + s - _ONE] + cell_cost[i + s - _ONE] * diagonal
+        key = _key(cell_cost, cost, climbs, i, i + s - _ONE, 1, diagonal)
         least = min(least, key if corners or max(south, west) < INF else INF)
-        key = cost[i - s - _ONE] + cell_cost[i - s - _ONE] * diagonal
+        key = _key(cell_cost, cost, climbs, i, i - s - _ONE, 1, diagonal)
         least = min(least, key if corners or max(north, west) < INF else INF)
         best[i - begin] = least
 
 
 @helper
-def _sweep(grid, cost, rows, floor, best, lowered, count):
+def _sweep(grid, climbs, cost, rows, floor, best, lowered, count):
     """Lower the cells of `rows`, and those next to them, to what they are offered, where they cost `floor` (s) or
     more and are offered less. Appends them to the `count` that are in `lowered`; returns how many there are."""
     cell_cost, _, stride, rule, corners = grid
@@ -155,7 +170,8 @@ def _sweep(grid, cost, rows, floor, best, lowered, count):
         begin, end = _span(first, last, stride, row)
         if end <= begin:
             continue
-        _best_offers(cell_cost, cost, np.uint64(stride), np.uint64(begin), np.uint64(end), diagonal, corners, best)
+        s, at, until = np.uint64(stride), np.uint64(begin), np.uint64(end)
+        _best_offers(cell_cost, cost, climbs, s, at, until, diagonal, corners, best)
         for i in range(begin, end):
             if best[i - begin] < cost[i] and cost[i] >= floor and cell_cost[i] < INF:
                 cost[i] = best[i - begin]
@@ -186,7 +202,7 @@ def _begin_anew(keys, behind, heads, overflow, inverse):
 
 
 @helper
-def _spread(grid, cost, buckets, lowered, count, rows, limit, entries, heads):
+def _spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, heads):
     """Let costs that have fallen spread, until no cell is offered less than it costs.
 
     buckets  width: up to the lowest cell cost no cell is served twice; beyond, costs are right too
@@ -259,16 +275,17 @@ def _spread(grid, cost, buckets, lowered, count, rows, limit, entries, heads):
             highest = max(highest, key)
             if n + np.uint64(8) > room:
                 return -1, highest
-            straight = key + cell_cost[u]
-            diagonal = key + cell_cost[u] * slant
+            own = cell_cost[u]
             # Branches, unlike in a growth: few neighbours are offered less, so that these are foretold.
             for k in range(4):
                 v = u + np.uint64(offsets[2 * k])
+                straight = offered(key, own, climbs, v, u, 0, _STRAIGHT)
                 if straight < cost[v] and cell_cost[v] < INF:
                     cost[v] = straight
                     lowered[n] = v
                     n += _ONE
                 v = u + np.uint64(offsets[2 * k + 1])
+                diagonal = offered(key, own, climbs, v, u, 1, slant)
                 if (
                     diagonal < cost[v]
                     and cell_cost[v] < INF
@@ -337,8 +354,8 @@ def _detach_behind(cost, parent, offsets, detached, count, limit):
     return count
 
 
-@kernel(f"({GRID}, {LABELS}, i8[::1], f4[::1], {BUCKETS}, UniTuple(i8, 3), {_SCRATCH})")
-def repair(grid, labels, changed, before, buckets, most, scratch):
+@step_kernel(f"({GRID}, CLIMBS, {LABELS}, i8[::1], f4[::1], {BUCKETS}, UniTuple(i8, 3), {_SCRATCH})", CLIMBS)
+def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
     """Bring a tree up to date after the costs of `changed` cells became what they are now.
 
     buckets  as `_spread` says
@@ -365,11 +382,11 @@ def repair(grid, labels, changed, before, buckets, most, scratch):
     count = np.int64(0)  # a literal would have `_sweep` compiled twice
     if many:
         _note(first, last, stride, detached, many)
-        count = _sweep(grid, cost, rows, INF, best, lowered, count)
+        count = _sweep(grid, climbs, cost, rows, INF, best, lowered, count)
     if any_cheaper:
         _note_cheaper(cheaper, cell_cost, stride, changed, before)
-        count = _sweep(grid, cost, cheaper, np.float32(-INF), best, lowered, count)
-    served, highest = _spread(grid, cost, buckets, lowered, count, rows, 2 * many + most[2], entries, heads)
+        count = _sweep(grid, climbs, cost, cheaper, np.float32(-INF), best, lowered, count)
+    served, highest = _spread(grid, climbs, cost, buckets, lowered, count, rows, 2 * many + most[2], entries, heads)
     if served < 0:
         return -1, INF
     if not parent.size:
@@ -380,6 +397,6 @@ def repair(grid, labels, changed, before, buckets, most, scratch):
     for row in range(from_row, to_row):
         begin, end = _span(first, last, stride, row)
         if begin < end:
-            point_row_to_parents(grid, cost, begin, end, parent)
+            point_row_to_parents(grid, climbs, cost, begin, end, parent)
     parent[root] = NONE
     return served + many, highest

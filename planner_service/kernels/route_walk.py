@@ -22,16 +22,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.compile import helper, kernel
+from planner_service.kernels.climbs import CLIMBS, offered, step_price
+from planner_service.kernels.compile import helper, kernel, step_kernel
 from planner_service.kernels.layout import (
     GRID,
     INF,
     LABELS,
     NONE,
     RULE_OCTILE,
-    SQRT2,
     SQRT2_EXACT,
     check_cells,
+    step_length,
     step_offsets,
 )
 
@@ -51,8 +52,8 @@ _STRETCH = 32
 """Steps between two looks at whether a lane's route has ended; a route that has stands still meanwhile."""
 
 
-@kernel(f"({GRID}, {LABELS}, u4[::1])")
-def relabel(grid, labels, trail):
+@step_kernel(f"({GRID}, CLIMBS, {LABELS}, u4[::1])", CLIMBS)
+def relabel(grid, climbs, labels, trail):
     """Costs := what is really driven from each cell along its parents. They are written whole; parents are read.
     `trail` has room for all cells."""
     cell_cost, offsets, _, rule, _ = grid
@@ -72,11 +73,21 @@ def relabel(grid, labels, trail):
             v = np.int64(trail[j])
             k = parent[v]
             u = v + offsets[k]
-            cost[v] = cost[u] + (cell_cost[u] * SQRT2 if rule == RULE_OCTILE and k & 1 else cell_cost[u])
+            odd = np.int64(k & 1)
+            cost[v] = offered(cost[u], cell_cost[u], climbs, v, u, odd, step_length(rule, odd))
 
 
 @helper
-def _walk_on(cell_cost, parent, moves, lanes, sums, trails, steps):
+def _driven(cell_cost, climbs, lengths, before, cell, code):
+    """float64, s: what the step costs that led from `before` to a cell; 0 beyond a route's end."""
+    own = np.float64(cell_cost[cell])
+    if climbs is None:
+        return own * lengths[code]
+    return own * np.float64(step_price(climbs, before, cell, np.int64(code & 1))) if code != NONE else 0.0
+
+
+@helper
+def _walk_on(cell_cost, climbs, parent, moves, lanes, sums, trails, steps):
     """Go `steps` steps on, in all lanes; steps beyond a route's end have the code NONE, and cost nothing."""
     offsets, lengths = moves
     a, b, c, d = (
@@ -98,14 +109,15 @@ def _walk_on(cell_cost, parent, moves, lanes, sums, trails, steps):
         trails[1, at_b + i] = code_b
         trails[2, at_c + i] = code_c
         trails[3, at_d + i] = code_d
+        from_a, from_b, from_c, from_d = a, b, c, d
         a += offsets[code_a]
         b += offsets[code_b]
         c += offsets[code_c]
         d += offsets[code_d]
-        sum_a += np.float64(cell_cost[a]) * lengths[code_a]
-        sum_b += np.float64(cell_cost[b]) * lengths[code_b]
-        sum_c += np.float64(cell_cost[c]) * lengths[code_c]
-        sum_d += np.float64(cell_cost[d]) * lengths[code_d]
+        sum_a += _driven(cell_cost, climbs, lengths, from_a, a, code_a)
+        sum_b += _driven(cell_cost, climbs, lengths, from_b, b, code_b)
+        sum_c += _driven(cell_cost, climbs, lengths, from_c, c, code_c)
+        sum_d += _driven(cell_cost, climbs, lengths, from_d, d, code_d)
     lanes[_CELL, 0], lanes[_CELL, 1], lanes[_CELL, 2], lanes[_CELL, 3] = (
         np.int64(a),
         np.int64(b),
@@ -143,8 +155,11 @@ def longer(walk: Lanes) -> Lanes:
     return lanes, sums, twice
 
 
-@kernel(f"(f4[::1], u1[::1], Tuple((u8[::1], f8[::1])), i8, i8[::1], UniTuple(i8, 2), {_WALKS}, {_WALK}, b1)")
-def walk_routes(cell_cost, parent, moves, root, starts, most, walks, walk, anew):
+@step_kernel(
+    f"(f4[::1], CLIMBS, u1[::1], Tuple((u8[::1], f8[::1])), i8, i8[::1], UniTuple(i8, 2), {_WALKS}, {_WALK}, b1)",
+    CLIMBS,
+)
+def walk_routes(cell_cost, climbs, parent, moves, root, starts, most, walks, walk, anew):
     """The routes from `starts` to a padded root. `join_routes` is to follow.
 
     moves  as `moves_of` returns them
@@ -183,7 +198,7 @@ def walk_routes(cell_cost, parent, moves, root, starts, most, walks, walk, anew)
             break
         if steps > room:
             return -1
-        _walk_on(cell_cost, parent, moves, lanes, sums, trails, steps)
+        _walk_on(cell_cost, climbs, parent, moves, lanes, sums, trails, steps)
         for j in range(_LANES):
             r = lanes[_ROUTE, j]
             if r == lanes[_UNTIL, j]:

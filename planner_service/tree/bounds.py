@@ -46,7 +46,7 @@ class LowerBounds:
         grid = self._grid
         limit = grid.grid.cells // LOWER_SHARE + 1024
         lowered, _ = repair(
-            *(grid.padded, (self._heuristic, _NO_PARENTS, 0), changes.cells, changes.before),
+            *(grid.padded, grid.climbs, (self._heuristic, _NO_PARENTS, 0), changes.cells, changes.before),
             *(grid.buckets, (0, 0, limit), grid.repair_scratch),
         )
         if lowered < 0:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import cell_costs as kernels
 from planner_service.kernels import repair, route_walk
+from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import (
     RULE_FOUR,
     RULE_OCTILE,
@@ -25,7 +26,9 @@ from planner_service.kernels.layout import (
     step_offsets,
 )
 from planner_service.tree.growth import grow_tree
+from planner_service.tree.padded_climbs import padded_climbs, with_scratch
 from shared_map.arrays import Bools, Floats, private_copy
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError
 from swarm.grid import GridSpec, Window
@@ -93,10 +96,7 @@ class Walks(NamedTuple):
 class CostGrid:
     """What entering each cell of a map costs, padded with a lethal border."""
 
-    directed = False
-    """Whether a step's cost depends on where it comes from, too; then only whole trees are grown."""
-
-    def __init__(self, grid: GridSpec, config: PlannerConfig) -> None:
+    def __init__(self, grid: GridSpec, config: PlannerConfig, climb: Climb | None = None) -> None:
         self.grid = grid
         self.config = config
         self.rule = rule_of(config)
@@ -109,7 +109,15 @@ class CostGrid:
         """Cells of a padded array."""
         self.diagonal = SQRT2_EXACT if self.rule == RULE_OCTILE else 1.0
         """Length of a diagonal step in straight ones."""
+        self.climbs: Climbs | None = None
+        """What a step's rise does to its cost, for kernels; None where entering a cell costs the same from
+        everywhere. If not, a cell's cost is that of the cheapest straight step into it."""
+        self.dearest_step = self.diagonal
+        """What a step costs at most, in cell costs."""
         self._metres = grid.resolution_m
+        if climb is not None:
+            self.climbs, self.dearest_step = padded_climbs(climb, self.rule)
+            self._metres *= climb.lowest
         self.length_weight_s = config.length_weight * grid.resolution_m
         """s; what a cell's length costs beside the time. It is part of every cell cost."""
         self.cell_cost: Floats = _NONE
@@ -133,6 +141,8 @@ class CostGrid:
         """Scratch of `walk`, which makes it longer where routes are."""
         self._repair_scratch: repair.Scratch | None = None
         """Made by the first repair of a small map."""
+        if self.climbs is not None:
+            self.climbs = with_scratch(self.climbs)
 
     @property
     def padded(self) -> PaddedGrid:
@@ -142,7 +152,7 @@ class CostGrid:
     @property
     def buckets(self) -> Buckets:
         """Of a repair: as wide as the lowest cell cost, and enough to hold all that costs at most a step more."""
-        longest = self.highest_cell_cost * self.diagonal
+        longest = self.highest_cell_cost * self.dearest_step
         count = math.ceil(longest / self.lowest_cell_cost) + 2
         return self.lowest_cell_cost, min(max(count, _FEWEST), _MOST)
 
@@ -319,7 +329,8 @@ class CostGrid:
         return self._grow(root, cost, parent)
 
     def _grow(self, root: int, cost: Floats, parent: NDArray[np.uint8]) -> float:
-        return grow_tree(self.padded, self.lowest_cell_cost, self.highest_cell_cost, root, cost, parent)
+        bounds = self.lowest_cell_cost, self.highest_cell_cost, self.dearest_step
+        return grow_tree(self.padded, self.climbs, bounds, root, cost, parent)
 
     def walk(self, parent: NDArray[np.uint8], root: int, starts: Cells, most: int, cell_cost: Floats) -> Walks:
         """Routes from padded cells that have a way to a padded root, over the cell costs of this or an earlier map.
@@ -334,10 +345,11 @@ class CostGrid:
         walks = ends, driven, np.empty(count, np.int64), np.empty(count, np.int64)
         longest = (most, self.grid.cells)
         walk = route_walk.walk_routes
-        steps = walk(cell_cost, parent, self._moves, root, starts, longest, walks, self._lanes, True)
+        read = cell_cost, self.climbs, parent, self._moves, root, starts, longest, walks
+        steps = walk(*read, self._lanes, True)
         while steps < 0:
             self._lanes = route_walk.longer(self._lanes)
-            steps = walk(cell_cost, parent, self._moves, root, starts, longest, walks, self._lanes, False)
+            steps = walk(*read, self._lanes, False)
         directions = np.empty(steps, np.uint8)
         route_walk.join_routes(walks, self._lanes, directions)
         return Walks(directions, *walks)

@@ -24,6 +24,7 @@ from planner_service.kernels.repair import repair
 from planner_service.tree.corridors import INNER, CorridorGraph
 from planner_service.tree.cost_grid import Cells, Changes, CostGrid, floats_of_bits
 from planner_service.tree.growth import FINE, KeptScratch, grow_tree
+from planner_service.tree.padded_climbs import climbs_in
 from shared_map.arrays import Floats
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
@@ -114,7 +115,8 @@ class CostToGoTree:
         heap, waiting, visited = corridor_growth.make_heap(box), -1, 0
         while waiting:
             more, waiting = corridor_growth.grow_corridors(
-                *(self.cost_grid.padded, labels, corridors.level, self._stamps_now(), self._now),
+                *(self.cost_grid.padded, self.cost_grid.climbs, labels),
+                *(corridors.level, self._stamps_now(), self._now),
                 *(box, inner, heap, waiting, self._trail),
             )
             visited += more
@@ -133,6 +135,10 @@ class CostToGoTree:
         if self.root < 0:
             raise ValueError("the tree has no root: grow it first")
         grid.check_root(root)
+        if not self.cost[grid.pad(root)] < math.inf:
+            # A step that is too steep may be one way only: whoever has a way to the new root may have none to the
+            # old one, and be left without.
+            return 0
         row0, col0, row1, col1 = box = self._box(window)
         width = col1 - col0 + 2
         start, old = self._in_window(root, window), self._in_window(self.root, window)
@@ -140,7 +146,9 @@ class CostToGoTree:
         bits = cut_window(grid.cell_cost.view(np.int32), grid.stride, box, part.view(np.int32))
         cost = np.empty_like(part)
         padded: PaddedGrid = part, step_offsets(width), width, grid.rule, grid.corners
-        grow_tree(padded, *floats_of_bits(bits), start, cost, None, self._kept if part.size <= _SMALL else None)
+        climbs = None if grid.climbs is None else climbs_in(grid.climbs, grid.stride, box)
+        kept = self._kept if part.size <= _SMALL else None
+        grow_tree(padded, climbs, (*floats_of_bits(bits), grid.dearest_step), start, cost, None, kept)
         way = float(cost[old])
         if not way < math.inf:
             return 0
@@ -150,7 +158,7 @@ class CostToGoTree:
         # A neighbour of a cell that got cheaper may lead there now.
         around = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 + 1, rows), min(col1 + 1, cols))
         new_root = grid.pad(root)
-        point_to_parents(grid.padded, self.cost, new_root, around, self.parent)
+        point_to_parents(grid.padded, grid.climbs, self.cost, new_root, around, self.parent)
         self.exact = self.exact and root == self.root
         self.root = root
         self._ways_changed()
@@ -180,11 +188,9 @@ class CostToGoTree:
         if changes.cells.size == 0:
             return 0
         grid = self.cost_grid
-        if grid.directed:
-            return -1
         most = _most_repaired(grid.grid.cells)
         visited, highest = repair(
-            *(grid.padded, self._labels, changes.cells, changes.before),
+            *(grid.padded, grid.climbs, self._labels, changes.cells, changes.before),
             *(grid.buckets, most, grid.repair_scratch),
         )
         self.reach = max(self.reach, float(highest))
@@ -200,7 +206,8 @@ class CostToGoTree:
         if not self.exact:
             grid = self.cost_grid
             stamps = self._stamps_now()
-            corridor_growth.tighten(grid.padded, self._labels, stamps, self._now, cells, self._trail)
+            ways = grid.padded, grid.climbs, self._labels
+            corridor_growth.tighten(*ways, stamps, self._now, cells, self._trail)
 
     @property
     def _trail(self) -> NDArray[np.uint32]:
@@ -221,7 +228,7 @@ class CostToGoTree:
 
     def relabel(self) -> None:
         """Make every cost what is really driven along the parents, and the offset 0."""
-        route_walk.relabel(self.cost_grid.padded, self._labels, self._trail)
+        route_walk.relabel(self.cost_grid.padded, self.cost_grid.climbs, self._labels, self._trail)
         self.offset = 0.0
 
     @property

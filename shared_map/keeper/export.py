@@ -129,14 +129,24 @@ def to_bands(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """(pace, kind) of the winning marks. The pace is in s/m: inf is lethal, nan is as the prior map says. The kind
     is a MarkKind, NOTHING_SAID_BAND where no author says anything."""
+    pace, kind, _ = to_cells(grid, sets, now_ns)
+    return pace, kind
+
+
+def to_cells(
+    grid: GridSpec, sets: Iterable[MarkSet], now_ns: int = 0
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
+    """As `to_bands`, and when each winning mark was made: UNIX time in ns, 0 where nobody says anything."""
     replica = MapReplica(grid)
     replica.merge(list(sets))
     replica.tick(now_ns)
     pace = np.full(grid.cells, np.nan, np.float32)
     kind = np.full(grid.cells, NOTHING_SAID_BAND, np.uint8)
+    stamps_ns = np.zeros(grid.cells, np.int64)
     for tile in replica.held.tiles:
         won = replica.winners(tile)
         cells = grid_cells(grid, tile_corners(grid, tile), won.cells)
-        kind[cells] = won.kinds
+        kind[cells], stamps_ns[cells] = won.kinds, won.stamps_ns
         pace[cells] = np.choose(won.kinds, [won.paces, np.float32(np.inf), np.float32(np.nan)])
-    return pace.reshape(grid.rows, grid.cols), kind.reshape(grid.rows, grid.cols)
+    shape = (grid.rows, grid.cols)
+    return pace.reshape(shape), kind.reshape(shape), stamps_ns.reshape(shape)

@@ -43,7 +43,7 @@ def kept_key(scenario: Scenario) -> str | None:
     """Digest of all that a terrain and its truth follow from; None where files have a part in it."""
     terrain, cost = scenario.terrain, scenario.cost
     zones = (*cost.zones, *terrain.hidden.zones)
-    files = terrain.photo or terrain.labels or cost.layers or any(zone.mask for zone in zones)
+    files = terrain.photo or terrain.labels or terrain.cover or cost.layers or any(z.mask or z.file for z in zones)
     if terrain.source != "synthetic" or files:
         return None
     here = Path(__file__).parent

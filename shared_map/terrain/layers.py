@@ -4,10 +4,16 @@ The merge rule, per cell, in this order:
 
 1. pace = flat pace x slope factor x class factor x (1 + rough_per_m x roughness); on a road the road pace instead.
    Where `cost.directional`, the slope factor is left out, and each step costs by its rise instead (`step_climb`).
+   No finite pace is above `PACE_MOST` or below `PACE_LEAST`.
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
    Then the scenario's own layers (`cost_layers`), one after the other; a void stays lethal.
-3. Zones in the order painted: a road sets the road pace (over cliffs and water too: a bridge, a cutting; not over a
-   void), preferred halves, rough doubles; then every forbidden zone is lethal, whatever else was painted there.
+3. Zones in the order written: a pace sets the pace of open ground, a factor multiplies it, preferred halves, rough
+   doubles, slow water multiplies; a road sets the road pace (over cliffs and the terrain's own water too: a
+   cutting, a causeway; not over a void), one of a file only where that is quicker. Then water that is lethal closes
+   what it touches, roads too; then bridges open the water beneath them; then every forbidden zone is lethal,
+   whatever else was painted there.
+   Where `cost.directional`, each cell then pays what `cost.cross_slope_factor` asks for driving along its slope;
+   steps that lead up or down get it back.
 4. This is the ground. The prior map is the ground with inflation: a cell is lethal where a vehicle of
    `vehicle_radius_m` in its middle would touch a lethal cell.
 5. Marks replace the ground cell by cell (see `cost_map`), before inflation.
@@ -26,9 +32,10 @@ import numpy as np
 
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.row_bands import in_bands
-from shared_map.terrain.slope_rules import slope_factor
+from shared_map.terrain.slope_rules import along_slope_factor, factor_bounds, slope_factor
 from swarm.config.scenario import CostConfig
 from swarm.grid import GridSpec
+from swarm.wire.statements import PACE_LEAST, PACE_MOST
 
 LETHAL = np.float32(np.inf)
 
@@ -45,6 +52,8 @@ class TerrainClass(enum.IntEnum):
     ROAD = 6
     BUILT = 7
     SNOW = 8
+    SHRUB = 9
+    WETLAND = 10
 
 
 CLASS_FACTOR: Mapping[TerrainClass, float] = {
@@ -57,8 +66,11 @@ CLASS_FACTOR: Mapping[TerrainClass, float] = {
     TerrainClass.ROAD: 1.0,
     TerrainClass.BUILT: 3.0,
     TerrainClass.SNOW: 2.5,
+    TerrainClass.SHRUB: 1.5,
+    TerrainClass.WETLAND: 5.0,
 }
-"""Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`."""
+"""Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`. Shrub is the heavy
+brush of Soule and Goldman (1972), for people on foot; wetland is a judgement: vehicles get stuck there."""
 
 
 def gradient(elevation_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
@@ -146,6 +158,23 @@ def roughness_of_padded(padded_m: Floats, resolution_m: float) -> Floats:
     return most
 
 
+def along_slope_of_padded(padded_m: Floats, resolution_m: float, cost: CostConfig) -> Floats:
+    """What the slope of each cell raises the pace along it by (`slope_rules.along_slope_factor`).
+
+    A cell is as steep as its steepest step, if its slope is less: so no step gets more back than its cell has paid.
+    """
+    steepness = grade_of_padded(padded_m, resolution_m)
+    rows, cols = steepness.shape
+    centre = padded_m[1:-1, 1:-1]
+    for dr in (-1, 0, 1):
+        for dc in (-1, 0, 1):
+            if dr or dc:
+                run = np.float32(resolution_m * math.hypot(dr, dc))
+                rise = np.abs(padded_m[1 + dr : 1 + dr + rows, 1 + dc : 1 + dc + cols] - centre) / run
+                np.fmax(steepness, rise, out=steepness)
+    return along_slope_factor(steepness, cost)
+
+
 def class_factors(cost: CostConfig) -> Floats:
     """Factor of each class, indexed by its number: the built-in ones, replaced by the scenario's."""
     factors = np.ones(256, np.float32)
@@ -169,7 +198,22 @@ def terrain_pace(grade_: Floats, classes: Bytes, cost: CostConfig, rough_m: Floa
     road = classes == TerrainClass.ROAD
     if road.any():
         np.copyto(pace, np.float32(1 / cost.road_speed_m_per_s), where=road & np.isfinite(pace))
+    if _may_leave_bounds(cost):
+        lethal = np.isinf(pace)
+        np.clip(pace, np.float32(PACE_LEAST), np.float32(PACE_MOST), out=pace)
+        pace[lethal] = LETHAL
     return pace
+
+
+def _may_leave_bounds(cost: CostConfig) -> bool:
+    """Whether a pace may be one that marks cannot tell. Where it cannot be, none is looked for: that takes time."""
+    least, most = factor_bounds(cost)
+    factors = class_factors(cost)[: max(TerrainClass) + 1] if cost.classes else np.ones(1, np.float32)
+    finite = factors[np.isfinite(factors)]
+    if cost.rough_per_m or not finite.size:
+        return True
+    level = 1 / cost.flat_speed_m_per_s
+    return bool(least * finite.min() * level < PACE_LEAST or most * finite.max() * level > PACE_MOST)
 
 
 def polygon_mask(polygon_m: Sequence[tuple[float, float]], grid: GridSpec) -> Bools:

@@ -1,12 +1,10 @@
 """Slope rules: the factor that slope puts on pace, one row per rule of `cost.slope_rule`.
 
-linear, quadratic  in the sine of the slope (gravity's pull), reaching `steep_factor` at `max_slope_deg`
-tobler             Tobler's hiking function (1993); fastest at 5 % downhill
-energy             a wheeled vehicle of constant power: against rolling resistance and gravity uphill, no faster
-                   than on the level downhill
+A factor is relative to level ground, whose speed is `flat_speed_m_per_s`, so a rule that its source states as a
+speed is divided by its own level speed. Paces are per metre of the map, as terrains and their steps are.
 
-Only correctly rounded operations (+ - * / sqrt) go into linear, quadratic and energy, so that two machines get the
-same bits and the same digest of the terrain.
+Only correctly rounded operations (+ - * / sqrt) go into all rules but tobler, so that two machines get the same
+bits and the same digest of the terrain.
 """
 
 from __future__ import annotations
@@ -20,8 +18,11 @@ import numpy as np
 from shared_map.arrays import Floats
 from swarm.config.scenario import CostConfig, SlopeRule
 
-ROLLING_RESISTANCE = 0.08
-"""Share of its weight that a wheeled vehicle needs to roll on level open ground (grass, firm soil)."""
+MOST_FACTOR = 100.0
+"""No slope raises a pace more, unless `steep_factor` says so: costly is not lethal."""
+
+_LEAST_FACTOR = 0.35
+"""No rule goes below it, but a table may."""
 
 Factor = Callable[[Floats, Floats, CostConfig], Floats]
 """Pace relative to level ground, float32, by rise over run (negative is downhill), its sine, and the settings."""
@@ -30,32 +31,95 @@ Factor = Callable[[Floats, Floats, CostConfig], Floats]
 class RuleRow(NamedTuple):
     """One rule.
 
-    mean      the factor of a cell by its grade (never negative), whichever way the cell is crossed
-    directed  the factor of a step by its rise
+    mean         the factor of a cell by its grade (never negative), whichever way the cell is crossed
+    directed     the factor of a step by its rise
+    is_directed  whether uphill and downhill differ
+    about        what it is, for people
+    source       where it comes from
     """
 
     mean: Factor
     directed: Factor
+    is_directed: bool
+    about: str
+    source: str
 
 
 def slope_factor(grade: Floats, cost: CostConfig) -> Floats:
-    """Pace relative to level ground, the same in all directions; inf where steeper than `max_slope_deg` or NaN."""
+    """Pace relative to level ground, the same in all directions; inf where steeper than `max_slope_deg` or NaN.
+
+    Of a rule that tells uphill from downhill it is the mean of both: there and back again cost together what they
+    do where steps have directions. Half of the ways over a cell lead along its slope, so half of what
+    `cross_slope_factor` adds is added.
+    """
     sine = _sine(grade)
-    return _limited(SLOPE_RULES[cost.slope_rule].mean(grade, sine, cost), sine, cost)
+    factor = _bounded(SLOPE_RULES[cost.slope_rule].mean(grade, sine, cost), cost)
+    if cost.cross_slope_factor > 1:
+        factor *= np.float32(1) + np.float32(0.5 * _cross_slope(cost)) * (sine * sine)
+    return _without_steeper(factor, sine, cost.max_slope_deg)
 
 
 def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
     """Pace relative to level ground when driving up a rise (metres per metre; negative is downhill).
 
-    Steeper than `max_slope_deg`, up or down, is inf.
+    Steeper than `max_climb_deg` up or `max_descent_deg` down is inf. Of ground with a `cross_slope_factor` it is
+    relative to `along_slope_factor`.
     """
     sine = _sine(rise)
-    return _limited(SLOPE_RULES[cost.slope_rule].directed(rise, sine, cost), np.abs(sine), cost)
+    factor = _bounded(SLOPE_RULES[cost.slope_rule].directed(rise, sine, cost), cost)
+    if cost.cross_slope_factor > 1:
+        factor /= np.float32(1) + np.float32(_cross_slope(cost)) * (sine * sine)
+    climb_deg, descent_deg = step_limits_deg(cost)
+    return _without_steeper(_without_steeper(factor, sine, climb_deg), -sine, descent_deg)
 
 
-def _limited(factor: Floats, sine: Floats, cost: CostConfig) -> Floats:
-    if cost.max_slope_deg < 90:
-        np.copyto(factor, np.float32(np.inf), where=sine > np.float32(_limit(cost)))
+def along_slope_factor(steepness: Floats, cost: CostConfig) -> Floats:
+    """Pace along a slope, neither up nor down, relative to level ground; 1 where the slope is NaN.
+
+    A cell of steepness g that is crossed with a rise r costs (1 + k sin(g)^2) / (1 + k sin(r)^2) times as much for
+    its slope across the way: 1 straight up or down, `cross_slope_factor` along a slope of `max_slope_deg`. What
+    depends on the cell is this; what depends on the rise is in `directional_factor`.
+    """
+    sine = _sine(steepness)
+    factor: Floats = np.float32(1) + np.float32(_cross_slope(cost)) * (sine * sine)
+    np.copyto(factor, np.float32(1), where=np.isnan(sine))
+    return factor
+
+
+def factor_bounds(cost: CostConfig) -> tuple[float, float]:
+    """(least, most) that `slope_factor` gives of ground that is not too steep; they need not be reached."""
+    least = min((factor for _, factor in cost.slope_table), default=_LEAST_FACTOR)
+    most = cost.steep_factor if cost.slope_rule in ("linear", "quadratic") else max(MOST_FACTOR, cost.steep_factor)
+    return least, most * cost.cross_slope_factor * (1 + 1e-5)
+
+
+def said_of_cost(cost: CostConfig) -> str:
+    """A sentence for people who look at a terrain: by which rule its slopes cost."""
+    row = SLOPE_RULES[cost.slope_rule]
+    way = "the mean of up and down" if row.is_directed else "the same up and down"
+    if cost.directional:
+        way = "each step by its way up or down"
+    preset = f" of preset {cost.preset}" if cost.preset else ""
+    return f"slope rule {cost.slope_rule}{preset}, {way}; {cost.flat_speed_m_per_s:g} m/s on level open ground"
+
+
+def step_limits_deg(cost: CostConfig) -> tuple[float, float]:
+    """(steepest climb, steepest descent) of a step along its way."""
+    climb_deg, descent_deg = cost.max_climb_deg, cost.max_descent_deg
+    return (
+        cost.max_slope_deg if climb_deg is None else climb_deg,
+        cost.max_slope_deg if descent_deg is None else descent_deg,
+    )
+
+
+def _bounded(factor: Floats, cost: CostConfig) -> Floats:
+    least = 0.0 if cost.top_speed_m_per_s is None else cost.flat_speed_m_per_s / cost.top_speed_m_per_s
+    return np.clip(factor, np.float32(least), np.float32(max(MOST_FACTOR, cost.steep_factor)), out=factor)
+
+
+def _without_steeper(factor: Floats, sine: Floats, most_deg: float) -> Floats:
+    if most_deg < 90:
+        np.copyto(factor, np.float32(np.inf), where=sine > np.float32(math.sin(math.radians(most_deg))))
     np.copyto(factor, np.float32(np.inf), where=np.isnan(sine))
     return factor
 
@@ -63,6 +127,11 @@ def _limited(factor: Floats, sine: Floats, cost: CostConfig) -> Floats:
 def _limit(cost: CostConfig) -> float:
     """Sine of `max_slope_deg`."""
     return math.sin(math.radians(cost.max_slope_deg))
+
+
+def _cross_slope(cost: CostConfig) -> float:
+    """What the square of a slope's sine adds to the pace along it."""
+    return (cost.cross_slope_factor - 1) / _limit(cost) ** 2
 
 
 def _sine(rise: Floats) -> Floats:
@@ -86,46 +155,163 @@ def _quadratic(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
     return factor
 
 
-def _tobler(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-    """Tobler (1993): walking speed 6 exp(-3.5 |rise + 0.05|) km/h, here as pace relative to the level.
-
-    Cut off at a hundredfold pace: costly is not lethal."""
-    exponent = np.float32(3.5) * (np.abs(rise + np.float32(0.05)) - np.float32(0.05))
-    capped: Floats = np.minimum(np.exp(np.minimum(exponent, np.float32(5))), np.float32(100))
-    return capped
-
-
 def _energy(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
+    """A wheeled vehicle: as quick as on level ground, unless its motor or its brakes are too weak for that.
+
+    Per weight and metre the motor works rolling resistance x cos + sin, and has `power_reserve` x rolling
+    resistance for it at the flat speed. Downhill the brakes hold what gravity gives beyond the rolling resistance,
+    for which they have `braking_share` of the motor's power: who comes down quicker runs away or burns them. With a
+    share of 1 that is the drivers' rule to descend in the gear in which one would climb.
+    """
+    rolling = cost.rolling_resistance
     cosine = np.sqrt(np.float32(1) - sine * sine)
-    factor = cosine + sine * np.float32(1 / ROLLING_RESISTANCE)
-    floored: Floats = np.maximum(factor, np.float32(1))
-    return floored
+    pull = sine * np.float32(1 / rolling)
+    up = (cosine + pull) * np.float32(1 / cost.power_reserve)
+    down = (-pull - cosine) * np.float32(1 / (cost.power_reserve * cost.braking_share))
+    factor: Floats = np.maximum(np.maximum(up, down), np.float32(1))
+    return factor
 
 
-def _by_steepness(mean: Factor) -> RuleRow:
+def _tobler(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
+    """Walking speed 6 exp(-3.5 |rise + 0.05|) km/h."""
+    exponent = np.float32(3.5) * (np.abs(rise + np.float32(0.05)) - np.float32(0.05))
+    factor: Floats = np.exp(np.minimum(exponent, np.float32(5)))
+    return factor
+
+
+_CLIMB = 5000 / 600
+_DESCENT = 5000 / 300 / 6
+
+
+def _naismith_langmuir(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
+    """5 km/h and one hour more for 600 m of ascent; ten minutes less for 300 m of descent on slopes of 5 to 12
+    degrees, ten minutes more on steeper ones."""
+    gentle, steep = (np.float32(-math.tan(math.radians(each))) for each in (5, 12))
+    per_rise = np.where(rise > gentle, np.float32(0), np.float32(_DESCENT))
+    per_rise = np.where(rise < steep, np.float32(-_DESCENT), per_rise)
+    per_rise = np.where(rise > 0, np.float32(_CLIMB), per_rise)
+    factor: Floats = np.float32(1) + per_rise * rise
+    return factor
+
+
+def polynomial(rise: Floats, coefficients: tuple[float, ...]) -> Floats:
+    """By Horner's rule, from the highest power down."""
+    value: Floats = np.full_like(rise, coefficients[0])
+    for each in coefficients[1:]:
+        value *= rise
+        value += np.float32(each)
+    return value
+
+
+MINETTI = (280.5, -58.7, -76.8, 51.9, 19.6, 2.5)
+"""J per kg and metre of way, by the gradient; of walking."""
+MINETTI_STEEPEST = 0.45
+"""Gradient up to which was measured."""
+
+
+def _minetti(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
+    """Walking at constant metabolic power: pace in proportion to the energy per metre, which the source tells along
+    the slope, here per metre of the map. Beyond what was measured a metre of height costs as much as at its end."""
+    steepest = np.float32(MINETTI_STEEPEST)
+    inside = np.clip(rise, -steepest, steepest)
+    joules = polynomial(inside, MINETTI)
+    along = np.sqrt(np.float32(1) + inside * inside)
+    # Per metre of height the same as at the end: per metre of the map it grows with the rise.
+    beyond = np.maximum(np.abs(rise) / steepest, np.float32(1))
+    factor: Floats = joules * along * beyond / np.float32(MINETTI[-1])
+    return factor
+
+
+HERZOG = (1337.8, 278.19, -517.39, -78.199, 93.419, 19.825, 1.64)
+"""J per kg and metre, by the gradient."""
+
+
+def _herzog(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
+    """Walking at constant metabolic power, by Herzog's polynomial through Minetti's data: it stays positive on all
+    slopes, and is for those of up to 50 %."""
+    # Beyond a grade of 2 the bound is reached anyway, and float32 would overflow.
+    factor: Floats = polynomial(np.clip(rise, -2, 2), HERZOG) / np.float32(HERZOG[-1])
+    return factor
+
+
+def _herzog_wheeled(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
+    """1 + (slope / critical slope)^2: where slope is critical, hairpins are as good as the straight way."""
+    share = np.minimum(rise * np.float32(100 / cost.critical_slope_percent), np.float32(1e6))
+    factor: Floats = np.float32(1) + share * share
+    return factor
+
+
+def _table(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
+    """Straight lines over degrees. Arcus tangent is no correctly rounded operation: the points are taken as rises,
+    and lines in degrees are cut into pieces of a quarter degree at most."""
+    slopes_deg, factors = np.array(cost.slope_table, np.float64).T
+    fine = np.unique(np.concatenate((slopes_deg, np.arange(-356, 357) / 4)))
+    fine = fine[(fine >= slopes_deg[0]) & (fine <= slopes_deg[-1])]
+    rises = np.array([math.tan(math.radians(each)) for each in fine])
+    found: Floats = np.interp(rise, rises, np.interp(fine, slopes_deg, factors)).astype(np.float32)
+    return found
+
+
+def _by_steepness(mean: Factor, about: str, source: str) -> RuleRow:
     """A rule that does not tell uphill from downhill."""
 
     def directed(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
         return mean(np.abs(rise), np.abs(sine), cost)
 
-    return RuleRow(mean, directed)
+    return RuleRow(mean, directed, False, about, source)
 
 
-def _by_direction(directed: Factor) -> RuleRow:
+def _by_direction(directed: Factor, about: str, source: str) -> RuleRow:
     """A rule that tells uphill from downhill; its mean is that of up and down."""
 
     def mean(rise: Floats, sine: Floats, cost: CostConfig) -> Floats:
-        both: Floats = directed(rise, sine, cost) + directed(-rise, -sine, cost)
+        both = _bounded(directed(rise, sine, cost), cost)
+        both += _bounded(directed(-rise, -sine, cost), cost)
         both *= np.float32(0.5)
         return both
 
-    return RuleRow(mean, directed)
+    return RuleRow(mean, directed, True, about, source)
 
 
 SLOPE_RULES: Mapping[SlopeRule, RuleRow] = {
-    "linear": _by_steepness(_linear),
-    "quadratic": _by_steepness(_quadratic),
-    "tobler": _by_direction(_tobler),
-    "energy": _by_direction(_energy),
+    "linear": _by_steepness(
+        _linear, "grows with the sine of the slope to steep_factor at max_slope_deg", "a plain curve"
+    ),
+    "quadratic": _by_steepness(
+        _quadratic, "grows with the square of the sine to steep_factor at max_slope_deg", "a plain curve"
+    ),
+    "energy": _by_direction(
+        _energy,
+        "a wheeled vehicle: rolling resistance and grade against the power of its motor, and of its brakes",
+        "balance of power, as in J. Y. Wong, Theory of Ground Vehicles",
+    ),
+    "tobler": _by_direction(
+        _tobler,
+        "a hiker: 6 exp(-3.5 |slope + 0.05|) km/h, fastest at 5 % down",
+        "W. Tobler, Three presentations on geographical analysis and modeling, NCGIA Technical Report 93-1, 1993",
+    ),
+    "naismith_langmuir": _by_direction(
+        _naismith_langmuir,
+        "a hiker: 5 km/h, 1 h per 600 m up; per 300 m down 10 min less on 5 to 12 degrees, 10 min more beyond",
+        "W. Naismith, Scottish Mountaineering Club Journal 2, 1892; E. Langmuir, Mountaincraft and Leadership,"
+        " 1984",
+    ),
+    "minetti": _by_direction(
+        _minetti,
+        "a walker of constant metabolic power: 2.5 J/kg/m on the level, least at some 15 % down",
+        "A. E. Minetti et al., Energy cost of walking and running at extreme uphill and downhill slopes, Journal of"
+        " Applied Physiology 93, 2002",
+    ),
+    "herzog": _by_direction(
+        _herzog,
+        "a walker of constant metabolic power, by a polynomial for slopes of up to 50 %",
+        "I. Herzog, Theory and practice of cost functions, CAA 2010",
+    ),
+    "herzog_wheeled": _by_steepness(
+        _herzog_wheeled,
+        "carts: 1 + (slope / critical_slope_percent)^2",
+        "I. Herzog, Theory and practice of cost functions, CAA 2010, after Llobera and Sluckin, 2007",
+    ),
+    "table": _by_direction(_table, "points of one's own: slope_table or slope_csv", "the scenario"),
 }
 """Every rule; a new one is a row here and its name in `swarm.config.scenario.SlopeRule`."""

@@ -2,26 +2,31 @@
 
 A cell's pace is then that of level ground, and a step costs its length x the pace of the cell which it enters x the
 factor of its rise. Vehicles and planners read the factor from one table, so a vehicle drives what its route
-promises.
+promises. A step that is steeper along its way than allowed has an infinite factor: no way leads over it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
-from shared_map.terrain.slope_rules import directional_factor
+from shared_map.terrain.slope_rules import directional_factor, step_limits_deg
 from swarm.config.scenario import CostConfig
 from swarm.grid import GridSpec
 
 ENTRIES = 512
 """Entries of the table on each side of level: the rise is resolved to this part of the steepest."""
 _STEEPEST = 4.0
-"""As a grade: 76 degrees. Steeper steps cost as this one."""
+"""As a grade: 76 degrees. Steeper steps cost as this one, so limits beyond it do not count."""
+_HALF, _ROUND = np.float32(ENTRIES), np.float32(0.5)
+_ROOM = ENTRIES / (ENTRIES - 0.51)
+"""What a limit is widened by: it then lies on the border between the last entry and the one before, by a hair on
+the side of what is allowed, and the last stands for all that is steeper."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +34,8 @@ class Climb:
     """The factor that a step's rise puts on its pace.
 
     elevation_m  float32  (rows, cols); a step from or to a void (NaN) is level
-    factors      float32  (2 * ENTRIES + 1) for rises from -steepest to steepest; 1 in the middle
+    factors      float32  (2 * ENTRIES + 1) for rises from -steepest to steepest; 1 in the middle; inf where no step
+                          may be so steep
     steepest     metres per metre; steeper steps cost as much as this
     """
 
@@ -38,20 +44,43 @@ class Climb:
     factors: Floats
     steepest: float
 
-    @property
+    @cached_property
     def lowest(self) -> float:
         """The lowest factor: no step costs less than level ground times this."""
         return float(self.factors.min())
+
+    @cached_property
+    def highest(self) -> float:
+        """The highest factor of a step that is allowed."""
+        return float(self.factors[np.isfinite(self.factors)].max())
 
     @property
     def note(self) -> str:
         """A sentence for people who look at the paces."""
         return (
             "paces are those of level ground; each step costs by what it climbs too,"
-            f" times {self.lowest:.3g} to {self.factors.max():.3g}"
+            f" times {self.lowest:.3g} to {self.highest:.3g}{self._limits()}"
         )
 
-    @property
+    def _limits(self) -> str:
+        said = []
+        for way, factors in (("up", self.factors[ENTRIES:]), ("down", self.factors[ENTRIES::-1])):
+            allowed = int(np.isfinite(factors).sum())
+            if allowed <= ENTRIES:
+                most = (allowed - 0.5) / ENTRIES * self.steepest
+                said.append(f"{math.degrees(math.atan(most)):.3g} degrees {way}")
+        return f", and none is steeper than {' or '.join(said)}" if said else ""
+
+    def allows(self, tail: int, head: int) -> bool:
+        """Whether a step between neighbours (flat indices) is not too steep."""
+        return self.of_step(tail, head) < math.inf
+
+    def driven(self, tail: int, head: int) -> float:
+        """As `of_step`, for a vehicle that is on this step whatever it costs: it turned back where it had climbed,
+        or is on its way out of a closed zone. Never inf: what is too steep is driven as slowly as anything."""
+        return min(self.of_step(tail, head), self.highest)
+
+    @cached_property
     def per_metre(self) -> tuple[np.float32, np.float32]:
         """Entries of the table per metre of rise, of a straight step and of a diagonal one."""
         straight = ENTRIES / (self.steepest * self.grid.resolution_m)
@@ -68,31 +97,28 @@ class Climb:
         )
         straight_per_m, diagonal_per_m = self.per_metre
         at = (heights[heads] - heights[tails]) * np.where(diagonal, diagonal_per_m, straight_per_m)
-        half = np.float32(ENTRIES)
-        at = np.clip(np.where(np.isnan(at), np.float32(0), at), -half, half)
-        factors: Floats = self.factors[(at + half + np.float32(0.5)).astype(np.intp)]
+        at = np.clip(np.where(np.isnan(at), np.float32(0), at), -_HALF, _HALF)
+        factors: Floats = self.factors[(at + _HALF + _ROUND).astype(np.intp)]
         return factors
 
     def of_step(self, tail: int, head: int) -> float:
         """The factor of one step between neighbours (flat indices). Without arrays: vehicles ask many times a
-        second."""
+        second. With the roundings of `along`, so that a step which one allows is allowed by the other."""
         cols = self.grid.cols
         row0, col0 = divmod(tail, cols)
         row1, col1 = divmod(head, cols)
-        climbed_m = float(self.elevation_m[row1, col1]) - float(self.elevation_m[row0, col0])
-        if tail == head or math.isnan(climbed_m):
+        climbed_m = self.elevation_m[row1, col1] - self.elevation_m[row0, col0]
+        if tail == head or climbed_m != climbed_m:
             return 1.0
-        at = climbed_m * float(self.per_metre[row0 != row1 and col0 != col1])
-        return float(self.factors[int(min(max(at, -ENTRIES), ENTRIES) + ENTRIES + 0.5)])
+        at = float(climbed_m * self.per_metre[row0 != row1 and col0 != col1])
+        return float(self.factors[int(np.float32(min(max(at, -ENTRIES), ENTRIES) + ENTRIES) + _ROUND)])
 
 
 def climb_of(grid: GridSpec, elevation_m: Floats, cost: CostConfig) -> Climb | None:
     """The climb of a terrain; None if cost does not depend on direction."""
     if not cost.directional:
         return None
-    steepest = _STEEPEST
-    if cost.max_slope_deg < math.degrees(math.atan(_STEEPEST)):
-        # A hair less: at the very limit ground is lethal, and a step never is.
-        steepest = math.tan(math.radians(cost.max_slope_deg)) * (1 - 1e-5)
+    limit = math.tan(math.radians(min(max(step_limits_deg(cost)), 89.0)))
+    steepest = min(limit * _ROOM, _STEEPEST)
     rises = np.linspace(-steepest, steepest, 2 * ENTRIES + 1, dtype=np.float32)
     return Climb(grid, elevation_m, directional_factor(rises, cost), steepest)

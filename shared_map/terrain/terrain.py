@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from shared_map.terrain.homes import homes_of
 from shared_map.terrain.kept import fetch_kept, keep, kept_key
 from shared_map.terrain.layers import (
     TerrainClass,
+    along_slope_of_padded,
     class_factors,
     grade_of_padded,
     inflate,
@@ -32,8 +33,9 @@ from shared_map.terrain.layers import (
     terrain_pace,
 )
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from shared_map.terrain.zones import paint_zones
+from shared_map.terrain.zones import ZoneFacts, files_of_zone, paint_zones
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import CostConfig, Scenario
@@ -41,6 +43,7 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.plugins.find import source_of
 from swarm.runtime.role import RoleSetup
+from swarm.wire.statements import PACE_MOST
 
 if TYPE_CHECKING:
     from shared_map.terrain.importers.sources import Source
@@ -63,6 +66,7 @@ class Terrain:
     digest            16 hex digits of grid, prior pace and cost rules (and heights, where steps cost by them)
     climb             what a step costs for what it climbs; None if it costs the same both ways
     notes             sentences about where it came from and what was done to it
+    zones             what each zone did to it; empty of a prepared one
     """
 
     grid: GridSpec
@@ -75,6 +79,7 @@ class Terrain:
     vehicle_radius_m: float = 0.0
     climb: Climb | None = None
     notes: tuple[str, ...] = field(default=())
+    zones: tuple[ZoneFacts, ...] = field(default=())
 
     @property
     def lethal(self) -> NDArray[np.bool_]:
@@ -110,15 +115,23 @@ def _built(scenario: Scenario, source: Source, progress: Progress) -> Terrain:
         world = cost_world(grid, source.elevation_m, classes, source.photo, scenario.seed)
         ground = apply_cost_layers(scenario, ground, world)
         notes.append(f"cost layers: {', '.join(each.layer for each in cost.layers)}")
+    zones: list[ZoneFacts] = []
     if cost.zones:
-        paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m))
+        if any(zone.file for zone in cost.zones):
+            classes = classes.copy()
+        zones = paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m), classes)
+        notes.extend(each.told(grid.cells) for each in zones if each.file is not None)
+    if cost.directional and cost.cross_slope_factor > 1:
+        _add_cross_slopes(ground, source.elevation_m, cost, grid, progress)
+    notes.append(said_of_cost(cost))
     photo = source.photo
     if photo is None:
         from shared_map.terrain.synthetic.landscape import paint_photo
 
         photo = paint_photo(source.elevation_m, classes, grid.resolution_m, scenario.seed, progress)
         notes.append("photo painted from elevation and classes, as there is none")
-    return finished(grid, source.elevation_m, photo, classes, ground, cost, tuple(notes))
+    terrain = finished(grid, source.elevation_m, photo, classes, ground, cost, tuple(notes))
+    return replace(terrain, zones=tuple(zones))
 
 
 def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress) -> Floats:
@@ -137,6 +150,17 @@ def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress
 
     in_bands(source.grid.rows, work, "slope and cost", progress)
     return ground
+
+
+def _add_cross_slopes(
+    ground: Floats, elevation_m: Floats, cost: CostConfig, grid: GridSpec, progress: Progress
+) -> None:
+    def work(row0: int, row1: int) -> None:
+        padded_m, part = padded_rows(elevation_m, row0, row1), ground[row0:row1]
+        dearer = part * along_slope_of_padded(padded_m, grid.resolution_m, cost)
+        np.minimum(dearer, np.float32(PACE_MOST), out=part, where=np.isfinite(part))
+
+    in_bands(grid.rows, work, "slope and cost", progress)
 
 
 def finished(
@@ -199,8 +223,11 @@ def _digest(grid: GridSpec, pace: Floats, cost: CostConfig, elevation_m: Floats 
     digest.update(np.ascontiguousarray(pace).data)
     if elevation_m is not None:
         digest.update(np.ascontiguousarray(elevation_m).data)
-    # Where a mask lies differs between machines; what it painted is in the pace.
-    zones = tuple(msgspec.structs.replace(z, mask=z.mask and Path(z.mask).name) for z in cost.zones)
+    # Where a file lies differs between machines; what it painted is in the pace.
+    zones = tuple(
+        msgspec.structs.replace(z, mask=z.mask and Path(z.mask).name, file=z.file and Path(z.file).name)
+        for z in cost.zones
+    )
     digest.update(msgspec.json.encode(msgspec.structs.replace(cost, zones=zones), order="sorted"))
     return digest.hexdigest()
 
@@ -242,8 +269,11 @@ def build_truth(scenario: Scenario, terrain: Terrain) -> Floats:
 def scenario_key(scenario: Scenario) -> str:
     """Fingerprint of all that a terrain is built from: a prepared one with another key is another terrain."""
     parts = {"format": FORMAT, "seed": scenario.seed, "terrain": scenario.terrain, "cost": scenario.cost}
-    files = [name for name in (scenario.terrain.source, scenario.terrain.photo) if name]
-    stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in map(Path, files) if path.is_file()]
+    named = scenario.terrain
+    names = (named.source, named.photo, named.labels, named.cover, named.cover_codes)
+    files = [Path(name) for name in names if name]
+    files += [path for zone in (*scenario.cost.zones, *named.hidden.zones) for path in files_of_zone(zone)]
+    stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in files if path.is_file()]
     layers = [source_of(named, scenario.plugin_folder) for named in cost_layers_of(scenario)]
     payload = msgspec.json.encode([parts, stamps, layers], order="sorted")
     return hashlib.blake2b(payload, digest_size=8).hexdigest()

@@ -1,46 +1,305 @@
-"""Zones: parts of the terrain, drawn as polygons or painted as masks, with a cost of their own."""
+"""Zones: parts of the terrain with a cost of their own, drawn as polygons, painted as masks, or read from files."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import assert_never
+from typing import TYPE_CHECKING, Any, assert_never
 
 import numpy as np
 
-from shared_map.arrays import Bools, Floats
+from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.importers.rasters import mask_of
-from shared_map.terrain.layers import LETHAL, polygon_mask
+from shared_map.terrain.layers import LETHAL, TerrainClass, polygon_mask
+from shared_map.terrain.places import MapFrame
 from swarm.config.scenario import CostConfig, ZoneConfig
 from swarm.errors import TerrainError
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, Window
+from swarm.places import corners_of, extent_of
+from swarm.wire.statements import PACE_LEAST, PACE_MOST
+
+if TYPE_CHECKING:
+    from shared_map.terrain.importers.zone_files import Burnt, FileFacts
 
 PREFERRED_FACTOR = np.float32(0.5)
 ROUGH_FACTOR = np.float32(2.0)
+_BESIDE = (".shx", ".dbf", ".prj", ".cpg")
+"""What belongs to a Shapefile."""
+_APPROACH_CELLS = 3
+"""So many cells of road on either side of a bridge are opened with it: water covers every cell that it touches, and
+has a width by its class, so that it may reach beyond the ends of the bridge."""
+
+
+@dataclass(frozen=True)
+class ZoneFacts:
+    """What a zone did to the terrain, for people.
+
+    cells    that it covers
+    changed  whose pace it changed
+    lethal   that it made lethal
+    opened   that were lethal and are not, by its road or its bridges
+    file     of features: which were used, which not, and why
+    """
+
+    name: str
+    kind: str
+    cells: int
+    changed: int
+    lethal: int
+    opened: int
+    file: FileFacts | None = None
+
+    def told(self, cells: int) -> str:
+        """A sentence; `cells` is how many the terrain has."""
+        shape = f"{self.kind} zone" + (f" {self.name!r}" if self.name != self.kind else "")
+        text = f"{self.cells} cells, {self.changed} changed"
+        if self.lethal:
+            text += f", {self.lethal / cells:.1%} of the terrain made lethal"
+        if self.opened:
+            text += f", {self.opened} opened"
+        if self.file is None:
+            return f"{shape}: {text}"
+        file = self.file
+        layer = f" layer {file.layer!r}" if file.layer and file.layer != Path(file.file).stem else ""
+        parts = [f"{shape} from {file.file}{layer} in {file.crs}: {file.used} of {file.features}"]
+        parts[0] += " features" if file.layer else " values"
+        if file.bridges:
+            parts[0] += f" ({file.bridges} bridge{'s' * (file.bridges > 1)})"
+        parts.append(text)
+        left_out = [f"{file.outside} outside of the terrain, or without a shape"] if file.outside else []
+        for why, count in file.skipped.most_common(6):
+            names = file.named.get(why, [])
+            left_out.append(f"{count} {why}" + (f" (feature {', '.join(names)})" if names else ""))
+        if left_out:
+            parts.append(f"left out: {', '.join(left_out)}")
+        if file.mended:
+            shown = ", ".join(file.mended[:5]) + (" ..." if len(file.mended) > 5 else "")
+            parts.append(f"{len(file.mended)} that cross themselves were mended: feature {shown}")
+        return "; ".join(parts)
+
+    def as_json(self, cells: int) -> dict[str, Any]:
+        """Fields of `--json`; shares are of all cells."""
+        facts: dict[str, Any] = {
+            "name": self.name,
+            "kind": self.kind,
+            "cells": self.cells,
+            "changed": self.changed,
+            "opened": self.opened,
+            "lethal_share": round(self.lethal / cells, 6),
+        }
+        if self.file is not None:
+            file = self.file
+            facts |= {
+                "file": file.file,
+                "layer": file.layer,
+                "crs": file.crs,
+                "features": file.features,
+                "used": file.used,
+                "outside": file.outside,
+                "skipped": dict(file.skipped),
+                "skipped_ids": file.named,
+                "mended_ids": file.mended,
+                "bridges": file.bridges,
+                "classes": dict(file.classes),
+            }
+        return facts
 
 
 def paint_zones(
-    pace: Floats, zones: Sequence[ZoneConfig], grid: GridSpec, cost: CostConfig, void: Bools | None = None
-) -> None:
-    """Paint zones onto a pace, in place: step 3 of the merge rule in `layers`."""
+    pace: Floats,
+    zones: Sequence[ZoneConfig],
+    grid: GridSpec,
+    cost: CostConfig,
+    void: Bools | None = None,
+    classes: Bytes | None = None,
+) -> list[ZoneFacts]:
+    """Paint zones onto a pace, in place: step 3 of the merge rule in `layers`.
+
+    classes  of the cells: those of roads and water from files are entered, if given
+
+    Raises TerrainError with one sentence.
+    """
+    painter = _Painter(pace, grid, cost, void, classes)
+    painted = []
     for zone in zones:
-        inside = zone_mask(zone, grid)
+        painted.append(painter.read(zone))
+        painter.cost(painted[-1])
+    for each in painted:
+        painter.water(each)
+    for each in painted:
+        painter.bridges(each)
+    for each in painted:
+        painter.forbidden(each)
+    return [each.facts() for each in painted]
+
+
+_NOTHING = (Window(0, 0, 0, 0), np.zeros((0, 0), np.float32))
+
+
+@dataclass(eq=False)
+class _Painted:
+    """A zone while it is painted. Parts are (window, array).
+
+    values  factor or pace, NaN where there is none; kept after they are painted where a bridge needs them only
+    lethal  where it is lethal
+    """
+
+    zone: ZoneConfig
+    values: tuple[Window, Floats] | None
+    lethal: tuple[Window, Bools] | None
+    burnt: Burnt | None = None
+    cells: int = 0
+    counts: dict[str, int] = field(default_factory=lambda: {"changed": 0, "lethal": 0, "opened": 0})
+
+    def facts(self) -> ZoneFacts:
+        file = None if self.burnt is None else self.burnt.facts
+        return ZoneFacts(self.zone.called, self.zone.kind, self.cells, **self.counts, file=file)
+
+
+def _around(inside: Bools) -> Window:
+    """The smallest window that holds all cells of a mask; there is one."""
+    rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    return Window(int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1)
+
+
+def _part(window: Window) -> tuple[slice, slice]:
+    return slice(window.row0, window.row1), slice(window.col0, window.col1)
+
+
+class _Painter:
+    def __init__(
+        self, pace: Floats, grid: GridSpec, cost: CostConfig, void: Bools | None, classes: Bytes | None
+    ) -> None:
+        self._pace, self._grid, self._cost, self._classes = pace, grid, cost, classes
+        self._void = void
+        self._road_pace = np.float32(1 / cost.road_speed_m_per_s)
+        self._water: Bools | None = None
+
+    def read(self, zone: ZoneConfig) -> _Painted:
+        """What a zone covers."""
+        if zone.file is not None:
+            from shared_map.terrain.importers.zone_files import burn_zone
+
+            burnt = burn_zone(zone, self._grid, f"zone {zone.called!r}")
+            cells = int((~np.isnan(burnt.values[1])).sum()) + int(burnt.lethal[1].sum())
+            return _Painted(zone, burnt.values, burnt.lethal, replace(burnt, values=_NOTHING), cells)
+        inside = zone_mask(zone, self._grid)
+        window = _around(inside)
+        inside = inside[_part(window)]
+        found = _Painted(zone, None, None, cells=int(inside.sum()))
+        if zone.kind in ("forbidden", "water"):
+            found.lethal = (window, inside.copy())
+        else:
+            found.values = (window, np.where(inside, np.float32(zone.value or 1.0), np.float32(np.nan)))
+        return found
+
+    def cost(self, painted: _Painted) -> None:
+        """What is no more than costly."""
+        zone = painted.zone
+        if painted.values is not None and not painted.values[0].empty:
+            window, values = painted.values
+            self._set(painted, window, self._changed(zone, window, values, from_file=zone.file is not None))
+        if painted.burnt is None or painted.burnt.bridges[0].empty:
+            painted.values = None
+
+    def _changed(self, zone: ZoneConfig, window: Window, values: Floats, *, from_file: bool) -> Floats:
+        """The pace of a window with a zone in it."""
+        before = self._pace[_part(window)]
+        inside = ~np.isnan(values)
+        after = before.copy()
         match zone.kind:
             case "preferred":
-                pace[inside] *= PREFERRED_FACTOR
+                after[inside] *= PREFERRED_FACTOR
             case "rough":
-                pace[inside] *= ROUGH_FACTOR
+                after[inside] *= ROUGH_FACTOR
+            case "factor" | "water":
+                after[inside] = self._possible(before[inside] * values[inside])
+            case "pace":
+                inside &= np.isfinite(before)
+                after[inside] = self._possible(values[inside])
             case "road":
-                if void is not None:
-                    inside &= ~void
-                pace[inside] = np.float32(1 / cost.road_speed_m_per_s)
+                self._lay(window, after, values, inside, from_file)
             case "forbidden":
                 pass  # painted last
             case _:
                 assert_never(zone.kind)
-    for zone in zones:
-        if zone.kind == "forbidden":
-            pace[zone_mask(zone, grid)] = LETHAL
+        return after
+
+    def _lay(self, window: Window, after: Floats, values: Floats, inside: Bools, from_file: bool) -> None:
+        if self._void is not None:
+            inside = inside & ~self._void[_part(window)]
+        road = self._possible(values[inside] * self._road_pace)
+        # A way is driven on where it is quicker than the ground beside it, or the ground is closed.
+        after[inside] = np.minimum(after[inside], road) if from_file else road
+        if from_file and self._classes is not None:
+            self._classes[_part(window)][inside] = TerrainClass.ROAD
+
+    @staticmethod
+    def _possible(pace: Any) -> Any:
+        """Costly is not lethal: what is finite stays so, and within what any message may say."""
+        return np.where(np.isinf(pace), LETHAL, np.clip(pace, np.float32(PACE_LEAST), np.float32(PACE_MOST)))
+
+    def water(self, painted: _Painted) -> None:
+        """Water closes what it covers, roads too; so does what paces and factors say to be lethal."""
+        if painted.zone.kind not in ("water", "pace", "factor") or painted.lethal is None:
+            return
+        window, wet = painted.lethal
+        if painted.zone.kind == "water" and self._classes is not None and painted.burnt is not None:
+            self._classes[_part(window)][wet] = TerrainClass.WATER
+        self._close(painted)
+        if self._water is None:
+            self._water = np.zeros(self._pace.shape, np.bool_)
+        self._water[_part(window)] |= wet
+
+    def bridges(self, painted: _Painted) -> None:
+        """Bridges open the water beneath them, and the ends of their roads that lie in it."""
+        if painted.values is None or painted.burnt is None or self._water is None:
+            return
+        window, values = painted.values
+        over, deck = painted.burnt.bridges
+        if window.empty or over.empty:
+            return
+        from scipy import ndimage
+
+        bridge = np.zeros(self._pace.shape, np.bool_)
+        bridge[_part(over)] = deck
+        road = ~np.isnan(values) & self._water[_part(window)]
+        open_ = ndimage.binary_dilation(
+            bridge[_part(window)] & road, np.ones((3, 3), np.bool_), iterations=_APPROACH_CELLS, mask=road
+        )
+        after = self._pace[_part(window)].copy()
+        self._lay(window, after, values, open_, from_file=True)
+        painted.counts["opened"] += int((np.isinf(self._pace[_part(window)]) & np.isfinite(after)).sum())
+        self._pace[_part(window)] = after
+
+    def forbidden(self, painted: _Painted) -> None:
+        """What is forbidden is lethal, whatever else was painted there; so are roads of a lethal class."""
+        if painted.zone.kind in ("forbidden", "road"):
+            self._close(painted)
+
+    def _close(self, painted: _Painted) -> None:
+        if painted.lethal is not None and not painted.lethal[0].empty:
+            window, closed = painted.lethal
+            self._set(painted, window, np.where(closed, LETHAL, self._pace[_part(window)]))
+
+    def _set(self, painted: _Painted, window: Window, after: Floats) -> None:
+        part = _part(window)
+        before, counts = self._pace[part], painted.counts
+        counts["changed"] += int((before != after).sum())
+        counts["lethal"] += int((np.isfinite(before) & np.isinf(after)).sum())
+        counts["opened"] += int((np.isinf(before) & np.isfinite(after)).sum())
+        self._pace[part] = after
+
+
+def files_of_zone(zone: ZoneConfig) -> list[Path]:
+    """Files that a zone is read from, those beside them included; some of these may not exist."""
+    if zone.file is None:
+        return [] if zone.mask is None else [Path(zone.mask)]
+    path = Path(zone.file)
+    if path.suffix.lower() != ".shp":
+        return [path]
+    return [path, *(path.with_suffix(ending) for ending in _BESIDE)]
 
 
 def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
@@ -48,6 +307,15 @@ def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
     covers none."""
     if zone.mask is not None:
         inside = mask_of(Path(zone.mask), grid)
+    elif zone.polygon is not None:
+        frame = MapFrame(grid)
+        corners = corners_of(zone.polygon, frame, f"{where} {zone.name or zone.kind!r}: polygon")
+        side_m = grid.resolution_m
+        inside = polygon_mask([(col * side_m, row * side_m) for row, col in corners], grid)
+        if not inside.any():
+            raise TerrainError(
+                f"{where} {zone.name or zone.kind!r} covers no cell of the terrain: {extent_of(frame)}"
+            )
     else:
         inside = polygon_mask(zone.polygon_m or (), grid)
     if not inside.any():

@@ -13,9 +13,11 @@ from typing import Any
 
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
+from swarm.places import Given, cell_of, written
 from swarm.wire.messages.processes import RunInfo
 
 WGS84 = "EPSG:4326"
+_EARTH_M = 6_371_000.0
 Point = tuple[float, float]
 _Transform = Callable[[float, float], Point]
 
@@ -61,6 +63,16 @@ class Frame:
                 f"{east_m:.10g} and y_m {south_m:.10g} ... {grid.north_m:.10g} in {self.crs[:40]}"
             )
         return grid.cell(row, col)
+
+    def cell_named(self, place: Given) -> int:
+        """The cell of a place as commands and scenarios have it: `"48.27,9.44"` (latitude, longitude), `"xy:X,Y"`
+        in metres of the map, `"cell:ROW,COL"`, or `(row, col)`. Raises ConfigError in one sentence."""
+        return cell_of(place, self, "the place")
+
+    def written(self, cell: int) -> str:
+        """A cell for people, in each form that `cell_named` reads. Raises as `centre_m` and `to_wgs84`."""
+        self.centre_m(cell)
+        return written(self, cell)
 
     def centre_m(self, cell: int) -> Point:
         """(x_m, y_m) of the middle of a cell. Raises ConfigError on one outside the terrain."""
@@ -123,16 +135,26 @@ class Frame:
         if self.crs == "local":
             raise ConfigError('this terrain has no coordinates (its crs is "local"): give x_m and y_m')
         try:
-            from pyproj import Transformer
+            from pyproj import CRS, Transformer
             from pyproj.exceptions import CRSError
         except ModuleNotFoundError as error:
             raise ConfigError("latitudes and longitudes need pyproj: pip install 'terrain-swarm[wgs84]'") from error
         try:
-            there = Transformer.from_crs(WGS84, self.crs, always_xy=True)
-            back = Transformer.from_crs(self.crs, WGS84, always_xy=True)
+            system = CRS.from_user_input(self.crs)
+            degrees = _degrees_of(system)
+            there = Transformer.from_crs(degrees, system, always_xy=True)
+            back = Transformer.from_crs(system, degrees, always_xy=True)
         except CRSError as error:
             raise ConfigError(f"pyproj does not know the terrain's crs {self.crs[:60]!r}") from error
         return there.transform, back.transform
+
+
+def _degrees_of(system: Any) -> str:
+    """What latitudes and longitudes are on the body on which a system lies: WGS 84 on the Earth."""
+    ellipsoid = system.ellipsoid
+    if ellipsoid is None or abs(ellipsoid.semi_major_metre - _EARTH_M) < 0.01 * _EARTH_M:
+        return WGS84
+    return f"+proj=longlat +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +no_defs"
 
 
 def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:

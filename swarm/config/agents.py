@@ -24,15 +24,15 @@ class AgentPlan(msgspec.Struct, frozen=True):
 class AddedAgent(msgspec.Struct, frozen=True):
     """An agent that joins a run which its scenario does not name it in.
 
-    at  [row, col] near which its vehicles enter; anywhere if None
+    at  place near which its vehicles enter, as a target's `start`; anywhere if None
     """
 
     plan: AgentPlan
-    at: tuple[int, int] | None = None
+    at: tuple[int, int] | str | None = None
 
 
 def added_agent(
-    scenario: Scenario, id: str, group: str, count: int, at: tuple[int, int] | None = None
+    scenario: Scenario, id: str, group: str, count: int, at: tuple[int, int] | str | None = None
 ) -> AddedAgent:
     """Vehicles of a group of the scenario, beside those that it has. Raises ConfigError where that cannot be."""
     groups = {each.name: each for each in scenario.groups}

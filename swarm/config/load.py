@@ -6,25 +6,24 @@ import ipaddress
 import re
 from collections import Counter
 from pathlib import Path
-from typing import get_args
 
 import msgspec
 
+from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import explain, nearest
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import (
     MOST_TARGETS,
     RESERVED_GROUP,
-    WHOLE_TREE_STRATEGIES,
     PlannerConfig,
     Scenario,
-    Strategy,
     TlsConfig,
     ZoneConfig,
     ids_of,
 )
 from swarm.errors import ConfigError
+from swarm.places import read_place
 from swarm.ranks import split_rank
 
 
@@ -35,11 +34,12 @@ def load_scenario(path: Path) -> Scenario:
 
 def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
     """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given."""
-    raw = parse_toml(text, source, ConfigError)
+    raw = with_preset(parse_toml(text, source, ConfigError))
     try:
         scenario = msgspec.convert(raw, Scenario)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {explain(str(error), raw, Scenario)}") from error
+    scenario = msgspec.structs.replace(scenario, cost=with_slope_csv(scenario.cost, source, base))
     _check(scenario, source)
     return scenario if base is None else _anchored(scenario, base)
 
@@ -64,12 +64,16 @@ def _check(scenario: Scenario, source: str) -> None:
         ("terrain.hidden.zones", scenario.terrain.hidden.zones),
     ):
         for n, zone in enumerate(zones):
-            if zone.polygon_m is None and zone.mask is None:
-                raise ConfigError(f"{source}: {key}[{n}]: missing required field `polygon_m` (or `mask`)")
-            if zone.polygon_m is not None and zone.mask is not None:
-                raise ConfigError(f"{source}: {key}[{n}]: polygon_m and mask exclude each other")
+            _check_zone(zone, f"{source}: {key}[{n}]")
+    for n, target in enumerate(scenario.targets):
+        if target.start is not None:
+            read_place(target.start, f"{source}: targets[{n}].start")
+    for n, group in enumerate(scenario.groups):
+        for place in group.cells:
+            read_place(place, f"{source}: groups[{n}].cells")
     for plugin in plugins_of(scenario):
         check_name(plugin, source)
+    check_cost(scenario.cost, source)
     if scenario.cost.directional:
         _check_directional(scenario.planner, source)
     names = [group.name for group in scenario.groups]
@@ -99,13 +103,29 @@ def _check(scenario: Scenario, source: str) -> None:
             check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
 
 
+_VALUES = {"factor": "factor", "pace": "pace_s_per_m"}
+
+
+def _check_zone(zone: ZoneConfig, where: str) -> None:
+    given = [key for key in ("polygon", "polygon_m", "mask", "file") if getattr(zone, key) is not None]
+    if not given:
+        raise ConfigError(f"{where}: missing required field `polygon` (or `polygon_m`, `mask`, `file`)")
+    if len(given) > 1:
+        raise ConfigError(f"{where}: {given[0]} and {given[1]} exclude each other")
+    for corner in zone.polygon or ():
+        read_place(corner, f"{where}.polygon")
+    if zone.file is None:
+        of_files = [key for key in ("layer", "crs", "attribute", "width_m", "classes") if getattr(zone, key)]
+        if of_files:
+            raise ConfigError(f"{where}: {of_files[0]} goes with file only, found {given[0]}")
+        if zone.kind in _VALUES and zone.value is None:
+            raise ConfigError(f"{where}: missing required field `{_VALUES[zone.kind]}`")
+    for kind, key in _VALUES.items():
+        if getattr(zone, key) is not None and zone.kind != kind:
+            raise ConfigError(f"{where}: {key} goes with kind {kind}, found {zone.kind!r}")
+
+
 def _check_directional(planner: PlannerConfig, source: str) -> None:
-    if planner.strategy in get_args(Strategy) and planner.strategy not in WHOLE_TREE_STRATEGIES:
-        allowed = " or ".join(map(repr, WHOLE_TREE_STRATEGIES))
-        raise ConfigError(
-            f"{source}: planner.strategy: {planner.strategy!r} does not go with cost.directional = true, as windows"
-            f" and corridors know one cost per cell; expected {allowed}, which grow whole trees"
-        )
     if planner.length_weight:
         raise ConfigError(
             f"{source}: planner.length_weight: {planner.length_weight:g} does not go with cost.directional = true;"
@@ -142,6 +162,10 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
         source = str(base / source)
     photo = None if terrain.photo is None else str(base / terrain.photo)
     labels = None if terrain.labels is None else str(base / terrain.labels)
+    cover = None if terrain.cover is None else str(base / terrain.cover)
+    codes = terrain.cover_codes
+    if codes is not None and codes not in COVER_TABLES:
+        codes = str(base / codes)
     hidden = msgspec.structs.replace(terrain.hidden, zones=_anchored_zones(terrain.hidden.zones, base))
     cost = msgspec.structs.replace(scenario.cost, zones=_anchored_zones(scenario.cost.zones, base))
     network = scenario.network
@@ -149,15 +173,22 @@ def _anchored(scenario: Scenario, base: Path) -> Scenario:
         tls = network.tls
         tls = TlsConfig(ca=str(base / tls.ca), certificate=str(base / tls.certificate), key=str(base / tls.key))
         network = msgspec.structs.replace(network, tls=tls)
-    terrain = msgspec.structs.replace(terrain, source=source, photo=photo, labels=labels, hidden=hidden)
+    files = {"source": source, "photo": photo, "labels": labels, "cover": cover, "cover_codes": codes}
+    terrain = msgspec.structs.replace(terrain, **files, hidden=hidden)
     folder = str(base / scenario.plugin_folder)
     return msgspec.structs.replace(scenario, terrain=terrain, cost=cost, network=network, plugin_folder=folder)
 
 
 def _anchored_zones(zones: tuple[ZoneConfig, ...], base: Path) -> tuple[ZoneConfig, ...]:
     return tuple(
-        zone if zone.mask is None else msgspec.structs.replace(zone, mask=str(base / zone.mask)) for zone in zones
+        msgspec.structs.replace(
+            zone,
+            mask=zone.mask and str(base / zone.mask),
+            file=zone.file and str(base / zone.file),
+        )
+        for zone in zones
     )
 
 
 BUILT_IN_TERRAINS = ("jacksboro", "synthetic")
+COVER_TABLES = ("worldcover", "corine", "corine-level-3", "nlcd")

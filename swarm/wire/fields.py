@@ -218,8 +218,8 @@ class Bounded(msgspec.Struct, frozen=True):
 
 
 class Part(msgspec.Struct, frozen=True):
-    """Base of structs which a message lists by the hundred. The `Bounded` that lists them checks all ids at once,
-    because a call for each takes as long as all else about it."""
+    """Base of structs of which a message lists hundreds: the `Bounded` that lists them checks their ids all at
+    once, because a call for each takes as long as all else about it."""
 
 
 Rule = Callable[[Any], None]

@@ -59,7 +59,8 @@ def test_bucket_queue_and_radix_heap_give_the_same_costs_to_the_last_bit(rules: 
         parent = np.empty(ground.size, np.uint8)
         longest = ground.highest_cell_cost * ground.diagonal
         assert longest <= MAX_RATIO * ground.lowest_cell_cost  # so that it is buckets that grow it
-        grow_tree(ground.padded, ground.lowest_cell_cost, ground.highest_cell_cost, root, by_buckets, None)
+        bounds = ground.lowest_cell_cost, ground.highest_cell_cost, ground.dearest_step
+        grow_tree(ground.padded, None, bounds, root, by_buckets, None)
         scratch = radix_heap.make_scratch(ground.size, ground.rule)
         radix_heap.grow_by_radix_heap(ground.padded, (by_heap, parent, root), ground.lowest_cell_cost, scratch)
         np.testing.assert_array_equal(by_heap, by_buckets)

@@ -204,10 +204,18 @@ RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
 ]
 
 
+FIRST = {
+    "a_first_cell_is_taken_from_a_table_that_is_about_to_free_it": 66,
+    "a_robot_that_is_replaced_says_that_it_has_ended": 23,
+    "a_cell_that_was_shut_for_a_guest_is_anybodys": 67,
+}
+"""Histories tried before the others, as they collided last: what is rare is found soon."""
+
+
 @pytest.mark.parametrize("broken", RULES, ids=lambda rule: rule.__name__)
 def test_each_rule_is_needed(broken: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
     broken(monkeypatch)
-    for seed in range(96):
+    for seed in (FIRST.get(broken.__name__, 0), *range(96)):
         world = (world_of, borders_of)[seed % 2](seed // 2)
         world.run(QUIET_S)
         if world.collisions:

@@ -51,6 +51,7 @@ def test_a_sample_of_problems_has_the_published_lengths(scenario: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda path: path.name)
 def test_every_problem_has_the_published_length(scenario: Path) -> None:
     assert_lengths(scenario, None)

@@ -101,7 +101,7 @@ def test_a_repair_may_concern_the_whole_map(rules: dict) -> None:
         tree, ground = work.tree, work.ground
         labels = (tree.cost, tree.parent, ground.pad(work.root))
         most = (10**9, 10**9, 10**9)
-        given = (ground.padded, labels, changes.cells, changes.before, ground.buckets, most)
+        given = (ground.padded, None, labels, changes.cells, changes.before, ground.buckets, most)
         taken, highest = kernels.repair(*given, ground.repair_scratch)
         assert taken > 1000
         tree.reach = float(highest)
@@ -142,7 +142,7 @@ def test_costs_do_not_depend_on_the_width_or_number_of_buckets(width: float) -> 
         tree, ground = work.tree, work.ground
         labels = (tree.cost, tree.parent, ground.pad(work.root))
         buckets, most = (width, count), (10**9, 10**9, 10**9)
-        given = (ground.padded, labels, changes.cells, changes.before, buckets, most)
+        given = (ground.padded, None, labels, changes.cells, changes.before, buckets, most)
         taken, highest = kernels.repair(*given, ground.repair_scratch)
         assert taken > 0
         tree.reach = max(tree.reach, float(highest))
@@ -158,7 +158,7 @@ def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(rules: dict) 
         changes: Changes = work.ground.apply(work.pace, windows)
         ground, heuristic = work.ground, work.tree.cost.copy()
         labels = (heuristic, np.empty(0, np.uint8), 0)
-        given = (ground.padded, labels, changes.cells, changes.before, ground.buckets, (0, 0, 10**9))
+        given = (ground.padded, None, labels, changes.cells, changes.before, ground.buckets, (0, 0, 10**9))
         done, _ = kernels.repair(*given, ground.repair_scratch)
         assert done > 0
         work.tree.grow(work.root)

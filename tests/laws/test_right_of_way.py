@@ -252,10 +252,20 @@ RULES: list[Callable[[pytest.MonkeyPatch], None]] = [
 ]
 
 
+FIRST = {
+    "stores_after_a_promise": 39,
+    "an_older_life_goes_on": 14,
+    "forgets_where_an_older_life_may_stand": 14,
+    "seats_a_file_that_is_not_the_first": 18,
+    "acts_on_a_table_that_is_not_the_newest": 37,
+}
+"""Histories tried before the others, as they collided last: what is rare is found soon."""
+
+
 @pytest.mark.parametrize("broken", RULES, ids=lambda rule: rule.__name__)
 def test_each_rule_is_needed(broken: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch) -> None:
     broken(monkeypatch)
-    for seed in range(96):
+    for seed in (FIRST.get(broken.__name__, 0), *range(96)):
         world = (world_of, borders_of, world_of, duel_of)[seed % 4](seed // 2)
         world.run(QUIET_S)
         if world.collisions:

@@ -42,17 +42,7 @@ def test_a_long_walk_with_marks_keeps_the_laws(strategy: str) -> None:
     pace = random_pace(rng, 40, 37, 10.0, 0.15)
     config = PlannerConfig(strategy=strategy, k_min=1, cpu_budget=1e-9, full_every=5)  # type: ignore[arg-type]
     play = Play(pace, config)
-    for step in range(60):
-        play.happen(Move(int(rng.integers(-1, 2)), int(rng.integers(-1, 2))))
-        if step % 3 == 0:
-            play.happen(Marks(step, 2))
-        if step % 10 == 5:
-            play.happen(Job("begin"))
-        if step % 10 == 8:
-            play.happen(Job("end"))
-        if step % 6 == 0:
-            play.check()
-    play.check()
+    play.walk(rng, 60, 6)
 
 
 @pytest.mark.parametrize("jump", [5, 8, 16, 30])

@@ -20,8 +20,8 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
             3,
             "every cell of the terrain is lethal",
         ),
-        ('walk = "waypoints"', "start = [500, 3]", 2, "start [500, 3] is outside the terrain of 96 x 128 cells"),
-        ("vehicles = 12", "vehicles = 12\ncells = [[3, 500]]", 2, "cell [3, 500] is outside the terrain"),
+        ('walk = "waypoints"', "start = [500, 3]", 2, "start is [500, 3], outside the terrain: 96 x 128 cells"),
+        ("vehicles = 12", "vehicles = 12\ncells = [[3, 500]]", 2, "cell is [3, 500], outside the terrain"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_one_sentence(

@@ -19,6 +19,7 @@ from swarm.errors import SwarmError
 
 pytestmark = pytest.mark.network
 
+SIGNALS = [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough), signal.SIGKILL]
 SMALL = ("bench", "swarm", "--vehicles", "20", "--targets", "2")
 
 
@@ -66,7 +67,7 @@ def test_a_swarm_of_twenty_is_measured_and_written_into_the_page(temporary: Path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_bench_that_is_ended_takes_its_swarm_with_it(temporary: Path, number: signal.Signals) -> None:
     with (temporary / "said").open("w") as said:
         bench = subprocess.Popen([*SWARM, *SMALL, "--seconds", "300"], stdout=said, stderr=said)
@@ -88,7 +89,7 @@ def test_a_bench_that_is_ended_takes_its_swarm_with_it(temporary: Path, number: 
             os.kill(pid, signal.SIGKILL)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize(
     ("words", "processes"),
     [("crowd --seeds 0:50", 2), ("swarm --vehicles 100 --simulated --seconds 600", 1)],

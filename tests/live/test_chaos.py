@@ -39,7 +39,7 @@ def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(
     assert running(runs) == {}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGTERM, marks=pytest.mark.thorough), signal.SIGKILL])
 def test_chaos_that_ends_takes_its_swarm_with_it(tmp_path: Path, number: signal.Signals) -> None:
     runs = tmp_path / "runs"
     with (tmp_path / "said").open("w") as said:

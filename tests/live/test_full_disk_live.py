@@ -22,7 +22,7 @@ def test_where_nothing_more_can_be_written_the_swarm_goes_on_and_says_so(tmp_pat
 
     command = [*SWARM, "up", str(write_scenario(tmp_path)), "--runs", str(tmp_path / "runs")]
     told = subprocess.run(
-        [*command, "--plain", "--seconds", "15"],
+        [*command, "--plain", "--seconds", "10"],
         capture_output=True, text=True, timeout=150, check=False, preexec_fn=limit,
     )  # fmt: skip
     (run_dir,) = (tmp_path / "runs").iterdir()

@@ -174,7 +174,7 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
     for options, sentence in (
         (("--group", "none"), "has no group 'none'"),
         (("--id", "a0"), "has an agent 'a0' itself"),
-        (("--at", "five"), "expected ROW,COL"),
+        (("--at", "five"), "expected LAT,LON"),
         (("--count", 99), "an agent hosts 1 to 6 vehicles"),
     ):
         refused = add(live, *options)

@@ -86,7 +86,7 @@ def test_an_added_target_gets_a_planner_and_is_chased(running: LiveSwarm) -> Non
 
     def routed() -> bool:
         found = swarm("route", "--target", "x", "--row", 40, "--col", 60, "--connect", running.endpoint)
-        return found.returncode == 0 and "to x in" in found.stdout
+        return found.returncode == 0 and "to x at cell:" in found.stdout
 
     eventually(routed, 40, "a route to the new target")
     assert order(running, "group", "all", "targets", "x")["silent"] == []
@@ -122,7 +122,7 @@ def test_a_person_gives_an_order_by_a_selector_and_reads_json(running: LiveSwarm
         (("zone", "remove", "nowhere"), "there is no zone"),
         (("vehicle", "stop", "a7-00"), "vehicle 'a7-00': there is none"),
         (("target", "add", "t0", "--at", "4,4"), "is there already"),
-        (("target", "move", "t1", "--at", "4000,4"), "is not in 96 x 128 cells"),
+        (("target", "move", "t1", "--at", "4000,4"), "outside the terrain"),
         (("group", "grey", "targets", "t0"), "there is none"),
         (("set", "seed", "4"), "cannot change while the swarm runs"),
     ],

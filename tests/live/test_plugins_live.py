@@ -73,7 +73,7 @@ def test_a_swarm_all_whose_plugins_fail_names_each_and_goes_on(tmp_path: Path) -
         vehicles="sensor = 'failing:Hangs'\nassignment = 'failing:Silent'\ndynamics = 'failing:Unspeakable'",
         also="[planner]\nstrategy = 'failing:Silent'\n",
     )
-    told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 25, "--plain", timeout_s=110)
+    told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 12, "--plain", timeout_s=110)
     said = told.stdout + told.stderr
     assert told.returncode == 0, said
     for sentence in (
@@ -112,7 +112,7 @@ web_port = 0
 def test_the_examples_of_all_pages_run_together(tmp_path: Path) -> None:
     path = write_all_examples(tmp_path, ALL.format(port=free_ports(1)[0]))
     assert sum(line.count(":") for line in path.read_text().splitlines() if '"tcp' not in line) == 6
-    told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 20, "--plain", timeout_s=110)
+    told = swarm("up", path, "--runs", tmp_path / "runs", "--seconds", 8, "--plain", timeout_s=110)
     said = told.stdout + told.stderr
     assert told.returncode == 0, said
     assert "plug-in" not in said

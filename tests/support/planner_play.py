@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from support import slow_twins as naive
@@ -13,6 +14,7 @@ from planner_service.full_growth import GrownTree
 from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.corridors import CorridorSearch
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.routes import RouteStatus
@@ -32,18 +34,20 @@ class Play:
         *,
         has_worker: bool = False,
         chosen_by: Strategy | None = None,
+        climb: Climb | None = None,
     ) -> None:
         self.pace = pace
         self.config = config
         self.grid = GridSpec(*pace.shape, 1.0)
-        self.tree = TargetTree(self.grid, config, None, all_kernels, has_worker=has_worker, chosen_by=chosen_by)
+        self.tree = TargetTree(self.grid, config, climb, all_kernels, has_worker=has_worker, chosen_by=chosen_by)
         self.has_worker = has_worker
         self.version = 0
         self.target = int(np.flatnonzero(np.isfinite(pace))[0])
         self.grown: GrownTree | None = None
         self.search: CorridorSearch | None = None
         self.since: list[Window] = []
-        self.rules = {
+        self.rules: dict[str, Any] = {
+            "climb": climb,
             "neighbours": config.neighbours,
             "edge": config.edge,
             "corner_cutting": config.corner_cutting,
@@ -78,6 +82,23 @@ class Play:
                 self.search = None
         elif event.what == "force":
             self.tree.force([0, self.grid.cells - 1])
+
+    def walk(self, rng: np.random.Generator, steps: int, check_every: int) -> set[str]:
+        """Moves to random neighbours, with marks and a worker's growths now and then. Returns what was grown."""
+        kinds = set()
+        for step in range(steps):
+            self.happen(Move(int(rng.integers(-1, 2)), int(rng.integers(-1, 2))))
+            kinds.add(self.last.kind)
+            if step % 3 == 0:
+                self.happen(Marks(step, 2))
+            if step % 10 == 5:
+                self.happen(Job("begin"))
+            if step % 10 == 8:
+                self.happen(Job("end"))
+            if step % check_every == 0:
+                self.check()
+        self.check()
+        return kinds
 
     def _mark(self, event: Marks) -> Window:
         rng = np.random.default_rng(event.seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import heapq
 import itertools
 import math
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from shared_map.terrain.step_climb import Climb
 from swarm.grid import STEP_COL, STEP_ROW
 
 
@@ -41,7 +43,11 @@ def steps(
 
 
 def graph_into(
-    pace: NDArray[np.float32], neighbours: int = 8, edge: str = "octile", corner_cutting: bool = False
+    pace: NDArray[np.float32],
+    neighbours: int = 8,
+    edge: str = "octile",
+    corner_cutting: bool = False,
+    climb: Climb | None = None,
 ) -> csr_matrix:
     """The graph of all steps with every edge turned round, so that a search from the target finds the ways to
     it."""
@@ -59,8 +65,27 @@ def graph_into(
         out.append(cells[here][legal])
         into.append(cells[there][legal])
         costs.append(pace[there][legal].astype(np.float64) * step_length(direction, edge))
+        if climb is not None:
+            costs[-1] *= climb.along(out[-1], into[-1])
+            allowed = np.isfinite(costs[-1])
+            out[-1], into[-1], costs[-1] = out[-1][allowed], into[-1][allowed], costs[-1][allowed]
     shape = (pace.size, pace.size)
     return csr_matrix((np.concatenate(costs), (np.concatenate(into), np.concatenate(out))), shape=shape)
+
+
+@functools.lru_cache(maxsize=4)
+def factors_of(climb: Climb) -> list[list[float]]:
+    """Of each direction and cell: the factor of the step; 1 where it would leave the grid."""
+    rows, cols = climb.grid.rows, climb.grid.cols
+    row, col = np.divmod(np.arange(rows * cols), cols)
+    found = []
+    for direction in range(8):
+        r = np.clip(row + STEP_ROW[direction], 0, rows - 1)
+        c = np.clip(col + STEP_COL[direction], 0, cols - 1)
+        inside = (abs(r - row) == abs(STEP_ROW[direction])) & (abs(c - col) == abs(STEP_COL[direction]))
+        factors = climb.along(row * cols + col, np.where(inside, r * cols + c, row * cols + col))
+        found.append(np.where(inside, factors, 1.0).tolist())
+    return found
 
 
 def cost_to_go(
@@ -69,9 +94,11 @@ def cost_to_go(
     neighbours: int = 8,
     edge: str = "octile",
     corner_cutting: bool = False,
+    climb: Climb | None = None,
 ) -> NDArray[np.float64]:
     """Cheapest cost from every cell to the target on cells of one metre, by scipy on the reversed graph."""
-    found: NDArray[np.float64] = dijkstra(graph_into(pace, neighbours, edge, corner_cutting), indices=target)
+    graph = graph_into(pace, neighbours, edge, corner_cutting, climb)
+    found: NDArray[np.float64] = dijkstra(graph, indices=target)
     return found.reshape(pace.shape)
 
 
@@ -117,6 +144,7 @@ def follow(
     neighbours: int = 8,
     edge: str = "octile",
     corner_cutting: bool = False,
+    climb: Climb | None = None,
 ) -> tuple[int, float] | None:
     """(last cell, cost) of a route on cells of one metre; None if it breaks a rule on the way."""
     rows, cols = pace.shape
@@ -131,6 +159,9 @@ def follow(
                 return None
             if not corner_cutting and (pace[row, c] == math.inf or pace[r, col] == math.inf):
                 return None
-        total += float(pace[r, c]) * step_length(direction, edge)
+        factor = 1.0 if climb is None else factors_of(climb)[direction][row * cols + col]
+        if factor == math.inf:
+            return None
+        total += float(pace[r, c]) * step_length(direction, edge) * factor
         row, col = r, c
     return row * cols + col, total

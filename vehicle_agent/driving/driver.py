@@ -68,7 +68,7 @@ class Driver:
             before = motion.cell
             pace_s_per_m = self._physics.item(motion.head)
             if climb is not None:
-                pace_s_per_m *= climb.of_step(motion.tail, motion.head)
+                pace_s_per_m *= climb.driven(motion.tail, motion.head)
             if self._dynamics is None:
                 left_s = motion.advance(left_s, pace_s_per_m)
             else:

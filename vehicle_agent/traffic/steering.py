@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
@@ -36,6 +37,7 @@ class Steering:
     pace         float32 (rows, cols), s/m; inf is lethal; read at each call
     reserve      cells ahead of itself that a vehicle may be granted
     bodies       what speaks no right of way: its cells are passed as lethal ones are, but by routes
+    climb        says which steps are too steep; None if none is
 
     ways_out     cell that only an operator's zone closes -> steps from there out of it: who stands there leaves
     """
@@ -47,8 +49,10 @@ class Steering:
         planner: PlannerConfig,
         reserve: int,
         bodies: Bodies,
+        climb: Climb | None = None,
     ) -> None:
         self._grid = grid
+        self._climb = climb
         self._pace = pace.reshape(-1)
         self._diagonal = planner.neighbours == 8
         self._corner_cutting = planner.corner_cutting
@@ -67,7 +71,7 @@ class Steering:
         """Whether the map allows the step between two neighbours; a diagonal also needs the cells beside it."""
         if tail in self.ways_out:
             return head in self._out_of(tail)
-        if self.closed(head):
+        if self.closed(head) or not (self._climb is None or self._climb.allows(tail, head)):
             return False
         cols = self._grid.cols
         rows, col = head // cols - tail // cols, head % cols - tail % cols
@@ -87,6 +91,8 @@ class Steering:
             south, east = np.diff(rows), np.diff(cols)
             beside = np.isinf(self._pace[at[:-1] + east]) | np.isinf(self._pace[at[:-1] + south * self._grid.cols])
             lethal |= beside & (south != 0) & (east != 0)
+        if self._climb is not None:
+            lethal |= np.isinf(self._climb.along(at[:-1], at[1:]))
         return int(lethal.argmax()) if lethal.any() else len(cells) - 1
 
     def wish(
@@ -187,7 +193,9 @@ class Steering:
             sides = around[direction - 1] is not None and around[(direction + 1) % 8] is not None
             if direction % 2 == 0 or (self._diagonal and (sides or self._corner_cutting)):
                 steps.append(found)
-        return steps
+        if self._climb is None:
+            return steps
+        return [each for each in steps if self._climb.allows(cell, each)]
 
     def _places(self, route: Sequence[int]) -> list[tuple[int, int, float]]:
         """(row, column, cells of the route from there on) of each cell of a route."""

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
-from shared_map.terrain.importers.georeference import bounds_in, crs_of, resampling
+from shared_map.terrain.importers.georeference import bounds_in, crs_name, crs_of, resampling
 from shared_map.terrain.importers.rasters import opened
+from shared_map.terrain.importers.true_colour import MOST_SIDE, why_drawn
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -27,11 +28,13 @@ class Photo:
     rgb    uint8 (rows, cols, 3): red, green, blue; black where it shows nothing
     seen   bool (rows, cols): where it shows anything
     notes  what was done to it, for people
+    drawn  that its own pixels are those of a drawn map, for people; None if they may be a photo's
     """
 
     rgb: Bytes
     seen: Bools
     notes: tuple[str, ...]
+    drawn: str | None = None
 
 
 def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Progress = no_progress) -> Photo:
@@ -69,7 +72,7 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
             return _read(dataset, grid, None, None, [], progress)
         crs = crs_of(dataset.crs, given_crs if not dataset.crs else None, what)
         target = rasterio.CRS.from_user_input(grid.crs)
-        share = _overlap(dataset, crs, target, grid, what)
+        share = overlap(dataset, crs, target, grid, what)
         notes = [f"photo: {dataset.height} x {dataset.width} pixels, covers {share:.1%} of the terrain"]
         aligned = crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3)
         return _read(dataset, grid, crs, None if aligned else target, notes, progress)
@@ -82,8 +85,18 @@ def transform_of(grid: GridSpec) -> Any:
     return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
 
 
-def _overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
-    west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+def overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
+    """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target, what)
+    except (RasterioError, CPLE_BaseError) as error:
+        names = crs_name(crs), crs_name(target)
+        raise TerrainError(
+            f"{what} is in {names[0]}, from which no way leads to the terrain's {names[1]}"
+        ) from error
     grid_east = grid.west_m + grid.cols * grid.resolution_m
     grid_south = grid.north_m - grid.rows * grid.resolution_m
     wide = min(east, grid_east) - max(west, grid.west_m)
@@ -129,7 +142,22 @@ def _read(dataset: Any, grid: GridSpec, crs: Any, target: Any, notes: list[str],
         raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
     if not seen.all():
         notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
-    return Photo(rgb, seen, tuple(notes))
+    return Photo(rgb, seen, tuple(notes), _why_drawn(dataset, indexes, palette))
+
+
+def _why_drawn(dataset: Any, indexes: list[int], palette: NDArray[np.uint8] | None) -> str | None:
+    """Looked for in the file's own pixels, in its middle."""
+    from rasterio.windows import Window
+
+    if len(indexes) == 1 and palette is None:
+        return None
+    if any(dataset.dtypes[index - 1] != "uint8" for index in indexes):
+        return None
+    rows, cols = min(dataset.height, MOST_SIDE), min(dataset.width, MOST_SIDE)
+    window = Window((dataset.width - cols) // 2, (dataset.height - rows) // 2, cols, rows)
+    stored = dataset.read(indexes, window=window)
+    rgb = np.moveaxis(stored, 0, -1) if palette is None else palette[stored[0]]
+    return why_drawn(rgb, dataset.dataset_mask(window=window) > 0)
 
 
 def _band(dataset: Any, index: int, row0: int, row1: int, grid: GridSpec, crs: Any, target: Any) -> NDArray[Any]:

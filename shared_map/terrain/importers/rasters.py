@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.georeference import crs_of, plan_grid, resampling
-from shared_map.terrain.importers.level_ground import MOST_SAMPLED, looked_at, without
+from shared_map.terrain.importers.level_ground import MOST_SAMPLED, looked_at
 from shared_map.terrain.importers.raster_kinds import kind_of
+from shared_map.terrain.importers.voids import without
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.config.input_files import size
 from swarm.config.scenario import TerrainConfig
@@ -31,18 +32,22 @@ _MAX_PIXELS = 16 * MAX_CELLS
 """Of formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
 """A block is what has to be unpacked at once."""
+_MOST_BLOCKS = 1 << 20
+"""Of a band of a sparse file."""
 _MAX_BANDS = 256
 _LONGEST_REASON = 200
 _UNITS_M = {
-    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
-    **dict.fromkeys(("us survey foot", "us-ft", "ftus", "ft us"), 1200 / 3937),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
+    **dict.fromkeys(("us survey foot", "us survey feet", "survey foot", "survey feet", "us foot"), 1200 / 3937),
+    **dict.fromkeys(("us feet", "us ft", "ftus", "ft us", "foot us", "usft"), 1200 / 3937),
+    **dict.fromkeys(("fathom", "fathoms"), 1.8288),
     **dict.fromkeys(("dm", "decimetre", "decimeter"), 0.1),
     **dict.fromkeys(("cm", "centimetre", "centimeter", "centimetres", "centimeters"), 0.01),
     **dict.fromkeys(("mm", "millimetre", "millimeter"), 0.001),
     **dict.fromkeys(("km", "kilometre", "kilometer"), 1000.0),
     **dict.fromkeys(("", "m", "metre", "meter", "metres", "meters"), 1.0),
 }
-"""What a file may call the unit of its heights, in metres."""
+"""What a file may call the unit of its heights, in metres. Written as `_plain_unit` leaves it."""
 _READ_ROWS = 512
 
 
@@ -123,16 +128,35 @@ def _check_size(dataset: Any, what: str) -> None:
 
 
 def _check_length(path: Path, dataset: Any, what: str) -> None:
-    """An uncompressed file must be as long as its header says: a header can promise 20 GB."""
+    """An uncompressed file must be as long as its header says, but for blocks that were never written: a header can
+    promise 20 GB."""
     if dataset.driver != "GTiff" or dataset.compression is not None:
         return
     promised = dataset.width * dataset.height * sum(np.dtype(dtype).itemsize for dtype in dataset.dtypes)
-    sparse = dataset.tags(ns="IMAGE_STRUCTURE").get("SPARSE_OK")
-    if path.stat().st_size < promised and not sparse:
+    if path.stat().st_size < promised and _is_cut(dataset, path.stat().st_size):
         raise TerrainError(
             f"{what} {path} is truncated: its header promises {dataset.height} x {dataset.width} cells,"
             f" {size(promised)}, and it has {size(path.stat().st_size)}; fetch it again"
         )
+
+
+def _is_cut(dataset: Any, length: int) -> bool:
+    """Whether a block of a GeoTIFF lies beyond the end of its file. A sparse file has blocks that lie nowhere."""
+    written = 0
+    for band, (high, wide) in enumerate(dataset.block_shapes, 1):
+        rows, cols = -(-dataset.height // high), -(-dataset.width // wide)
+        if rows * cols > _MOST_BLOCKS:
+            return True
+        for block in range(rows * cols):
+            place = f"{block % cols}_{block // cols}"
+            offset = dataset.get_tag_item(f"BLOCK_OFFSET_{place}", "TIFF", bidx=band)
+            if offset is None:
+                continue
+            written += 1
+            size_of_block = dataset.get_tag_item(f"BLOCK_SIZE_{place}", "TIFF", bidx=band)
+            if int(offset) + int(size_of_block or 0) > length:
+                return True
+    return written == 0
 
 
 def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_progress) -> Raster:
@@ -153,57 +177,61 @@ def read_elevation(path: Path, config: TerrainConfig, progress: Progress = no_pr
         If the file cannot be read, holds no heights, or does not fit a grid (see `plan_grid`).
     """
     with opened(path, "terrain") as dataset:
-        if dataset.count >= 3:
-            raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
-        if np.dtype(dataset.dtypes[0]).kind not in "iuf":
-            raise TerrainError(
-                f"terrain {path} holds {dataset.dtypes[0]} values; heights are whole or real numbers"
-            )
-        crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
-        grid, target, notes = plan_grid(
-            dataset.transform, dataset.height, dataset.width, crs, config.resolution_m, f"terrain {path}"
+        return elevation_of(dataset, path, config, progress)
+
+
+def elevation_of(dataset: Any, path: Path, config: TerrainConfig, progress: Progress = no_progress) -> Raster:
+    """As `read_elevation`, of a dataset that is open; `path` names it in errors."""
+    if dataset.count >= 3:
+        raise TerrainError(f"terrain {path} has {dataset.count} bands: a photo? Name it in terrain.photo")
+    if np.dtype(dataset.dtypes[0]).kind not in "iuf":
+        raise TerrainError(f"terrain {path} holds {dataset.dtypes[0]} values; heights are whole or real numbers")
+    crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
+    grid, target, notes = plan_grid(
+        dataset.transform, dataset.height, dataset.width, crs, config.resolution_m, f"terrain {path}"
+    )
+    factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
+    if (factor, offset) != (1.0, 0.0):
+        notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")
+    unit = _plain_unit(dataset.units[0] or "")
+    unit_m = _UNITS_M.get(unit, 1.0)
+    if unit_m != 1.0:
+        factor, offset = factor * unit_m, offset * unit_m
+        notes.append(f"heights are in {unit}, put into metres")
+    elif unit not in _UNITS_M and config.height_scale is None:
+        notes.append(f"heights are in {unit[:40]!r}, which is unknown, and taken for metres: terrain.height_scale")
+    elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
+        name, metres = crs.linear_units_factor
+        notes.append(
+            f"distances are in {name}, and heights, of which the file says nothing, are taken for metres; if"
+            f" they are not, terrain.height_scale = {metres:.6g}"
         )
-        factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
+    if config.height_scale is not None:
+        factor, offset = factor * config.height_scale, offset * config.height_scale
+    if dataset.count == 2:
+        notes.append("the file has two bands; heights are taken from the first")
+    sample = _sampled(dataset)
+    voids, found, told = looked_at(sample, config, factor, offset)
+    notes.extend(told)
+    level = _placed_mask(dataset, found, crs, grid, target)
+    elevation_m = np.empty((grid.rows, grid.cols), np.float32)
+    heights = _heights_without(dataset, voids, path) if voids and target is not None else None
+    for row0, row1 in bands(grid.rows, _READ_ROWS):
+        band = elevation_m[row0:row1]
+        if target is None:
+            _read_straight(dataset, row0, row1, band, voids)
+        else:
+            _read_warped(dataset, heights, crs, grid, target, row0, band)
         if (factor, offset) != (1.0, 0.0):
-            notes.append(
-                f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied"
-            )
-        unit = (dataset.units[0] or "").lower()
-        unit_m = _UNITS_M.get(unit, 1.0)
-        if unit_m != 1.0:
-            factor, offset = factor * unit_m, offset * unit_m
-            notes.append(f"heights are in {unit}, put into metres")
-        elif unit not in _UNITS_M and config.height_scale is None:
-            notes.append(
-                f"heights are in {unit[:40]!r}, which is unknown, and taken for metres: terrain.height_scale"
-            )
-        elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
-            name, metres = crs.linear_units_factor
-            notes.append(
-                f"distances are in {name}, and heights, of which the file says nothing, are taken for metres; if"
-                f" they are not, terrain.height_scale = {metres:.6g}"
-            )
-        if config.height_scale is not None:
-            factor, offset = factor * config.height_scale, offset * config.height_scale
-        if dataset.count == 2:
-            notes.append("the file has two bands; heights are taken from the first")
-        sample = _sampled(dataset)
-        voids, found, told = looked_at(sample, config, factor, offset)
-        notes.extend(told)
-        level = _placed_mask(dataset, found, crs, grid, target)
-        elevation_m = np.empty((grid.rows, grid.cols), np.float32)
-        heights = _heights_without(dataset, voids, path) if voids and target is not None else None
-        for row0, row1 in bands(grid.rows, _READ_ROWS):
-            band = elevation_m[row0:row1]
-            if target is None:
-                _read_straight(dataset, row0, row1, band, voids)
-            else:
-                _read_warped(dataset, heights, crs, grid, target, row0, band)
-            if (factor, offset) != (1.0, 0.0):
-                band *= np.float32(factor)
-                band += np.float32(offset)
-            progress("reading heights", row1 / grid.rows)
+            band *= np.float32(factor)
+            band += np.float32(offset)
+        progress("reading heights", row1 / grid.rows)
     return Raster(grid, elevation_m, level, tuple(notes))
+
+
+def _plain_unit(text: str) -> str:
+    """A unit without case, brackets and signs: [m], US_survey_foot, ft (US)."""
+    return " ".join("".join(sign if sign.isalnum() else " " for sign in text.lower()).split())
 
 
 def _sampled(dataset: Any) -> Floats:

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from shared_map.arrays import Bools, Floats
+from shared_map.terrain.importers.degrees import equidistant, metres_per_degree
 from shared_map.terrain.importers.ground_cover import classified, with_photo, with_water, without_voids
 from shared_map.terrain.importers.raster_kinds import is_raster
 from shared_map.terrain.importers.source import Source as Source
@@ -61,12 +63,28 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
         source = _from_file(Path(config.source), config, progress)
     source = without_voids(source, config)
     if config.photo is not None:
+        config = _photo_or_cover(config)
+    if config.photo is not None:
         source = with_photo(source, Path(config.photo), config, progress)
     if source.photo is not None:
         source = classified(source, config, seed, progress)
     elif config.labels is not None:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
-    return with_water(source, config)
+    source = with_water(source, config)
+    if config.cover is not None:
+        from shared_map.terrain.importers.land_cover import with_cover
+
+        source = with_cover(source, config, progress)
+    return source
+
+
+def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
+    """The settings with a photo that is a drawn map of land cover named as such."""
+    from shared_map.terrain.importers.cover_meaning import is_drawn
+
+    if config.photo is None or config.cover is not None or config.labels is not None:
+        return config
+    return replace(config, photo=None, cover=config.photo) if is_drawn(Path(config.photo), config) else config
 
 
 # --- built in -----------------------------------------------------------------------------------------------
@@ -84,7 +102,7 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
     from shared_map.terrain.importers.plain_files import read_npz
-    from shared_map.terrain.synthetic.landscape import cover, flat_water
+    from shared_map.terrain.synthetic.landscape import cover
 
     plain = read_npz(_jacksboro_path())
     assert plain.heights is not None
@@ -92,11 +110,11 @@ def _jacksboro(config: TerrainConfig, seed: int) -> Source:
         plain.heights, plain.step, plain.west, plain.north, config, JACKSBORO_FILE
     )
     classes = cover(elevation_m, grid.resolution_m, seed)
-    # Lakes are level in the file's own whole metres, no longer after resampling.
-    wet = flat_water(plain.heights)
-    classes[wet[_nearest(wet.shape[0], wet.shape[1], grid)]] = TerrainClass.WATER
+    _, level, told = _looked_at(plain.heights, 1.0, config)
+    if config.level_is == "water":
+        classes[level[_nearest(level.shape[0], level.shape[1], grid)]] = TerrainClass.WATER
     origin = "Jacksboro fault, Tennessee: USGS 3 arc seconds, public domain, from matplotlib's sample data"
-    return Source(grid, elevation_m, classes, notes=(origin, note))
+    return Source(grid, elevation_m, classes, notes=(origin, note, *told))
 
 
 def _jacksboro_path() -> Path:
@@ -125,10 +143,15 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 
 def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.terrain.importers.rasters import read_elevation
+    from shared_map.terrain.importers.coded_rasters import of_other_contents
+    from shared_map.terrain.importers.rasters import elevation_of, opened
 
     _check_hgt(path)
-    raster = read_elevation(path, config, progress)
+    with opened(path, "terrain") as dataset:
+        source = of_other_contents(dataset, path, config, progress)
+        if source is not None:
+            return source
+        raster = elevation_of(dataset, path, config, progress)
     classes = np.zeros(raster.elevation_m.shape, np.uint8)
     return Source(raster.grid, raster.elevation_m, classes, level=raster.level, notes=(str(path), *raster.notes))
 
@@ -146,15 +169,19 @@ def _check_hgt(path: Path) -> None:
 
 def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A grey image of heights: needs to be told how many metres a grey level and a cell are."""
+    from shared_map.terrain.importers.coded_rasters import of_other_contents
     from shared_map.terrain.importers.georeference import check_size
     from shared_map.terrain.importers.rasters import opened
 
-    if config.resolution_m is None or config.height_scale is None:
-        raise TerrainError(
-            f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel) and"
-            " terrain.height_scale (metres per grey level)"
-        )
     with opened(path, "terrain") as dataset:
+        source = of_other_contents(dataset, path, config, progress)
+        if source is not None:
+            return source
+        if config.resolution_m is None or config.height_scale is None:
+            raise TerrainError(
+                f"terrain {path}: an image has no scale; set terrain.resolution_m (metres per pixel) and"
+                " terrain.height_scale (metres per grey level)"
+            )
         if dataset.count not in (1, 2):
             raise TerrainError(f"terrain {path} has {dataset.count} colour bands; heights are one grey band")
         check_size(dataset.height, dataset.width, f"terrain {path}")
@@ -167,7 +194,8 @@ def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
     """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
-    from shared_map.terrain.importers.level_ground import looked_at, without
+    from shared_map.terrain.importers.level_ground import looked_at
+    from shared_map.terrain.importers.voids import without
 
     voids, level, told = looked_at(stored.astype(np.float32), config, scale)
     return without(stored.astype(np.float32), voids) * np.float32(scale), level, told
@@ -175,8 +203,11 @@ def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Flo
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     from shared_map.terrain.importers.plain_files import read_asc, read_npz
+    from shared_map.terrain.importers.text_grids import read_text_grid
 
-    plain = read_asc(path) if path.suffix.lower() == ".asc" else read_npz(path)
+    suffix = path.suffix.lower()
+    read = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)
+    plain = read(path)
     assert plain.heights is not None
     step, photo = plain.step, plain.photo
     heights, level, told = _looked_at(plain.heights, config.height_scale or 1.0, config)
@@ -185,7 +216,7 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
             raise TerrainError(f"terrain {path} does not say how large a cell is; set terrain.resolution_m")
         step = (config.resolution_m, config.resolution_m)
     degrees = plain.degrees or _geographic(config.crs)
-    if path.suffix.lower() == ".asc" and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
+    if suffix != ".npz" and not degrees and config.crs is None and step[0] < 0.1 and abs(plain.west) <= 180:
         raise TerrainError(
             f"terrain {path}: a cell of {step[0]:g} looks like degrees; set terrain.crs = 'EPSG:4326'"
         )
@@ -197,7 +228,10 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
         photo = photo[_nearest(photo.shape[0], photo.shape[1], grid)]
     classes = np.zeros(heights.shape, np.uint8)
     level = level[_nearest(level.shape[0], level.shape[1], grid)]
-    return Source(grid, heights, classes, photo, level=level, notes=(str(path), note, *told))
+    notes = [str(path), *plain.notes, note, *told]
+    if read is read_text_grid and plain.step != (0.0, 0.0) and grid.crs == "local":
+        notes.append("x and y are taken for metres of a system without a name; terrain.crs names it")
+    return Source(grid, heights, classes, photo, level=level, notes=tuple(notes))
 
 
 def _nearest(rows: int, cols: int, grid: GridSpec) -> tuple[Any, ...]:
@@ -249,6 +283,8 @@ _READERS: Mapping[str, Callable[[Path, TerrainConfig, Progress], Source]] = {
     ".zip": _raster,
     ".asc": _heights,
     ".npz": _heights,
+    ".csv": _heights,
+    ".xyz": _heights,
     ".png": _png,
     ".map": _map,
     ".yaml": _map,
@@ -266,14 +302,6 @@ def is_terrain(path: Path) -> bool:
 # --- onto the grid ------------------------------------------------------------------------------------------
 
 
-def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
-    """Metres in one degree of latitude and of longitude on WGS 84, to the millimetre."""
-    phi = math.radians(latitude_deg)
-    lat = 111132.954 - 559.822 * math.cos(2 * phi) + 1.175 * math.cos(4 * phi)
-    lon = 111412.84 * math.cos(phi) - 93.5 * math.cos(3 * phi)
-    return round(lat, 3), round(lon, 3)
-
-
 def _from_degrees(
     heights: Floats, step: tuple[float, float], west: float, north: float, config: TerrainConfig, what: str
 ) -> tuple[Floats, GridSpec, str]:
@@ -282,7 +310,7 @@ def _from_degrees(
     if not (abs(middle) < 85 and abs(west) <= 360):
         raise TerrainError(f"{what}: its middle is at latitude {middle:g}; degrees must lie between -85 and 85")
     per_lat, per_lon = metres_per_degree(middle)
-    crs = f"+proj=eqc +lat_ts={middle:.6f} +lon_0={west:.6f} +datum=WGS84 +units=m +no_defs"
+    crs = equidistant(middle, west)
     metric = (step[0] * per_lon, step[1] * per_lat)
     if what == JACKSBORO_FILE and config.resolution_m is None:
         config = _at(config, JACKSBORO_RESOLUTION_M)
@@ -290,9 +318,7 @@ def _from_degrees(
 
 
 def _at(config: TerrainConfig, resolution_m: float) -> TerrainConfig:
-    import msgspec
-
-    return msgspec.structs.replace(config, resolution_m=resolution_m)
+    return replace(config, resolution_m=resolution_m)
 
 
 def _from_metres(

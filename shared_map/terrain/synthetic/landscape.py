@@ -6,9 +6,8 @@ Only additions, products and square roots of seeded numbers, so that a seed give
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.arrays import Bytes, Floats
 from shared_map.terrain import layers
 from shared_map.terrain.layers import TerrainClass, grade_of_padded, gradient, gradient_of_padded
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
@@ -26,6 +25,8 @@ TINT = np.array(
         [186, 178, 164],  # ROAD
         [164, 122, 108],  # BUILT
         [236, 240, 244],  # SNOW
+        [104, 116, 66],  # SHRUB
+        [88, 108, 94],  # WETLAND
     ],
     np.uint8,
 )
@@ -144,35 +145,6 @@ def _grade(elevation_m: Floats, resolution_m: float) -> Floats:
 
     in_bands(elevation_m.shape[0], work)
     return steepness
-
-
-def flat_water(elevation_m: Floats, at_least: int = 4) -> Bools:
-    """Level patches: cells exactly as high as all eight neighbours, in patches of `at_least`, and their shores.
-
-    Elevation models are levelled on lakes; real ground is never as flat as that. A plain (more than a third of the
-    terrain) is no lake.
-
-    Parameters
-    ----------
-    elevation_m : float32 (rows, cols), m
-        As in the file: after resampling no lake is level any more.
-    at_least : int
-        Cells of the smallest patch, without its shore.
-
-    Returns
-    -------
-    bool (rows, cols)
-    """
-    from scipy import ndimage
-
-    level = ndimage.maximum_filter(elevation_m, 3) == ndimage.minimum_filter(elevation_m, 3)
-    labels, count = ndimage.label(level, structure=np.ones((3, 3), np.int8))
-    if count == 0 or level.mean() > 1 / 3:
-        return np.zeros(elevation_m.shape, np.bool_)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    lakes: NDArray[np.bool_] = sizes[labels] >= at_least
-    return np.asarray(ndimage.binary_dilation(lakes, np.ones((3, 3), np.bool_)), np.bool_)
 
 
 LEVEL_LIGHT = 0.70710678

@@ -304,6 +304,7 @@ def test_tables_fit_into_eighty_columns(words: tuple[str, ...]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_cold_cache_takes_longer_than_a_warm_one() -> None:
     report = bench("start", "--size", "64", "--runs", "1", "--no-kernels")
     assert [row["until"] for row in report["rows"]] == ["tree", "tree", "route", "route"]

@@ -4,27 +4,31 @@ from __future__ import annotations
 
 import csv
 import json
+from itertools import product
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import rasterio
-from hypothesis import given
-from hypothesis import strategies as st
+from numpy.typing import NDArray
 from rasterio.transform import from_origin
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 from typer.testing import CliRunner
 
 from launch_scripts.commands.query import app
-from launch_scripts.commands.route_on_terrain import find_route, profile_of
+from launch_scripts.commands.reach import corridor
+from launch_scripts.commands.route_files import DescribedRoute, metres_along, profile_of, write_route
+from launch_scripts.commands.route_on_terrain import find_route
 from launch_scripts.commands.terrain import app as terrain_app
-from shared_map.terrain.places import latitudes_of, middles_of, parse_place
-from swarm.errors import ConfigError, SwarmError
+from launch_scripts.launcher.options import find_scenario
+from shared_map.terrain.terrain import build_terrain
+from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 
 SYSTEM = "EPSG:32632"
 ALPS = GridSpec(60, 80, 20.0, 500_000.0, 5_200_000.0, SYSTEM)
-SITE = GridSpec(60, 80, 20.0)
 
 
 @pytest.fixture(scope="module")
@@ -43,43 +47,15 @@ def hill(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@given(st.integers(0, ALPS.cells - 1))
-def test_every_way_to_name_a_cell_means_that_cell(cell: int) -> None:
-    row, col = ALPS.row_col(cell)
-    (lat,), (lon,) = latitudes_of(ALPS, np.array([cell]))
-    (x_m,), (y_m,) = middles_of(ALPS, np.array([cell]))
-    for text in (f"cell:{row},{col}", f"xy:{x_m},{y_m}", f"{lat},{lon}", f" latlon:{lat}, {lon}"):
-        assert parse_place(text.strip(), ALPS, "--from") == cell
-    assert parse_place(f"{(col + 0.5) * 20},{-(row + 0.5) * 20}", SITE, "--from") == cell
-
-
-@pytest.mark.parametrize(
-    ("text", "grid", "complaint"),
-    [
-        ("nowhere", ALPS, "--from is 'nowhere'; expected LAT,LON"),
-        ("nan,nan", ALPS, "expected LAT,LON"),
-        ("1e999,1", ALPS, "no latitude and longitude"),
-        ("500100,5199900", ALPS, r"write xy:X,Y"),
-        ("0,0", ALPS, r"outside the terrain: 60 x 80 cells, x 500000 to 501600.*latitude 46\.\d+ to 46"),
-        ("cell:60,0", ALPS, "outside the terrain"),
-        ("cell:-1,0", SITE, "outside the terrain"),
-        ("latlon:46,9", SITE, "has no place; give xy:X,Y"),
-    ],
-)
-def test_a_bad_place_is_refused_in_a_sentence(text: str, grid: GridSpec, complaint: str) -> None:
-    with pytest.raises(ConfigError, match=complaint):
-        parse_place(text, grid, "--from")
-
-
 def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp_path: Path) -> None:
     route = find_route(str(hill), "cell:10,5", "cell:10,75")
-    assert route.found.cells[:, 0].max() >= 50
-    assert route.found.gap == pytest.approx(1, abs=1e-3)
-    assert route.at_s[-1] == pytest.approx(route.found.cost_s, rel=1e-4)
-    assert route.at_m[-1] == pytest.approx(route.found.length_m, rel=1e-6)
+    assert (route.cells // route.grid.cols).max() >= 50
+    assert route.gap == pytest.approx(1, abs=1e-3)
+    assert route.at_s[-1] == pytest.approx(route.cost_s, rel=1e-4)
+    assert route.at_m[-1] == pytest.approx(route.length_m, rel=1e-6)
     assert (np.diff(route.at_s) > 0).all()
     assert "m" in profile_of(route)
-    for ending in ("geojson", "gpx", "kml", "csv"):
+    for ending in ("geojson", "gpx", "kml", "csv", "png"):
         words = [
             "--terrain",
             hill,
@@ -108,7 +84,9 @@ def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp
 
 
 def test_what_cannot_be_is_said_in_a_sentence(hill: Path, tmp_path: Path) -> None:
-    with pytest.raises(SwarmError, match=r"--from is on lethal ground \(cell:10,35, class unknown\)"):
+    with pytest.raises(
+        SwarmError, match=r"--from is on lethal ground, cell:10,35 \(xy:.*, latlon:46.*\), class unknown"
+    ):
         find_route(str(hill), "cell:10,35", "cell:10,75")
     for words, complaint in (
         (["--terrain", str(hill), "--from", "cell:1,1"], "give --from and --to"),
@@ -132,7 +110,7 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(h
     with rasterio.open(tmp_path / "s.tif") as file:
         seconds = file.read(1)
         assert (file.crs.to_string(), file.nodata, file.shape) == (SYSTEM, -1.0, (60, 80))
-    assert seconds[10, 5] == pytest.approx(find_route(str(hill), "cell:10,5", "cell:10,75").found.cost_s, rel=1e-5)
+    assert seconds[10, 5] == pytest.approx(find_route(str(hill), "cell:10,5", "cell:10,75").cost_s, rel=1e-5)
     assert seconds[10, 35] == -1
     assert seconds[10, 75] == 0
     areas = [*words, str(tmp_path / "a.geojson"), "--every-s", "60", "--json"]
@@ -145,3 +123,92 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(h
         CliRunner().invoke(terrain_app, ["reach", *areas[:-2], "0.001"], catch_exceptions=False)
     with pytest.raises(SwarmError, match="--to is on lethal ground"):
         CliRunner().invoke(terrain_app, ["reach", str(hill), "--to", "cell:10,35"], catch_exceptions=False)
+
+
+def test_a_corridor_holds_cells_of_good_ways_and_no_others(hill: Path, tmp_path: Path) -> None:
+    """Against all cheapest ways there and on, by SciPy's Dijkstra."""
+    best = find_route(str(hill), "cell:20,5", "cell:30,75")
+    found = corridor(str(hill), "cell:20,5", "cell:30,75", 0.1)
+    pace = build_terrain(find_scenario(str(hill))).pace_s_per_m
+    there_s, on_s = (cheapest_s(pace, 20.0, (20, 5), to=False), cheapest_s(pace, 20.0, (30, 75), to=True))
+    truth = there_s + on_s
+    inside = np.isfinite(found.seconds)
+    assert found.fastest_s == pytest.approx(truth[20, 5], rel=1e-5)
+    assert (found.seconds[inside] >= truth[inside] * (1 - 1e-5)).all()
+    assert (truth[inside] <= best.cost_s * 1.1 + 1e-3).all()
+    assert inside.reshape(-1)[best.cells].all()
+    assert inside.sum() >= 0.95 * (truth <= best.cost_s * 1.1).sum() > 300
+    words = [
+        "reach",
+        str(hill),
+        "--from",
+        "cell:20,5",
+        "--to",
+        "cell:30,75",
+        "--slack",
+        "0.1",
+        "--every-s",
+        "5",
+        "--out",
+    ]
+    said = CliRunner().invoke(terrain_app, [*words, str(tmp_path / "c.geojson")], catch_exceptions=False).output
+    assert f"the best takes {best.cost_s:.0f} s" in said
+    features = json.loads((tmp_path / "c.geojson").read_text())["features"]
+    assert min(each["properties"]["from_s"] for each in features) == 0
+    for feature in features:
+        border, *holes = feature["geometry"]["coordinates"]
+        assert turned(border) > 0
+        assert all(turned(hole) < 0 for hole in holes)
+    with pytest.raises(SwarmError, match="--from is on lethal ground, cell:10,35"):
+        corridor(str(hill), "cell:10,35", "cell:30,75", 0.1)
+
+
+def turned(ring: list[list[float]]) -> float:
+    """Twice the area of a ring, above 0 against the clock."""
+    assert ring[0] == ring[-1]
+    (x0, y0), points = ring[0], np.array(ring)
+    x, y = points[:, 0] - x0, points[:, 1] - y0
+    return float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())
+
+
+def cheapest_s(pace: NDArray[np.float32], side_m: float, root: tuple[int, int], *, to: bool) -> NDArray[np.float64]:
+    """Seconds from everywhere to a cell, or from it to everywhere."""
+    rows, cols = pace.shape
+    cells, open_ = np.arange(rows * cols).reshape(rows, cols), np.isfinite(np.pad(pace, 1, constant_values=np.inf))
+    froms, tos, seconds = [], [], []
+    for down, right in product((-1, 0, 1), repeat=2):
+        there, down_only, right_only = (
+            open_[1 + r : 1 + r + rows, 1 + c : 1 + c + cols] for r, c in ((down, right), (down, 0), (0, right))
+        )
+        steps = cells[np.isfinite(pace) & there & down_only & right_only & ((down, right) != (0, 0))]
+        froms.append(steps)
+        tos.append(steps + down * cols + right)
+        seconds.append(side_m * np.hypot(down, right) * pace.reshape(-1)[tos[-1]].astype(np.float64))
+    ends = (np.concatenate(each) for each in ((tos, froms) if to else (froms, tos)))
+    graph = csr_array((np.concatenate(seconds), tuple(ends)), shape=(rows * cols, rows * cols))
+    return np.asarray(dijkstra(graph, indices=cells[root]).reshape(rows, cols), np.float64)
+
+
+def test_a_route_across_180_degrees_is_one_line(tmp_path: Path) -> None:
+    grid = GridSpec(10, 200, 100.0, 170_000.0, 8_200_000.0, "EPSG:32701")
+    cells = np.arange(5 * 200, 6 * 200)
+    route = DescribedRoute("across", grid, cells, 1.0, 1.0, metres_along(grid, cells))
+    for ending in ("geojson", "gpx", "kml", "csv"):
+        write_route(route, tmp_path / f"way.{ending}")
+    (feature,) = json.loads((tmp_path / "way.geojson").read_text())["features"]
+    lon = np.array(feature["geometry"]["coordinates"])[:, 0]
+    assert lon[0] < 180 < lon[-1]
+    assert np.abs(np.diff(lon)).max() < 0.01
+    points = ElementTree.parse(tmp_path / "way.gpx").iter("{http://www.topografix.com/GPX/1/1}trkpt")
+    within = np.array([float(point.attrib["lon"]) for point in points])
+    assert np.abs((within - lon + 180) % 360 - 180).max() < 1e-7
+    assert -180 <= within.min() < within.max() < 180
+    line = next(ElementTree.parse(tmp_path / "way.kml").iter("{http://www.opengis.net/kml/2.2}LineString"))
+    # The order that the schema asks for; heights are not known here.
+    assert [each.tag.rpartition("}")[2] for each in line] == ["tessellate", "altitudeMode", "coordinates"]
+    assert all(point.count(",") == 1 for point in (line[2].text or "").split())
+    with pytest.raises(SwarmError, match="a picture needs the terrain"):
+        write_route(route, tmp_path / "way.png")
+    site = DescribedRoute("site", GridSpec(9, 9, 1.0), np.arange(9), 1.0, 1.0, np.arange(9.0))
+    with pytest.raises(SwarmError, match="has no place on Earth"):
+        write_route(site, tmp_path / "way.kml")

@@ -286,7 +286,7 @@ def test_a_pose_with_the_highest_incarnation_that_there_is_leaves_a_standby_its_
 
 @pytest.mark.parametrize(
     ("start", "sentence"),
-    [((40, 3), r"target t: start \[40, 3\] is outside the terrain of 40 x 50"), ((0, 0), "is lethal")],
+    [((40, 3), r"target t: start is \[40, 3\], outside the terrain: 40 x 50"), ((0, 0), "is lethal")],
 )
 def test_a_start_nobody_can_stand_on_is_refused(start: tuple[int, int], sentence: str) -> None:
     pace = flat()

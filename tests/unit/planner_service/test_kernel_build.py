@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from planner_service import kernel_build
-from planner_service.kernel_build import DIRECTED, FIRST, LATER, KernelLoader, name_of
+from planner_service.kernel_build import KernelLoader, all_kernels, first_kernels, later_kernels, name_of
 from planner_service.kernels.compile import KERNELS
 
 
 def test_every_kernel_of_a_planner_is_built() -> None:
-    built = [name_of(kernel) for kernel in (*FIRST, *LATER, *DIRECTED)]
+    built = [name_of(kernel) for kernel in all_kernels()]
     assert sorted(built) == sorted(KERNELS.keys() - {"breadth_first"})
 
 
@@ -99,6 +99,7 @@ class Disk:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.there: set[str] = set()
         self.started = 0
+        self.options: list[str] = []
         self.building = False
         monkeypatch.setattr(kernel_build, "load", lambda each, compiling=True: name_of(each) in self.there)
         monkeypatch.setattr(kernel_build, "is_building", lambda: self.building)
@@ -108,7 +109,8 @@ class Disk:
         self.coming: list[str] = []
 
     def start(self, command: list[str]) -> None:
-        assert command[1:] == ["-m", "planner_service.kernel_build"]
+        assert command[1:3] == ["-m", "planner_service.kernel_build"]
+        self.options = command[3:]
         self.started += 1
         self.building = True
 
@@ -121,13 +123,13 @@ def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_th
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     disk = Disk(monkeypatch)
-    disk.coming = [name_of(kernel) for kernel in FIRST]
+    disk.coming = [name_of(kernel) for kernel in first_kernels(False)]
     loader = KernelLoader(directed=False, whole=False)
     loader.load_first()
     assert not disk.coming
     assert disk.started >= 1, "nobody was building"
     assert not loader.complete
-    disk.coming = [name_of(kernel) for kernel in LATER]
+    disk.coming = [name_of(kernel) for kernel in later_kernels(False)]
     loader.wait()
     assert loader.complete
 
@@ -135,16 +137,27 @@ def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_th
 def test_nobody_starts_builders_where_some_are_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(monkeypatch)
     disk.building = True
-    disk.coming = [name_of(kernel) for kernel in (*FIRST, *LATER)]
+    disk.coming = [name_of(kernel) for kernel in (*first_kernels(False), *later_kernels(False))]
     loader = KernelLoader(directed=False, whole=True)
     loader.load_first()
     assert loader.complete
     assert not disk.started
 
 
-def test_a_directed_terrain_waits_for_the_kernel_that_grows_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_directed_terrain_waits_for_the_kernels_that_grow_on_it(monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(monkeypatch)
-    disk.coming = [*map(name_of, FIRST), *map(name_of, LATER), *map(name_of, DIRECTED)]
+    disk.coming = [*map(name_of, later_kernels(True)), *map(name_of, first_kernels(True))]
     loader = KernelLoader(directed=True, whole=False)
     loader.load_first()
     assert not disk.coming
+    assert disk.options == ["--directed"]
+
+
+def test_what_only_the_other_kind_of_map_needs_is_not_compiled() -> None:
+    """Uphill is not downhill: other growths, and no more kernels than elsewhere."""
+    alike, directed = (
+        {name_of(kernel) for kernel in (*first_kernels(kind), *later_kernels(kind))} for kind in (False, True)
+    )
+    assert len(alike) == len(directed)
+    assert {name for name in alike & directed if name.startswith("grow")} == set()
+    assert not any("directed" in name for name in alike)

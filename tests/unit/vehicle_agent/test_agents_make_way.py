@@ -95,7 +95,7 @@ def maze(seed: int, size: int = 14) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.seeds(1)
 def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
     chance = random.Random(seed)
     text = scenario(24, per_agent=6, capture=15.0).replace('name = "t"\n', 'name = "t"\ncount = 3\n')

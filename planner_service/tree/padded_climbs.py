@@ -1,0 +1,40 @@
+"""The climb of a terrain as the kernels want it: padded, of a window, its table with the lengths of steps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planner_service.kernels.climbs import Climbs
+from planner_service.kernels.layout import RULE_FOUR, RULE_OCTILE, SQRT2
+from shared_map.arrays import Floats
+from shared_map.terrain.step_climb import Climb
+
+
+def padded_climbs(climb: Climb, rule: int) -> tuple[Climbs, float]:
+    """(climbs, what the dearest step that is not forbidden costs, in cell costs)."""
+    grid = climb.grid
+    height = np.zeros((grid.rows + 2, grid.cols + 2), np.float32)
+    height[1:-1, 1:-1] = climb.elevation_m
+    factors = climb.factors / np.float32(climb.lowest)
+    diagonal = {RULE_FOUR: np.float32(np.inf), RULE_OCTILE: SQRT2}.get(rule, np.float32(1.0))
+    prices = np.concatenate((factors, factors * diagonal))
+    climbs = height.reshape(-1), prices, np.array(climb.per_metre, np.float32), *_rows(grid.cols + 2)
+    return climbs, float(prices[prices < np.inf].max())
+
+
+def with_scratch(climbs: Climbs) -> Climbs:
+    """The same, with rows of its own to write to: one thread's."""
+    return *climbs[:3], *_rows(climbs[3].size)
+
+
+def _rows(stride: int) -> tuple[Floats, Floats, Floats, NDArray[np.int32]]:
+    keys, best, codes = np.empty((3, stride), np.float32)
+    return keys, best, codes, np.empty(stride, np.int32)
+
+
+def climbs_in(climbs: Climbs, stride: int, box: tuple[int, int, int, int]) -> Climbs:
+    """Of a window, as a padded grid of its own."""
+    row0, col0, row1, col1 = box
+    part = climbs[0].reshape(-1, stride)[row0 : row1 + 2, col0 : col1 + 2]
+    return np.ascontiguousarray(part).reshape(-1), *climbs[1:]

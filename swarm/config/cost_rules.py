@@ -1,0 +1,212 @@
+"""Settings of cost: presets of vehicle classes, slope tables in files, and which settings must agree."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from swarm.config.explain import nearest
+from swarm.config.input_files import FileKind, read_text, shown
+from swarm.config.scenario import CostConfig, Preset, Slope, SlopeFactor
+from swarm.errors import ConfigError
+
+
+class PresetRow(NamedTuple):
+    """A class of vehicles.
+
+    about     what it is, for people
+    source    where its numbers come from
+    settings  of `[cost]`, as a scenario would give them
+    """
+
+    about: str
+    source: str
+    settings: Mapping[str, Any]
+
+
+PRESETS: Mapping[Preset, PresetRow] = {
+    "hiker": PresetRow(
+        "a person on foot",
+        "Tobler (1993): 5.04 km/h on level paths, three fifths of it off them. The steepest slope is a judgement:"
+        " beyond 40 degrees hands are needed",
+        {
+            "slope_rule": "tobler",
+            "flat_speed_m_per_s": 0.84,
+            "road_speed_m_per_s": 1.4,
+            "max_slope_deg": 40.0,
+        },
+    ),
+    "wheeled": PresetRow(
+        "a car or lorry with all wheels driven",
+        "60 % of grade and 40 % of side slope are what the HMMWV is built for (its class of military vehicles is"
+        " tested at 60 %); rolling resistance of grass and firm soil after Wong, Theory of Ground Vehicles. Speeds,"
+        " the power reserve and the cost of a side slope are judgements",
+        {
+            "slope_rule": "energy",
+            "flat_speed_m_per_s": 10.0,
+            "road_speed_m_per_s": 20.0,
+            "rolling_resistance": 0.08,
+            "power_reserve": 3.0,
+            "cross_slope_factor": 2.0,
+            "max_slope_deg": 30.0,
+        },
+    ),
+    "tracked": PresetRow(
+        "a vehicle on tracks",
+        "60 % of grade as the M113 is built for; soft and broken ground slows tracks less than wheels, by how much"
+        " is a judgement, as are the speeds and the power reserve",
+        {
+            "slope_rule": "energy",
+            "flat_speed_m_per_s": 8.0,
+            "road_speed_m_per_s": 14.0,
+            "rolling_resistance": 0.08,
+            "power_reserve": 3.0,
+            "cross_slope_factor": 1.5,
+            "max_slope_deg": 30.0,
+            "class_factor": {"forest": 1.5, "rock": 2.0, "soil": 1.0, "snow": 1.5},
+        },
+    ),
+    "quadruped": PresetRow(
+        "a walking robot with four legs",
+        "the maker's data of Spot: 1.6 m/s at most, slopes to 30 degrees, steps to 0.3 m. The speed on open ground"
+        " and half of it on the steepest slope are judgements",
+        {
+            "slope_rule": "quadratic",
+            "flat_speed_m_per_s": 1.0,
+            "road_speed_m_per_s": 1.6,
+            "steep_factor": 2.0,
+            "max_slope_deg": 30.0,
+            "class_factor": {"rock": 1.5},
+        },
+    ),
+}
+"""Every preset; a new one is a row here and its name in `swarm.config.scenario.Preset`."""
+
+
+def with_preset(raw: dict[str, Any]) -> dict[str, Any]:
+    """What was read of a scenario, with the settings of its preset where it gives none itself.
+
+    What is no preset is left to the check of types.
+    """
+    cost = raw.get("cost")
+    name = cost.get("preset") if isinstance(cost, dict) else None
+    row = next((row for preset, row in PRESETS.items() if preset == name), None)
+    if not isinstance(cost, dict) or row is None:
+        return raw
+    settings = {**row.settings, **cost}
+    factors = row.settings.get("class_factor")
+    if factors is not None and isinstance(cost.get("class_factor"), dict):
+        settings["class_factor"] = {**factors, **cost["class_factor"]}
+    return {**raw, "cost": settings}
+
+
+def cost_of_preset(name: str | None) -> CostConfig:
+    """The cost of a scenario which says nothing but this preset, if that. Raises ConfigError on an unknown one."""
+    if name is None:
+        return CostConfig()
+    if name not in PRESETS:
+        names: list[str] = list(PRESETS)
+        raise ConfigError(f"no preset {shown(name)}{nearest(name, names)}; there are {', '.join(names)}")
+    return msgspec.convert(with_preset({"cost": {"preset": name}})["cost"], CostConfig)
+
+
+# --- slope tables -------------------------------------------------------------------------------------------
+
+_SLOPES = ("slope_deg", "slope_percent")
+_VALUES = ("factor", "pace_s_per_m", "speed_m_per_s")
+_LEVEL_TOLERANCE = 1e-3
+
+
+def with_slope_csv(cost: CostConfig, source: str, base: Path | None) -> CostConfig:
+    """The cost with the points of its `slope_csv`, which lies beside `base`. From then on the points are all that
+    counts, so processes need no file. Raises ConfigError."""
+    if cost.slope_csv is None:
+        return cost
+    if cost.slope_table:
+        raise ConfigError(f"{source}: cost: slope_table and slope_csv exclude each other")
+    path = Path(cost.slope_csv) if base is None else base / cost.slope_csv
+    points = read_slope_table(path, cost.flat_speed_m_per_s)
+    return msgspec.structs.replace(cost, slope_csv=None, slope_table=points)
+
+
+def read_slope_table(path: Path, flat_speed_m_per_s: float) -> tuple[tuple[float, float], ...]:
+    """Points (degrees, factor on the flat pace) of a .csv file. Raises ConfigError that names the line."""
+    lines = read_text(path, FileKind.SLOPE_TABLE, "utf-8-sig").splitlines()
+    try:
+        rows = list(csv.reader(lines))
+    except csv.Error as error:
+        raise ConfigError(f"slope table {path} is no table of comma-separated values: {error}") from error
+    names = [name.strip() for name in rows[0]] if rows else []
+    if len(names) != 2 or names[0] not in _SLOPES or names[1] not in _VALUES:
+        raise ConfigError(
+            f"slope table {path}: the first line is {shown(','.join(names))}, expected two columns,"
+            f" {' or '.join(_SLOPES)} and {' or '.join(_VALUES)}"
+        )
+    points = []
+    for number, row in enumerate(rows[1:], 2):
+        if not any(cell.strip() for cell in row):
+            continue
+        try:
+            slope, value = (float(cell) for cell in row)
+            if names[0] == "slope_percent":
+                slope = math.degrees(math.atan(slope / 100))
+            if names[1] == "speed_m_per_s":
+                value = 1 / value
+            factor = value if names[1] == "factor" else value * flat_speed_m_per_s
+            points.append(msgspec.convert((slope, factor), tuple[Slope, SlopeFactor]))
+        except (ValueError, ZeroDivisionError, msgspec.ValidationError) as error:
+            raise ConfigError(
+                f"slope table {path}: line {number} is {shown(','.join(row))}, expected a slope between -90 and 90"
+                " degrees and a pace of 0.01 to 100 times the flat one"
+            ) from error
+    return tuple(points)
+
+
+def check_cost(cost: CostConfig, source: str) -> None:
+    """Raise ConfigError where settings of cost that are valid each do not fit together."""
+    where = f"{source}: cost"
+    if bool(cost.slope_table) != (cost.slope_rule == "table"):
+        needs = (
+            "needs slope_table or slope_csv" if cost.slope_rule == "table" else "reads no slope_table or slope_csv"
+        )
+        raise ConfigError(f'{where}: slope_rule = "{cost.slope_rule}" {needs}')
+    _check_table(cost, where)
+    top = cost.top_speed_m_per_s
+    if top is not None and top < cost.flat_speed_m_per_s:
+        raise ConfigError(
+            f"{where}.top_speed_m_per_s: {top:g} is less than flat_speed_m_per_s = {cost.flat_speed_m_per_s:g}"
+        )
+    for key in ("max_climb_deg", "max_descent_deg"):
+        if getattr(cost, key) is not None and not cost.directional:
+            raise ConfigError(f"{where}.{key} is about steps: set directional = true, or max_slope_deg instead")
+
+
+def _check_table(cost: CostConfig, where: str) -> None:
+    points = cost.slope_table
+    if not points:
+        return
+    for (slope, _), (following, _) in pairwise(points):
+        if following <= slope:
+            raise ConfigError(
+                f"{where}.slope_table: {following:g} degrees follow on {slope:g}, expected rising slopes"
+            )
+    level = factor_at(points, 0.0)
+    if abs(level - 1) > _LEVEL_TOLERANCE:
+        raise ConfigError(
+            f"{where}.slope_table: level ground takes {level:g} times the flat pace, expected 1: how fast level"
+            f" ground is, flat_speed_m_per_s = {cost.flat_speed_m_per_s:g} says"
+        )
+
+
+def factor_at(points: tuple[tuple[float, float], ...], slope_deg: float) -> float:
+    """The factor of a slope: straight lines between the points, beyond the last the same."""
+    for (below, low), (above, high) in pairwise(points):
+        if below <= slope_deg <= above:
+            return low + (high - low) * (slope_deg - below) / (above - below)
+    return points[0][1] if slope_deg < points[0][0] else points[-1][1]

@@ -1,0 +1,187 @@
+"""Where uphill is not downhill, and some steps are too steep: the laws of the tree under every strategy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import slow_twins as naive
+from support.planner_play import Play
+from support.planner_strategies import (
+    RULES,
+    STRATEGIES,
+    Job,
+    Marks,
+    Move,
+    happenings,
+    paces,
+    planner_configs,
+    random_pace,
+)
+
+from planner_service.kernels import repair as kernels
+from planner_service.kernels.directed_growth import grow_directed
+from planner_service.kernels.layout import NONE
+from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_to_go import CostToGoTree
+from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from swarm.config.scenario import CostConfig, PlannerConfig, SlopeRule
+from swarm.grid import GridSpec, Window
+
+SLOPES: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")
+
+
+def random_climb(rng: np.random.Generator, rows: int, cols: int, relief_m: float, steepest: float) -> Climb:
+    """Rough ground with a void or two. Steps that rise or fall by more than `steepest` are forbidden; falls may be
+    by twice as much, so that some lead one way only."""
+    heights = rng.normal(0, relief_m, (rows, cols)).astype(np.float32)
+    heights[rng.random((rows, cols)) < 0.03] = np.nan
+    rule = SLOPES[int(rng.integers(3))]
+    climb = climb_of(GridSpec(rows, cols, 1.0), heights, CostConfig(directional=True, slope_rule=rule))
+    assert climb is not None
+    entry = int(ENTRIES * min(steepest / climb.steepest, 1.0))
+    factors = climb.factors.copy()
+    factors[ENTRIES + entry + 1 :] = np.inf
+    factors[: max(ENTRIES - 2 * entry, 0)] = np.inf
+    return replace(climb, factors=factors)
+
+
+@st.composite
+def climbs(draw: st.DrawFn, shape: tuple[int, int]) -> Climb:
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return random_climb(
+        rng, *shape, draw(st.sampled_from([0.0, 0.1, 0.5])), draw(st.sampled_from([0.1, 0.3, 10.0]))
+    )
+
+
+@given(paces(), planner_configs(), happenings(), st.data())
+@settings(max_examples=60, deadline=None)
+def test_whatever_happens_routes_arrive_are_legal_cost_what_they_say_and_bounds_hold(
+    pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job], data: st.DataObject
+) -> None:
+    play = Play(pace, config, climb=data.draw(climbs(pace.shape)))
+    play.check()
+    for event in events:
+        play.happen(event)
+        play.check()
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_a_long_walk_with_marks_keeps_the_laws(strategy: str) -> None:
+    rng = np.random.default_rng(5)
+    pace = random_pace(rng, 24, 22, 6.0, 0.1)
+    climb = random_climb(rng, 24, 22, 0.15, 0.35)
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9, full_every=5)  # type: ignore[arg-type]
+    play = Play(pace, config, climb=climb)
+    kinds = play.walk(rng, 40, 8)
+    assert strategy == "full" or kinds & {"window", "coarse"}, kinds
+
+
+class Ground:
+    """A directed map, a tree that is repaired, and one that is grown anew."""
+
+    def __init__(self, seed: int, rules: dict[str, Any], rows: int = 40, cols: int = 43) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.pace = random_pace(self.rng, rows, cols, (1.0, 4.0, 30.0)[seed % 3], (0.0, 0.15, 0.3)[seed // 3 % 3])
+        self.climb = random_climb(self.rng, rows, cols, (0.0, 0.1, 0.4)[seed % 3], (0.3, 0.6)[seed % 2])
+        self.config = PlannerConfig(**rules)
+        self.costs = self.fresh()
+        self.root = int(self.rng.choice(np.flatnonzero(np.isfinite(self.pace))))
+        self.tree = CostToGoTree(self.costs)
+        self.tree.grow(self.root)
+
+    def fresh(self) -> CostGrid:
+        costs = CostGrid(self.climb.grid, self.config, self.climb)
+        costs.load(self.pace)
+        return costs
+
+    def change(self, factor: float, side: int) -> Window:
+        row, col = (int(self.rng.integers(0, most - side)) for most in self.pace.shape)
+        window = Window(row, col, row + side, col + side)
+        patch = self.pace[row : row + side, col : col + side]
+        patch[:] = random_pace(self.rng, side, side, 5.0, 0.3) if factor == 0 else patch * np.float32(factor)
+        if not np.isfinite(self.pace.flat[self.root]):
+            self.pace.flat[self.root] = 1.0
+        return window
+
+    def check(self) -> None:
+        fresh = CostToGoTree(self.fresh())
+        fresh.grow(self.root)
+        np.testing.assert_array_equal(self.tree.inner(self.tree.cost), fresh.inner(fresh.cost))
+        np.testing.assert_array_equal(self.tree.inner(self.tree.parent), fresh.inner(fresh.parent))
+        assert self.tree.reach >= fresh.cost[np.isfinite(fresh.cost)].max()
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_repaired_trees_are_those_that_would_have_grown_in_every_cost_and_parent(seed: int) -> None:
+    ground = Ground(seed, RULES[seed % 5])
+    mended = 0
+    for n in range(12):
+        factors = (0.3, 0.7, 1.5, 3.0, np.inf, 0.0)[n % 6 :][: 1 + n % 2]
+        windows = [ground.change(factor, int(ground.rng.integers(1, 8))) for factor in factors]
+        if ground.tree.repair(ground.costs.apply(ground.pace, windows)) < 0:
+            ground.tree.grow(ground.root)
+        else:
+            mended += 1
+        ground.check()
+    assert mended > 3
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(seed: int) -> None:
+    ground = Ground(seed, RULES[seed % 5])
+    windows = [ground.change(factor, 6) for factor in (0.5, 0.25, 0.9)]
+    changes, costs = ground.costs.apply(ground.pace, windows), ground.costs
+    heuristic = ground.tree.cost.copy()
+    given_ = (costs.padded, costs.climbs, (heuristic, np.empty(0, np.uint8), 0), changes.cells, changes.before)
+    done, _ = kernels.repair(*given_, costs.buckets, (0, 0, 10**9), costs.repair_scratch)
+    assert done > 0
+    ground.tree.grow(ground.root)
+    np.testing.assert_array_equal(ground.tree.inner(heuristic), ground.tree.inner(ground.tree.cost))
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_growth_by_buckets_by_decrease_key_and_by_scipy_agree(seed: int) -> None:
+    ground = Ground(seed, RULES[seed % 5], 23, 31)
+    costs, tree = ground.costs, ground.tree
+    assert costs.climbs is not None
+    root = costs.pad(ground.root)
+    cost, parent = np.empty(costs.size, np.float32), np.full(costs.size, NONE, np.uint8)
+    links, first = np.empty((costs.size, 2), np.int32), np.empty(1 << 12, np.int32)
+    width = costs.highest_cell_cost * costs.dearest_step / 1000
+    grow_directed(costs.padded, (cost, parent, root), costs.climbs, (width, 1 << 12), links, first)
+    np.testing.assert_array_equal(tree.inner(tree.cost), tree.inner(cost))
+    best = naive.cost_to_go(ground.pace, ground.root, **RULES[seed % 5], climb=ground.climb)
+    best[~np.isfinite(ground.pace)] = np.inf
+    np.testing.assert_allclose(tree.inner(tree.cost), best, rtol=3e-6)
+    assert np.isinf(best[np.isfinite(ground.pace)]).any() or seed % 3 < 2
+
+
+def one_way() -> Climb:
+    """A terrace: from column 20 on the ground lies 1 m lower, which may be driven down and not up."""
+    heights = np.zeros((30, 40), np.float32)
+    heights[:, 20:] = -1.0
+    climb = climb_of(GridSpec(30, 40, 1.0), heights, CostConfig(directional=True, max_slope_deg=60))
+    assert climb is not None
+    factors = climb.factors.copy()
+    factors[ENTRIES + 10 :] = np.inf
+    return replace(climb, factors=factors)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_who_has_a_way_only_to_where_the_target_is_now_gets_one(strategy: str) -> None:
+    """Down a terrace there is a way, up it none: when the target comes up, those below lose their ways; once it is
+    down again, all have one."""
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9)  # type: ignore[arg-type]
+    play = Play(np.ones((30, 40), np.float32), config, climb=one_way())
+    kinds = []
+    for rows, cols in ((15, 16), *6 * ((0, 1),), *6 * ((0, -1),), (1, 1), (1, 1)):
+        play.happen(Move(rows, cols))
+        kinds.append(play.last.kind)
+        play.check()
+    assert strategy == "full" or "full" in kinds[1:], kinds
+    assert strategy == "full" or {"window", "coarse"} & {*kinds}, kinds

@@ -1,0 +1,389 @@
+"""Land-cover maps: codes become classes by a table that is known, said, or asked for; never interpolated."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+from rasterio.transform import from_origin
+from support.height_models import SIDE, hills, load, written
+
+from shared_map.terrain.importers.cover_recognition import NO_COLOUR, NOTHING, SAME_COLOUR, legend_codes
+from shared_map.terrain.importers.cover_tables import TABLES, read_cover_table
+from shared_map.terrain.importers.land_cover import read_cover
+from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.terrain import build_terrain
+from swarm.config.load import COVER_TABLES, parse_scenario
+from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.errors import ConfigError, TerrainError
+from swarm.grid import GridSpec
+
+EUROPE, USA = "EPSG:32632", "EPSG:32617"
+PLACE = from_origin(500_000, 5_000_000, 20, 20)
+
+
+def patches(codes: Any, seed: int = 1) -> Any:
+    """Codes in patches, each on an equal share of SIDE x SIDE cells."""
+    ground = hills(seed, 1.0)
+    borders = np.quantile(ground, np.linspace(0, 1, len(codes) + 1)[1:-1])
+    return np.array(codes)[np.digitize(ground, borders)]
+
+
+def drawn(path: Path, codes: Any, key: str, driver: str = "GTiff") -> Path:
+    """A map of codes in the colours of a published legend."""
+    image = np.full((*codes.shape, 3), 255, np.uint8)
+    for code, ground in TABLES[key].grounds.items():
+        image[codes == code] = ground.colour
+    shape = {"height": SIDE, "width": SIDE, "count": 3, "dtype": "uint8"}
+    with rasterio.open(path, "w", driver=driver, crs=EUROPE, transform=PLACE, **shape) as file:
+        file.write(np.moveaxis(image, -1, 0))
+    return path
+
+
+def expected(codes: Any, key: str) -> tuple[Any, Any]:
+    grounds = TABLES[key].grounds
+    kinds = np.vectorize(lambda code: int(grounds[code].kind))(codes)
+    return kinds, np.vectorize(lambda code: grounds[code].factor)(codes)
+
+
+def said(notes: tuple[str, ...], words: str) -> bool:
+    return any(words in note for note in notes)
+
+
+@pytest.fixture
+def dem(tmp_path: Path) -> Path:
+    return written(tmp_path / "dem.tif", hills(1, 300))
+
+
+# --- tables -------------------------------------------------------------------------------------------------
+
+
+def test_the_setting_names_the_tables_that_there_are() -> None:
+    assert tuple(TABLES) == COVER_TABLES
+    sizes = {key: len(table.grounds) for key, table in TABLES.items()}
+    assert sizes == {"worldcover": 11, "corine": 44, "corine-level-3": 44, "nlcd": 21}
+    level3 = list(TABLES["corine-level-3"].grounds.values())
+    assert [TABLES["corine"].grounds[n] for n in range(1, 45)] == level3
+
+
+@pytest.mark.parametrize("key", list(TABLES))
+def test_water_is_lethal_and_no_two_colours_of_a_legend_are_taken_for_each_other(key: str) -> None:
+    grounds = TABLES[key].grounds
+    wet = [ground for ground in grounds.values() if "water" in ground.name.lower() and "wetland" not in ground.name]
+    assert wet
+    assert all(ground.kind == TerrainClass.WATER for ground in wet)
+    for one, other in itertools.combinations([ground.colour for ground in grounds.values()], 2):
+        assert one is not None
+        assert other is not None
+        assert max(abs(a - b) for a, b in zip(one, other, strict=True)) > 2 * SAME_COLOUR or key == "nlcd", (
+            one,
+            other,
+        )
+    codes = legend_codes(TABLES[key])
+    for code, ground in grounds.items():
+        assert ground.colour is not None
+        red, green, blue = ground.colour
+        assert codes[red << 16 | green << 8 | blue] == code
+    assert codes[0x123456] == NO_COLOUR
+    assert codes[0xFFFFFF] == NOTHING
+
+
+@pytest.mark.parametrize("key", list(TABLES))
+@pytest.mark.parametrize("dtype", ["uint16", "float32"])
+def test_codes_of_each_table_become_its_grounds(tmp_path: Path, dem: Path, key: str, dtype: str) -> None:
+    codes = patches(list(TABLES[key].grounds))
+    path = written(tmp_path / "cover.tif", codes, dtype, crs=EUROPE)
+    source = load(dem, cover=str(path), cover_codes=None if key == "worldcover" else key)
+    kinds, factors = expected(codes, key)
+    np.testing.assert_array_equal(source.classes, kinds)
+    np.testing.assert_allclose(source.factor, factors)
+    assert said(source.notes, f"land cover: {TABLES[key].title}")
+
+
+def test_paces_follow_from_class_and_factor(tmp_path: Path) -> None:
+    flat = written(tmp_path / "flat.tif", np.add.outer(np.zeros(40), np.arange(40.0) / 100))
+    codes = np.tile(np.repeat([10, 20, 30, 80], 10), (40, 1))
+    cover = written(tmp_path / "cover.tif", codes, "uint8")
+    config = TerrainConfig(source=str(flat), cover=str(cover), cover_codes="worldcover", cover_classes={"30": 4.0})
+    pace = build_terrain(Scenario(terrain=config)).pace_s_per_m[20]
+    np.testing.assert_allclose(pace[[5, 15, 25]] * 10, [1.8, 1.5, 4.0], rtol=1e-3)
+    assert np.isinf(pace[35])
+
+
+# --- which table ----------------------------------------------------------------------------------------------
+
+
+def test_an_ambiguous_map_is_asked_for_and_the_place_may_answer(tmp_path: Path) -> None:
+    codes = patches([11, 21, 31, 41, 42, 43])
+    grid = GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000, USA)
+    here = written(tmp_path / "a.tif", codes, "uint8", crs=USA)
+    cover = read_cover(here, grid, TerrainConfig())
+    assert said(cover.notes, "NLCD, known by its codes and where it lies")
+    nowhere = written(tmp_path / "b.tif", codes, "uint8", crs='LOCAL_CS["site",UNIT["metre",1]]')
+    with pytest.raises(TerrainError, match=r"set terrain\.cover_codes = 'corine' or 'nlcd'$") as asked:
+        read_cover(nowhere, GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000), TerrainConfig())
+    assert "\n" not in str(asked.value)
+    both = written(tmp_path / "c.tif", patches([10, 20, 30, 40]), "uint8", crs=EUROPE)
+    with pytest.raises(
+        TerrainError, match=r"are those of ESA WorldCover, and of CORINE .*, and of GlobeLand30, and of"
+    ):
+        read_cover(both, GridSpec(SIDE, SIDE, 20.0, 500_000, 5_000_000, EUROPE), TerrainConfig())
+
+
+@pytest.mark.parametrize("codes", [[80], [1, 2], [1, 2, 3, 4, 5, 6, 7, 8, 9], [10, 20, 30, 60, 80, 100]])
+def test_codes_that_other_maps_have_too_are_asked_for(tmp_path: Path, dem: Path, codes: list[int]) -> None:
+    cover = written(tmp_path / "a.tif", patches(codes), "uint8")
+    with pytest.raises(TerrainError, match=r"set terrain\.cover_codes = .*, or a CSV file of code and class$"):
+        load(dem, cover=str(cover))
+
+
+@pytest.mark.parametrize("evidence", ["palette", "names", "attributes", "metadata", "file name"])
+def test_a_table_is_known_by_what_the_file_says_of_itself(tmp_path: Path, dem: Path, evidence: str) -> None:
+    codes = patches([11, 21, 31, 41, 42, 43])
+    grounds = TABLES["nlcd"].grounds
+    path = written(tmp_path / ("nlcd_2021.tif" if evidence == "file name" else "a.tif"), codes, "uint8")
+    with rasterio.open(path, "r+") as file:
+        if evidence == "palette":
+            file.write_colormap(1, {code: (*ground.colour, 255) for code, ground in grounds.items()})
+        if evidence == "metadata":
+            file.update_tags(title="National Land Cover Database 2021")
+    names = "".join(f"<Category>{grounds[n].name if n in grounds else ''}</Category>" for n in range(96))
+    rows = "".join(
+        f'<Row index="{n}"><F>{code}</F><F>{ground.name}</F></Row>'
+        for n, (code, ground) in enumerate(grounds.items())
+    )
+    described = {
+        "names": f"<CategoryNames>{names}</CategoryNames>",
+        "attributes": '<GDALRasterAttributeTable><FieldDefn index="0"><Name>Value</Name><Type>0</Type></FieldDefn>'
+        f'<FieldDefn index="1"><Name>Class</Name><Type>2</Type></FieldDefn>{rows}</GDALRasterAttributeTable>',
+    }.get(evidence)
+    if described is not None:
+        text = f'<PAMDataset><PAMRasterBand band="1">{described}</PAMRasterBand></PAMDataset>'
+        Path(f"{path}.aux.xml").write_text(text, encoding="utf-8")
+    source = load(dem, cover=str(path))
+    np.testing.assert_array_equal(source.classes, expected(codes, "nlcd")[0])
+    how = {"palette": "palette", "names": "names", "attributes": "names"}.get(evidence, "its name or metadata")
+    assert said(source.notes, "land cover: NLCD, known by")
+    assert said(source.notes, how)
+
+
+def test_what_the_table_lacks_is_named_with_its_share_and_so_is_no_data(tmp_path: Path, dem: Path) -> None:
+    codes = patches(list(TABLES["worldcover"].grounds))
+    codes[:4], codes[4:10] = 77, 0
+    cover = written(tmp_path / "cover.tif", codes, "uint8")
+    source = load(dem, cover=str(cover), cover_codes="worldcover")
+    assert said(source.notes, "codes 77 on 2.0% of the terrain are not in the table")
+    assert said(source.notes, "no data on 3.0% of the terrain")
+    assert (source.classes[:10] == TerrainClass.UNKNOWN).all()
+    own = load(dem, cover=str(cover), cover_codes="worldcover", cover_classes={"77": "rock", "0": "lethal"})
+    assert (own.classes[:4] == TerrainClass.ROCK).all()
+    assert np.isinf(own.factor[4:10]).all()
+    strange = written(tmp_path / "strange.tif", patches([3, 600, 601, 602]), "uint16")
+    with pytest.raises(TerrainError, match=r"codes \(3, 600, 601, 602\) are those of no built-in table"):
+        load(dem, cover=str(strange))
+    with pytest.raises(TerrainError, match="holds real numbers; codes are whole"):
+        load(dem, cover=str(written(tmp_path / "real.tif", codes + 0.5)))
+
+
+def test_codes_of_ones_own_come_from_the_scenario_or_a_csv_file(tmp_path: Path, dem: Path) -> None:
+    codes = patches([1, 2, 7008])
+    cover = str(written(tmp_path / "cover.tif", codes, "int32"))
+    table = tmp_path / "codes.csv"
+    table.write_text("code;class;name\n1;forest;Beech\n2;lethal;Quarry\n7008;2.5;Marsh, wet\n", encoding="utf-8")
+    own = {"1": "forest", "2": "lethal", "7008": 2.5}
+    for keys in ({"cover_codes": str(table)}, {"cover_classes": own}):
+        source = load(dem, cover=cover, **keys)
+        np.testing.assert_array_equal(source.classes == TerrainClass.FOREST, codes == 1)
+        np.testing.assert_array_equal(np.isinf(source.factor), codes == 2)
+        np.testing.assert_array_equal(source.factor == 2.5, codes == 7008)
+    assert read_cover_table(table).grounds[7008].name == "Marsh, wet"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("1,forest\n1,rock", "line 2: code 1 comes twice"),
+        ("1,sea", "line 1: 'sea' is no ground; expected unknown, water"),
+        ("1,-2", "line 1: '-2' is no ground"),
+        ("1,nan", "line 1: 'nan' is no ground"),
+        ("1", "line 1: '' is no ground"),
+        ("1O,forest\n2,rock", "line 1: '1O' is no code"),
+        ("code,class\nx,rock", "line 2: 'x' is no code"),
+        ("70000,rock", "code 70000 is too large"),
+        ("code,class\n", "has no line of code and class"),
+    ],
+)
+def test_a_bad_table_is_refused_with_its_line(tmp_path: Path, text: str, sentence: str) -> None:
+    path = tmp_path / "codes.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(TerrainError, match=sentence) as refused:
+        read_cover_table(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_settings_are_checked_and_anchored(tmp_path: Path) -> None:
+    for text, sentence in (("cover_classes = {a = 1}", "cover_classes"), ("cover_classes = {7 = 'sea'}", "'sea'")):
+        with pytest.raises(ConfigError, match=sentence):
+            parse_scenario(f"[terrain]\n{text}")
+    text = "[terrain]\ncover = 'c.tif'\ncover_codes = '{}'"
+    for codes, anchored in (("nlcd", "nlcd"), ("codes.csv", str(tmp_path / "codes.csv"))):
+        terrain = parse_scenario(text.format(codes), base=tmp_path).terrain
+        assert (terrain.cover, terrain.cover_codes) == (str(tmp_path / "c.tif"), anchored)
+    with pytest.raises(TerrainError, match=r"'ncld' is neither worldcover, .* nor a CSV file"):
+        load(written(tmp_path / "c.tif", patches([1, 2]), "uint8"), cover_codes="ncld")
+
+
+# --- onto the grid ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("system", "step"), [(EUROPE, 20.0), (EUROPE, 7.0), (EUROPE, 90.0), ("EPSG:4326", 20.0)])
+def test_no_code_is_made_up_by_resampling(tmp_path: Path, system: str, step: float) -> None:
+    codes = patches([10, 50, 95, 100])
+    place = PLACE if system == EUROPE else from_origin(9.0, 45.155, 0.0003, 0.0003)
+    cover = written(tmp_path / "cover.tif", codes, "uint8", crs=system, transform=place)
+    grid = GridSpec(int(3000 / step), int(3000 / step), step, 500_200, 4_999_800, EUROPE)
+    found = read_cover(cover, grid, TerrainConfig(cover_codes="worldcover"))
+    allowed = {
+        (int(ground.kind), float(np.float32(ground.factor))) for ground in TABLES["worldcover"].grounds.values()
+    }
+    pairs = set(zip(found.classes[found.known].tolist(), found.factor[found.known].tolist(), strict=True))
+    assert len(pairs) == 4
+    assert pairs <= allowed
+    if (system, step) == (EUROPE, 20.0):
+        np.testing.assert_array_equal(found.classes, expected(codes[10:160, 10:160], "worldcover")[0])
+    if step == 90.0:
+        assert said(found.notes, "each cell takes the most frequent code")
+
+
+def test_what_lies_beside_the_map_or_under_its_mask_is_unknown(tmp_path: Path, dem: Path) -> None:
+    codes = patches([10, 30, 50, 60, 80], seed=3)
+    place = from_origin(502_000, 5_000_000, 20, 20)
+    path = written(tmp_path / "cover.tif", codes, "uint8", transform=place)
+    with rasterio.open(path, "r+") as file:
+        mask = np.full((SIDE, SIDE), 255, np.uint8)
+        mask[:50] = 0
+        file.write_mask(mask)
+    cover = read_cover(path, load(dem).grid, TerrainConfig(cover_codes="worldcover"))
+    assert not cover.known[:, :100].any()
+    assert not cover.known[:50].any()
+    assert cover.known[50:, 100:].all()
+    np.testing.assert_array_equal(cover.classes[50:, 100:], expected(codes[50:, :100], "worldcover")[0])
+    assert said(cover.notes, "frame covers 50.0% of the terrain")
+    assert said(cover.notes, "no data on 62.5%")
+    far = written(tmp_path / "far.tif", codes, "uint8", transform=from_origin(900_000, 5_000_000, 20, 20))
+    with pytest.raises(TerrainError, match="does not overlap the terrain"):
+        read_cover(far, load(dem).grid, TerrainConfig(cover_codes="worldcover"))
+    moon = written(tmp_path / "moon.tif", codes, "uint8", crs="+proj=longlat +R=1737400 +no_defs")
+    with pytest.raises(TerrainError, match="from which no way leads to the terrain's EPSG:32632"):
+        read_cover(moon, load(dem).grid, TerrainConfig(cover_codes="worldcover"))
+
+
+def test_land_cover_wins_over_level_ground_and_says_so(tmp_path: Path) -> None:
+    ground = np.maximum(hills(13, 900) - 300, 0).astype(np.float32)
+    dem = written(tmp_path / "dem.tif", ground)
+    sea = load(dem).classes == TerrainClass.WATER
+    assert sea.any()
+    codes = np.where(sea, 80, 30)
+    codes[:, 100:] = 30
+    source = load(dem, cover=str(written(tmp_path / "c.tif", codes, "uint8")), cover_codes="worldcover")
+    np.testing.assert_array_equal(source.classes == TerrainClass.WATER, codes == 80)
+    assert said(source.notes, f"{sea[:, 100:].sum() / sea.size:.1%} of the terrain is water by photo or heights")
+
+
+# --- drawings -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", ["worldcover", "corine-level-3", "nlcd"])
+@pytest.mark.parametrize("setting", ["cover", "photo", "source"])
+def test_a_drawing_in_a_legends_colours_is_read_as_its_codes(
+    tmp_path: Path, dem: Path, key: str, setting: str
+) -> None:
+    codes = patches(list(TABLES[key].grounds))
+    codes[:5] = 0  # drawn white
+    path = drawn(tmp_path / "drawn.tif", codes, key)
+    source = load(path) if setting == "source" else load(dem, **{setting: str(path)})
+    np.testing.assert_array_equal(source.classes[5:], expected(codes[5:], key)[0])
+    np.testing.assert_allclose(source.factor[5:], expected(codes[5:], key)[1])
+    assert said(source.notes, f"{TABLES[key].title}, drawn in the colours of its legend")
+    assert said(source.notes, "no data on 2.5% of the terrain")
+
+
+@pytest.mark.parametrize("setting", ["cover", "photo", "source"])
+def test_an_image_whose_palette_has_a_legends_colours_is_read_as_its_codes(
+    tmp_path: Path, dem: Path, setting: str
+) -> None:
+    """As programs for pictures write it: entries are counted from 0, and their colours are the legend's."""
+    grounds = TABLES["worldcover"].grounds
+    entries = patches(range(len(grounds)))
+    path = written(tmp_path / "drawn.tif", entries, "uint8")
+    with rasterio.open(path, "r+") as file:
+        file.write_colormap(1, {n: (*ground.colour, 255) for n, ground in enumerate(grounds.values())})
+    source = load(path) if setting == "source" else load(dem, **{setting: str(path)})
+    np.testing.assert_array_equal(source.classes, expected(np.array(list(grounds))[entries], "worldcover")[0])
+
+
+def test_a_drawing_in_other_colours_is_refused_as_land_cover_and_not_read_as_a_photo(
+    tmp_path: Path, dem: Path
+) -> None:
+    path = drawn(tmp_path / "drawn.tif", patches([11, 31, 42]), "nlcd")
+    with rasterio.open(path, "r+") as file:
+        file.write(file.read()[::-1] // 2)
+    with pytest.raises(TerrainError, match="is an image, and not in the colours of ESA WorldCover"):
+        load(dem, cover=str(path))
+    notes = load(dem, photo=str(path)).notes
+    assert said(notes, "no classes are read from it")
+    assert said(notes, "terrain.cover")
+
+
+@pytest.mark.parametrize("step", [13.0, 20.0, 31.0])
+def test_a_drawing_is_known_by_its_own_pixels_and_not_by_what_resampling_leaves(
+    tmp_path: Path, dem: Path, step: float
+) -> None:
+    path = drawn(tmp_path / "drawn.tif", patches([11, 31, 42]), "nlcd")
+    with rasterio.open(path, "r+") as file:
+        file.write(file.read()[::-1] // 2)
+        file.transform = from_origin(500_000, 5_000_000, step, step)
+    source = load(dem, photo=str(path))
+    assert said(source.notes, "the photo is a drawn map: it has 3 colours")
+    assert (source.classes == TerrainClass.UNKNOWN).all()
+
+
+# --- a land-cover map as the terrain ------------------------------------------------------------------------
+
+
+def test_a_map_of_codes_alone_is_level_ground_with_classes(tmp_path: Path) -> None:
+    codes = patches(list(TABLES["worldcover"].grounds))
+    path = written(tmp_path / "a.tif", codes, "uint8")
+    with pytest.raises(TerrainError, match=r"'worldcover' if it is land cover, .* = 'metres' if it has heights"):
+        load(path)
+    assert load(path, elevation_encoding="metres").elevation_m.max() == 100
+    for source in (load(path, cover_codes="worldcover"), load(_tagged(path, tmp_path / "b.tif"))):
+        np.testing.assert_array_equal(source.classes, expected(codes, "worldcover")[0])
+        assert (source.elevation_m == 0).all()
+        assert said(source.notes, "there are no heights")
+
+
+def _tagged(path: Path, to: Path) -> Path:
+    to.write_bytes(path.read_bytes())
+    with rasterio.open(to, "r+") as file:
+        file.update_tags(product="ESA WorldCover 10m")
+    return to
+
+
+def test_heights_in_whole_metres_are_heights(tmp_path: Path) -> None:
+    for name, heights in (("low", np.rint(hills(1, 43) + 1)), ("tens", np.rint(hills(1, 20)) * 10)):
+        path = written(tmp_path / f"{name}.tif", heights, "uint8")
+        np.testing.assert_array_equal(load(path).elevation_m, heights.astype(np.float32))
+
+
+def test_a_palette_of_unknown_codes_is_asked_for(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.tif", patches([1, 2, 3, 200]), "uint8")
+    with rasterio.open(path, "r+") as file:
+        file.write_colormap(1, {n: (n, 255 - n, 77, 255) for n in range(256)})
+    with pytest.raises(TerrainError, match=r"has a palette, and its codes \(1, 2, 3, 200\).*'metres' if it has"):
+        load(path)
+    assert load(path, elevation_encoding="metres").elevation_m.max() == 200

@@ -1,0 +1,77 @@
+"""Patches of equal height: what a plain search over heights finds, whatever the bands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from shared_map.terrain.importers import level_patches as module
+from shared_map.terrain.importers.level_patches import level_patches
+
+EIGHT = np.ones((3, 3), np.int8)
+
+
+def stairs(seed: int, rows: int, cols: int, steps: float) -> np.ndarray:
+    """Whole numbers with wide steps, and some voids."""
+    rng = np.random.default_rng(seed)
+    heights = np.round(ndimage.gaussian_filter(rng.normal(size=(rows, cols)), 1.5) * steps).astype(np.float32)
+    heights[rng.random((rows, cols)) < 0.03] = np.nan
+    return heights
+
+
+def searched(heights: np.ndarray, least_cells: int) -> np.ndarray:
+    """Labels by one search for each height."""
+    alike = np.zeros(heights.shape, np.int64)
+    padded = np.pad(heights, 1, constant_values=np.nan)
+    for row in range(3):
+        for col in range(3):
+            if (row, col) != (1, 1):
+                alike += padded[row : row + heights.shape[0], col : col + heights.shape[1]] == heights
+    labels, count = np.zeros(heights.shape, np.int64), 0
+    for height in np.unique(heights[~np.isnan(heights)]):
+        parts, many = ndimage.label((alike >= 2) & (heights == height), EIGHT)
+        for number in range(1, many + 1):
+            if (parts == number).sum() >= least_cells:
+                count += 1
+                labels[parts == number] = count
+    return labels
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(0, 10_000), st.integers(1, 40), st.integers(1, 40), st.floats(2, 15))
+def test_patches_are_those_of_a_search_height_by_height(seed: int, rows: int, cols: int, steps: float) -> None:
+    heights = stairs(seed, rows, cols, steps)
+    found = level_patches(heights, 0.005, 5, 1.0)
+    expected = searched(heights, 5)
+    pairs = set(zip(expected.ravel().tolist(), found.labels.ravel().tolist(), strict=True)) | {(0, 0)}
+    assert len(pairs) == expected.max() + 1 == len(found.cells)
+    for number in range(1, len(found.cells)):
+        patch = found.labels == number
+        assert found.cells[number] == patch.sum()
+        assert found.height_m[number] == heights[patch][0]
+        assert found.spread_m[number] == 0
+        sides = 0
+        for axis, way in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            beyond = np.roll(patch, way, axis)
+            outer = [slice(None), slice(None)]
+            outer[axis] = slice(0, 1) if way == 1 else slice(-1, None)
+            beyond[tuple(outer)] = False
+            sides += (beyond & ~patch).sum()
+        assert found.edge[number] == sides
+        touched = np.concatenate((patch[0], patch[-1], patch[:, 0], patch[:, -1])).any()
+        assert found.border[number] == touched
+
+
+@pytest.mark.parametrize("band_rows", [1, 7, 1000])
+def test_bands_do_not_show(monkeypatch: pytest.MonkeyPatch, band_rows: int) -> None:
+    heights = stairs(3, 90, 70, 6.0)
+    expected = level_patches(heights, 0.005, 5, 1.0)
+    monkeypatch.setattr(
+        module, "bands", lambda rows: [(n, min(n + band_rows, rows)) for n in range(0, 90, band_rows)]
+    )
+    found = level_patches(heights, 0.005, 5, 1.0)
+    for name in vars(expected):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))

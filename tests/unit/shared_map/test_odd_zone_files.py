@@ -1,0 +1,231 @@
+"""Files of zones that are damaged, odd or hostile are refused in one sentence; rasters of paces and factors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+from rasterio.transform import Affine, from_origin
+from rasterio.warp import transform as to_crs
+from support.zone_shapes import UTM, feature, geojson, middles, painted, written
+
+from shared_map.terrain.importers.zone_outlines import outlines_of
+from shared_map.terrain.layers import polygon_mask
+from swarm.config.scenario import ZoneConfig
+from swarm.errors import TerrainError
+from swarm.grid import GridSpec
+
+BOX = {"type": "Polygon", "coordinates": [[[9.001, 46.94], [9.004, 46.94], [9.004, 46.95], [9.001, 46.94]]]}
+
+
+def collection(*geometries: Any) -> str:
+    return json.dumps(
+        {
+            "type": "FeatureCollection",
+            "features": [{"type": "Feature", "properties": {}, "geometry": g} for g in geometries],
+        }
+    )
+
+
+REFUSED = {
+    "empty": ("", "neither GeoJSON, GeoPackage nor Shapefile"),
+    "words": ("not a map at all", "neither GeoJSON, GeoPackage nor Shapefile"),
+    "other json": ('{"a": 1}', "is damaged"),
+    "cut off": (collection(BOX)[:-40], "is damaged"),
+    "deep": ('{"type": "FeatureCollection", "features":' + "[" * 100_000, "is damaged"),
+    "elsewhere": (
+        collection({"type": "Point", "coordinates": [100.0, 20.0]}),
+        r"reaches from 100, 20 to 100, 20, the terrain from 8\.9\S+, 46\.\S+ to 9\.\S+, 46\.\S+ in",
+    ),
+    "metres": (collection({"type": "Point", "coordinates": [500_100.0, 5_199_900.0]}), "which are no degrees"),
+    "huge": (collection({"type": "Point", "coordinates": [1e300, -1e300]}), "which are no degrees"),
+    "no number": (
+        collection({"type": "Point", "coordinates": [1e300, -1e300]}).replace("1e+300", "1e999"),
+        "is damaged",
+    ),
+    "sqlite": ("SQLite format 3\0" + "x" * 5000, "is damaged"),
+    "shapefile": ("\0\0\x27\x0a" + "\xff" * 500, "is damaged"),
+    "zip": ("PK\3\4" + "x" * 200, "is damaged or no .zip"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_file_that_cannot_be_read_is_refused_in_one_sentence(tmp_path: Path, name: str) -> None:
+    text, reason = REFUSED[name]
+    for ending in (".geojson", ".gpkg", ".shp", ".zip", ""):
+        path = tmp_path / f"a{ending}"
+        path.write_bytes(text.encode("latin-1"))
+        for kind in ("forbidden", "road", "factor"):
+            factor = 2.0 if kind == "factor" else None
+            with pytest.raises(TerrainError) as told:
+                painted([ZoneConfig(kind=kind, name="quarry", file=str(path), factor=factor, width_m=3.0)])
+            assert str(told.value).startswith(f"zone 'quarry' {path}") or "cannot read zone" in str(told.value)
+            assert "\n" not in str(told.value)
+            assert len(str(told.value)) < 500
+    zone = ZoneConfig(kind="factor", file=str(tmp_path / "a.geojson"), factor=2.0)
+    with pytest.raises(TerrainError, match=reason):
+        painted([zone])
+
+
+def test_files_without_shapes_change_nothing_and_say_so(tmp_path: Path) -> None:
+    path = tmp_path / "a.geojson"
+    for text, told in (
+        ('{"type": "FeatureCollection", "features": []}', "0 of 0 features; 0 cells, 0 changed"),
+        (collection(None, None), "0 of 2 features; 0 cells, 0 changed"),
+        (collection({"type": "Polygon", "coordinates": []}, None), "0 of 2 features"),
+    ):
+        path.write_text(text)
+        pace, (facts,) = painted([ZoneConfig(kind="forbidden", file=str(path))])
+        assert (pace == np.float32(0.1)).all()
+        assert told in facts.told(UTM.cells)
+
+
+def test_odd_shapes_are_taken_as_what_they_enclose(tmp_path: Path) -> None:
+    turn = np.arange(5) * 4 * np.pi / 5
+    star = shapely.Polygon(np.stack([20 + 12 * np.sin(turn), 20 - 12 * np.cos(turn)], axis=1))
+    assert not star.is_valid
+    three_d = shapely.Polygon([(40, 5, 100), (45, 5, 200), (45, 9, 300), (40, 9, 400)])
+    mixed = shapely.GeometryCollection(
+        [shapely.Point(3.5, 3.5), shapely.LineString([(1, 30), (9, 30.5)]), shapely.box(2, 8, 5, 11)]
+    )
+    file = geojson(tmp_path / "a.geojson", [feature(star, id=7), feature(None), feature(mixed), feature(three_d)])
+    pace, (facts,) = painted([ZoneConfig(kind="forbidden", file=file)])
+    assert np.isinf(pace[[20, 3, 30, 9, 7], [20, 3, 5, 3, 42]]).all()  # the middle of the star, too
+    assert facts.file is not None
+    assert facts.file.mended == ["7"]
+    assert "1 outside of the terrain, or without a shape" in facts.told(UTM.cells)
+    assert facts.file.used == 3
+
+
+def test_a_shape_that_crosses_itself_thousands_of_times_is_named_not_waited_for(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    scribble = shapely.Polygon(rng.uniform(5, 35, (4000, 2)))
+    file = geojson(tmp_path / "a.geojson", [feature(scribble, id=99), feature(shapely.box(1, 1, 3, 3))])
+    with pytest.raises(
+        TerrainError, match="feature 99 of a forbidden zone cannot be used: it crosses itself thousands"
+    ):
+        painted([ZoneConfig(kind="forbidden", file=file)])
+    _, (facts,) = painted([ZoneConfig(kind="rough", file=file)])
+    assert facts.cells == 4
+    assert "1 it crosses itself thousands of times (feature 99)" in facts.told(UTM.cells)
+    lines = geojson(tmp_path / "b.geojson", [feature(shapely.LineString(rng.uniform(5, 35, (500, 2))))])
+    assert painted([ZoneConfig(kind="road", file=lines, width_m=3.0)])[1][0].cells > 500
+
+
+def test_a_geopackage_of_several_layers_asks_which_and_views_are_no_layers(tmp_path: Path) -> None:
+    import sqlite3
+
+    file = written(tmp_path / "a.gpkg", [shapely.box(1, 1, 3, 3)], UTM.crs, layer="roads")
+    written(tmp_path / "a.gpkg", [shapely.box(1, 1, 5, 5)], UTM.crs, layer="lakes", append=False)
+    with pytest.raises(TerrainError, match="has 2 layers; set layer to one of roads, lakes"):
+        painted([ZoneConfig(kind="forbidden", file=file)])
+    with pytest.raises(TerrainError, match=r"has no layer 'lake', only roads, lakes; did you mean 'lakes'\?"):
+        painted([ZoneConfig(kind="forbidden", file=file, layer="lake")])
+    _, (facts,) = painted([ZoneConfig(kind="factor", factor=2.0, file=file, layer="lakes")])
+    assert facts.cells == 16
+    assert "from a.gpkg layer 'lakes' in EPSG:32632: 1 of 1 features" in facts.told(UTM.cells)
+    database = sqlite3.connect(file)
+    with database:
+        database.execute("DROP TABLE lakes")
+        database.execute(
+            "CREATE VIEW lakes AS WITH RECURSIVE n(fid) AS (SELECT 1 UNION ALL SELECT fid + 1 FROM n)"
+            " SELECT n.fid AS fid, roads.geom AS geom FROM n, roads"
+        )
+    database.close()
+    with pytest.raises(
+        TerrainError, match=r"layer 'lakes' is a view, expected a table|is damaged|has no layer 'lakes'"
+    ):
+        painted([ZoneConfig(kind="forbidden", file=file, layer="lakes")])
+
+
+# --- rasters of pace or factor ------------------------------------------------------------------------------
+
+
+def raster(path: Path, values: np.ndarray, where: Affine, crs: str | None, nodata: float | None = -1.0) -> str:
+    high, wide = values.shape
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=high,
+        width=wide,
+        count=1,
+        dtype=values.dtype,
+        crs=crs,
+        transform=where,
+        nodata=nodata,
+    ) as file:
+        file.write(values, 1)
+    return str(path)
+
+
+def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> None:
+    values = np.full((20, 25), 3.0, np.float32)
+    values[0, :] = -1.0
+    values[1, :] = np.inf
+    file = raster(tmp_path / "a.tif", values, from_origin(500_100, 5_199_900, 10.0, 10.0), UTM.crs)
+    pace, (facts,) = painted([ZoneConfig(kind="factor", file=file)])
+    np.testing.assert_allclose(pace[[9, 10, 11, 12, 29, 30], 20], [0.1, 0.1, np.inf, 0.3, 0.3, 0.1])
+    assert "factor zone from a.tif in EPSG:32632: 475 of 475 values" in facts.told(UTM.cells)
+    pace, _ = painted([ZoneConfig(kind="pace", file=file)])
+    np.testing.assert_allclose(pace[[11, 12], 20], [np.inf, 3.0])
+    degrees = to_crs(UTM.crs, "EPSG:4326", [500_000.0, 500_500.0], [5_200_000.0, 5_199_600.0])
+    (west, east), (north, south) = degrees
+    fine = np.full((400, 500), 2.0, np.float32)
+    fine[:, 250:] = 4.0
+    file = raster(
+        tmp_path / "b.tif", fine, from_origin(west, north, (east - west) / 500, (north - south) / 400), "EPSG:4326"
+    )
+    pace, _ = painted([ZoneConfig(kind="factor", file=file)])
+    np.testing.assert_allclose(pace[20, [5, 45]], [0.2, 0.4])
+    bad = raster(tmp_path / "c.tif", values - 10, from_origin(500_100, 5_199_900, 10.0, 10.0), UTM.crs, None)
+    with pytest.raises(
+        TerrainError, match=r"holds -11, expected a factor of 1e-06 to 1e.06, or inf where nothing drives"
+    ):
+        painted([ZoneConfig(kind="factor", file=bad)])
+    far = raster(tmp_path / "d.tif", values, from_origin(0, 0, 10.0, 10.0), UTM.crs)
+    with pytest.raises(
+        TerrainError, match="does not touch the terrain: it reaches from 0, -200 to 250, 0, the terrain"
+    ):
+        painted([ZoneConfig(kind="factor", file=far)])
+    with pytest.raises(TerrainError, match="is a raster, which goes with kind pace or factor, found 'road'"):
+        painted([ZoneConfig(kind="road", file=file)])
+    nowhere = raster(tmp_path / "e.tif", values, from_origin(500_100, 5_199_900, 10.0, 10.0), None)
+    with pytest.raises(TerrainError, match="does not say in which coordinate system it is; set crs, or 'local'"):
+        painted([ZoneConfig(kind="factor", file=nowhere)])
+    local = GridSpec(UTM.rows, UTM.cols, 10.0, UTM.west_m, UTM.north_m)
+    pace, _ = painted([ZoneConfig(kind="factor", file=nowhere, crs="local")], local)
+    np.testing.assert_allclose(pace[[10, 11, 12], 20], [0.1, np.inf, 0.3])
+
+
+# --- areas for orders ---------------------------------------------------------------------------------------
+
+
+def test_areas_of_a_file_become_rings_that_a_keeper_takes(tmp_path: Path) -> None:
+    star = shapely.Polygon([(5, 5), (15, 6), (14, 15), (6, 14)])
+    overlapping = [shapely.box(25, 5, 35, 12), shapely.box(30, 10, 40, 20)]
+    file = geojson(tmp_path / "a.geojson", [feature(each) for each in (star, *overlapping)], crs="EPSG:4326")
+    rings = outlines_of(Path(file), UTM, None, None, 256)
+    assert sorted(len(ring) for ring in rings) == [4, 8]
+    for ring, shape in zip(sorted(rings, key=len), (star, shapely.union_all(overlapping)), strict=True):
+        corners = tuple((10.0 * col, 10.0 * row) for row, col in ring)
+        clear = shapely.distance(shape.boundary, middles()) > 0.02
+        assert (polygon_mask(corners, UTM) == shapely.contains(shape, middles()))[clear].all()
+    round_ = geojson(tmp_path / "b.geojson", [feature(shapely.Point(20, 20).buffer(15, 500))])
+    (ring,) = outlines_of(Path(round_), UTM, None, None, 256)
+    assert 20 < len(ring) <= 256
+    hole = geojson(tmp_path / "c.geojson", [feature(shapely.box(1, 1, 9, 9) - shapely.box(3, 3, 5, 5))])
+    with pytest.raises(TerrainError, match="an area with a hole, which an order cannot have"):
+        outlines_of(Path(hole), UTM, None, None, 256)
+    line = geojson(tmp_path / "d.geojson", [feature(shapely.LineString([(1, 1), (5, 5)]))])
+    with pytest.raises(TerrainError, match="holds no area on the terrain"):
+        outlines_of(Path(line), UTM, None, None, 256)
+    comb = shapely.union_all([shapely.box(n, 1, n + 0.5, 20) for n in range(1, 40)] + [shapely.box(1, 19, 40, 21)])
+    teeth = geojson(tmp_path / "e.geojson", [feature(comb)])
+    with pytest.raises(TerrainError, match=r"of 1\d\d corners, at most 64 are ordered; simplify it"):
+        outlines_of(Path(teeth), UTM, None, None, 64)

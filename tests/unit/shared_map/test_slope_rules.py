@@ -1,0 +1,359 @@
+"""Slope rules beside what their sources say; limits of steps, slopes across the way, and settings that stand for
+others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shared_map.terrain.layers import along_slope_of_padded, terrain_pace
+from shared_map.terrain.slope_rules import (
+    SLOPE_RULES,
+    along_slope_factor,
+    directional_factor,
+    factor_bounds,
+    slope_factor,
+)
+from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.terrain import build_terrain, terrain_of_pace
+from shared_map.terrain.terrain_report import doubts_about, facts_of
+from swarm.config.cost_rules import PRESETS, check_cost, cost_of_preset
+from swarm.config.load import load_scenario, parse_scenario
+from swarm.config.scenario import CostConfig
+from swarm.errors import ConfigError
+from swarm.grid import GridSpec
+from swarm.wire.statements import PACE_LEAST, PACE_MOST
+
+POINTS = ((-30.0, 3.0), (0.0, 1.0), (20.0, 4.0))
+"""Of the rule `table`."""
+
+
+def ruled(rule: str, **given: object) -> CostConfig:
+    table = {"slope_table": POINTS} if rule == "table" else {}
+    return CostConfig(**{"slope_rule": rule, "max_slope_deg": 60.0, **table, **given})
+
+
+def stepped(rule: str, *rises: float, **given: object) -> np.ndarray:
+    return directional_factor(np.array(rises, np.float32), ruled(rule, **given)).astype(np.float64)
+
+
+def at_deg(rule: str, *slopes_deg: float, **given: object) -> np.ndarray:
+    return stepped(rule, *(math.tan(math.radians(each)) for each in slopes_deg), **given)
+
+
+# --- what the sources say ---------------------------------------------------------------------------------------
+
+
+def test_tobler_walks_5_04_km_h_on_the_level_and_6_down_5_percent() -> None:
+    level_km_h = 6 * math.exp(-3.5 * 0.05)
+    assert level_km_h == pytest.approx(5.04, abs=0.005)
+    speeds = level_km_h / stepped("tobler", 0.0, -0.05, 0.2, -0.25)
+    published = [6 * math.exp(-3.5 * abs(rise + 0.05)) for rise in (0.0, -0.05, 0.2, -0.25)]
+    np.testing.assert_allclose(speeds, published, rtol=1e-5)
+    assert speeds[1] == pytest.approx(6.0, rel=1e-5)
+
+
+def test_naismith_takes_an_hour_for_600_m_and_langmuir_ten_minutes_for_300_m_down() -> None:
+    def minutes(slope_deg: float, height_m: float) -> float:
+        """Over as much of a slope as makes this height."""
+        run_m = height_m / math.tan(math.radians(abs(slope_deg)))
+        return run_m / 5000 * 60 * float(at_deg("naismith_langmuir", slope_deg)[0]), run_m / 5000 * 60
+
+    for slope_deg, height_m, more in (
+        (10, 600, 60),
+        (-8, 300, -10),
+        (-11.9, 300, -10),
+        (-15, 300, 10),
+        (-3, 300, 0),
+    ):
+        took, on_the_level = minutes(slope_deg, height_m)
+        assert took - on_the_level == pytest.approx(more, abs=0.01), slope_deg
+
+
+def test_minetti_is_the_published_polynomial_along_the_slope_and_least_at_some_15_percent_down() -> None:
+    rises = np.linspace(-0.45, 0.45, 181)
+    joules = 280.5 * rises**5 - 58.7 * rises**4 - 76.8 * rises**3 + 51.9 * rises**2 + 19.6 * rises + 2.5
+    found = stepped("minetti", *rises) * 2.5 / np.sqrt(1 + rises**2)
+    np.testing.assert_allclose(found, joules, rtol=1e-4)
+    assert -0.2 <= rises[found.argmin()] <= -0.1
+    # A metre of height costs as much beyond what was measured as at its end.
+    steep = stepped("minetti", 0.45, 0.9, -0.45, -0.9)
+    np.testing.assert_allclose(steep[1::2], 2 * steep[::2], rtol=1e-5)
+
+
+def test_herzog_follows_minetti_and_stays_positive_on_all_slopes() -> None:
+    rises = np.linspace(-0.4, 0.4, 81)
+    published = (
+        1337.8 * rises**6 + 278.19 * rises**5 - 517.39 * rises**4 - 78.199 * rises**3 + 93.419 * rises**2
+    ) + (19.825 * rises + 1.64)
+    np.testing.assert_allclose(stepped("herzog", *rises) * 1.64, published, rtol=1e-4)
+    assert -0.15 <= rises[stepped("herzog", *rises).argmin()] <= -0.05
+    every = stepped("herzog", *np.linspace(-5, 5, 2001), max_slope_deg=90)
+    assert every.min() > 0.3
+    assert every.max() == 100
+
+
+def test_a_critical_slope_doubles_the_pace_of_herzogs_carts() -> None:
+    found = stepped("herzog_wheeled", 0.12, -0.12, 0.24, critical_slope_percent=12)
+    np.testing.assert_allclose(found, [2, 2, 5], rtol=1e-5)
+
+
+def test_a_wheeled_vehicle_is_slowed_by_its_motor_uphill_and_by_its_brakes_downhill() -> None:
+    up, down, gentle, steep = at_deg("energy", 20, -20, -4, -35)
+    sine, cosine = math.sin(math.radians(20)), math.cos(math.radians(20))
+    assert up == pytest.approx(cosine + sine / 0.08, rel=1e-5)
+    assert down == pytest.approx(sine / 0.08 - cosine, rel=1e-5)
+    assert gentle == 1
+    assert steep > 6  # it once cost as much as level ground
+    reserve = at_deg("energy", 20, -20, power_reserve=2, braking_share=3)
+    np.testing.assert_allclose(reserve, [up / 2, 1], rtol=1e-5)
+
+
+def test_no_slope_makes_a_vehicle_quicker_than_its_top_speed() -> None:
+    limited = stepped("minetti", -0.15, -0.02, flat_speed_m_per_s=1.5, top_speed_m_per_s=2.0)
+    np.testing.assert_allclose(limited, [0.75, stepped("minetti", -0.02)[0]], rtol=1e-6)
+
+
+def test_points_of_ones_own_are_joined_by_straight_lines_over_degrees() -> None:
+    np.testing.assert_allclose(at_deg("table", -45, -30, -15, 0, 10, 20, 40), [3, 3, 2, 1, 2.5, 4, 4], rtol=1e-4)
+
+
+# --- both ways --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rule", SLOPE_RULES)
+def test_a_cell_costs_the_mean_of_up_and_down(rule: str) -> None:
+    grades = np.linspace(0, 1.5, 400).astype(np.float32)
+    cost = ruled(rule)
+    up, down = directional_factor(grades, cost), directional_factor(-grades, cost)
+    np.testing.assert_allclose(slope_factor(grades, cost), (up + down) / 2, rtol=1e-6)
+
+
+def test_the_default_rule_is_the_same_bit_for_bit() -> None:
+    grades = np.random.default_rng(1).gamma(1.5, 0.2, 5000).astype(np.float32)
+    sine = grades / np.sqrt(grades * grades + np.float32(1))
+    limit = math.sin(math.radians(35))
+    plain = sine * sine * np.float32(5 / limit**2) + np.float32(1)
+    plain[sine > np.float32(limit)] = np.inf
+    np.testing.assert_array_equal(slope_factor(grades, CostConfig()), plain)
+
+
+@pytest.mark.parametrize("rule", SLOPE_RULES)
+@pytest.mark.parametrize("cross_slope_factor", [1.0, 5.0])
+def test_no_factor_leaves_the_bounds_that_are_told_of_its_rule(rule: str, cross_slope_factor: float) -> None:
+    cost = ruled(rule, cross_slope_factor=cross_slope_factor)
+    found = slope_factor(np.linspace(0, 1.7, 3000).astype(np.float32), cost)
+    least, most = factor_bounds(cost)
+    assert least <= found.min() <= found.max() <= most
+
+
+@given(
+    rule=st.sampled_from(sorted(SLOPE_RULES)),
+    flat=st.one_of(st.floats(0.01, 340), st.floats(0.01, 1.0), st.floats(100, 340)),
+    grade=st.floats(0, 1e4, width=32),
+    factor=st.sampled_from([1e-9, 1.0, 1e9]),
+)
+@settings(max_examples=60, deadline=None)
+def test_no_pace_leaves_the_bounds_of_marks(rule: str, flat: float, grade: float, factor: float) -> None:
+    cost = ruled(rule, max_slope_deg=90, flat_speed_m_per_s=flat, class_factor={"rock": factor})
+    pace = terrain_pace(np.array([[grade, np.nan]], np.float32), np.array([[3, 3]], np.uint8), cost)
+    assert np.float32(PACE_LEAST) <= pace[0, 0] <= np.float32(PACE_MOST)
+    assert pace[0, 1] == np.inf
+
+
+# --- limits of steps --------------------------------------------------------------------------------------------
+
+
+def climb_on(elevation_m: np.ndarray, cost: CostConfig) -> Climb:
+    climb = climb_of(GridSpec(*elevation_m.shape, 10.0), elevation_m.astype(np.float32), cost)
+    assert climb is not None
+    return climb
+
+
+@pytest.mark.parametrize("rule", SLOPE_RULES)
+@pytest.mark.parametrize(("climb_deg", "descent_deg"), [(35, 35), (20, 30), (30, 12), (5, None)])
+def test_no_step_is_steeper_than_its_limit(rule: str, climb_deg: float, descent_deg: float | None) -> None:
+    cost = ruled(rule, directional=True, max_slope_deg=40.0, max_climb_deg=climb_deg, max_descent_deg=descent_deg)
+    slopes_deg = np.arange(-60, 61, 3) + 0.5
+    heights = np.zeros((1, 2), np.float32)
+    for slope in slopes_deg:
+        heights[0, 1] = 10.0 * math.tan(math.radians(slope))
+        climb = climb_on(heights, cost)
+        allowed = -(descent_deg or 40.0) <= slope <= climb_deg
+        assert climb.allows(0, 1) == allowed, slope
+        assert climb.driven(0, 1) <= climb.highest < math.inf
+        assert (climb.along(np.array([0]), np.array([1]))[0] < np.inf) == allowed
+    assert climb.factors[ENTRIES] == 1
+
+
+def test_a_step_of_just_the_limit_is_allowed_and_a_hair_more_is_not() -> None:
+    for steepest_deg in (5.0, 20.0, 45.0, 60.0):
+        cost = CostConfig(directional=True, max_slope_deg=steepest_deg)
+        rise_m = 10.0 * math.tan(math.radians(steepest_deg))
+        for share, allowed in ((1.0, True), (1.0005, False)):
+            climb = climb_on(np.array([[0.0, rise_m * share]]), cost)
+            assert climb.allows(0, 1) == climb.allows(1, 0) == allowed
+    assert "none is steeper than 60 degrees up or 60 degrees down" in climb.note
+
+
+def test_the_report_tells_how_much_of_the_ground_can_be_entered_and_left_again() -> None:
+    level = terrain_of_pace(np.full((30, 40), 0.1, np.float32))
+    heights = np.zeros((30, 40), np.float32)
+    heights[:, :20] = 3.0  # 17 degrees down, not up
+    both = CostConfig(directional=True, max_slope_deg=30.0)
+    one_way = CostConfig(directional=True, max_climb_deg=10.0, max_slope_deg=30.0)
+    for cost, share, doubts in ((both, 1.0, 0), (one_way, 0.5, 1)):
+        facts = facts_of(replace(level, elevation_m=heights, climb=climb_on(heights, cost)))
+        assert facts["both_ways_share"] == share
+        assert sum("cost.max_climb_deg" in doubt for doubt in doubts_about(facts)) == doubts
+    up_the_edge, steps = 30 + 2 * 29, 2 * (30 * 39 + 29 * 40 + 2 * 29 * 39)  # diagonal ones climb 12 degrees
+    assert facts["too_steep_steps_share"] == pytest.approx(up_the_edge / steps, abs=1e-4)
+
+
+# --- across the way ---------------------------------------------------------------------------------------------
+
+
+def test_along_a_slope_of_the_limit_the_cross_slope_factor_is_paid_and_straight_up_it_nothing() -> None:
+    cost = ruled("energy", directional=True, max_slope_deg=30.0, cross_slope_factor=2.0)
+    plain = ruled("energy", directional=True, max_slope_deg=30.0)
+    rise = np.float32(math.tan(math.radians(29.9)))
+    plane_m = np.arange(7) * np.ones((7, 1)) * rise * 10.0
+    paid = along_slope_of_padded(plane_m.astype(np.float32), 10.0, cost)
+    climb, before = climb_on(plane_m, cost), climb_on(plane_m, plain)
+    across, straight = (0, 7), (0, 1)
+    assert paid[2, 2] * climb.of_step(*across) == pytest.approx(2.0, rel=0.01)
+    assert paid[2, 2] * climb.of_step(*straight) == pytest.approx(before.of_step(*straight), rel=0.01)
+    assert paid[2, 2] * climb.of_step(0, 8) > before.of_step(0, 8) * 1.2  # diagonally up
+
+
+def test_no_step_is_cheaper_for_slopes_across_the_way() -> None:
+    rng = np.random.default_rng(3)
+    heights = rng.normal(0, 4, (12, 14)).astype(np.float32)
+    heights[4, 5] = np.nan
+    cost = ruled("tobler", directional=True, cross_slope_factor=3.0)
+    paid = along_slope_of_padded(np.pad(heights, 1, mode="edge"), 10.0, cost).reshape(-1)
+    climb, before = climb_on(heights, cost), climb_on(heights, ruled("tobler", directional=True))
+    pairs = np.array([(cell, near) for cell in range(12 * 14) for _, near in climb.grid.neighbours(cell)])
+    tails, heads = pairs.T
+    here, there = paid[heads] * climb.along(tails, heads), before.along(tails, heads)
+    np.testing.assert_array_equal(np.isinf(here), np.isinf(there))
+    ratio = here[np.isfinite(here)] / there[np.isfinite(here)]
+    assert ratio.min() >= 0.99  # by the width of the table's entries
+    assert np.isfinite(paid).all()
+    assert (along_slope_factor(np.array([0, 0.3, np.nan], np.float32), cost) >= 1).all()
+
+
+def test_a_terrain_pays_for_slopes_across_the_way_and_says_its_rule() -> None:
+    def built(more: str) -> object:
+        text = f'[terrain]\nsource = "synthetic"\nrows = 40\ncols = 40\n[cost]\n{more}'
+        return build_terrain(parse_scenario(text))
+
+    plain, crossed = built("directional = true"), built("directional = true\ncross_slope_factor = 2")
+    passable = np.isfinite(plain.ground_s_per_m)
+    np.testing.assert_array_equal(np.isfinite(crossed.ground_s_per_m), passable)
+    ratio = crossed.ground_s_per_m[passable] / plain.ground_s_per_m[passable]
+    assert ratio.min() >= 1
+    assert ratio.max() > 1.1
+    assert "slope rule quadratic, each step by its way up or down; 10 m/s on level open ground" in plain.notes
+    hiker = built('preset = "hiker"')
+    assert any(
+        note.startswith("slope rule tobler of preset hiker, the mean of up and down") for note in hiker.notes
+    )
+
+
+# --- presets ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_a_scenario_that_fits_together(name: str) -> None:
+    cost = cost_of_preset(name)
+    check_cost(cost, "preset")
+    assert parse_scenario(f'cost.preset = "{name}"').cost == cost
+    assert np.isfinite(slope_factor(np.linspace(0, 0.5, 20).astype(np.float32), cost)).all()
+
+
+def test_settings_of_a_scenario_win_over_those_of_its_preset_key_by_key() -> None:
+    cost = parse_scenario(
+        '[cost]\npreset = "tracked"\nmax_slope_deg = 35\nflat_speed_m_per_s = 10\nclass_factor = { rock = 4 }'
+    ).cost
+    assert (cost.slope_rule, cost.max_slope_deg, cost.flat_speed_m_per_s) == ("energy", 35.0, 10.0)
+    assert cost.class_factor == {"forest": 1.5, "rock": 4.0, "soil": 1.0, "snow": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('preset = "hoover"', "cost.preset"),
+        ("preset = 3", "cost.preset"),
+        ("preset = ['hiker']", "cost.preset"),
+        ('slope_rule = "table"', 'slope_rule = "table" needs slope_table or slope_csv'),
+        ("slope_table = [[0, 1]]", 'slope_rule = "quadratic" reads no slope_table or slope_csv'),
+        ('slope_rule = "table"\nslope_table = [[0, 1], [-5, 2]]', "-5 degrees follow on 0, expected rising slopes"),
+        ('slope_rule = "table"\nslope_table = [[-9, 2], [9, 2]]', "level ground takes 2 times the flat pace"),
+        ('slope_rule = "table"\nslope_table = [[0, nan]]', "cost.slope_table"),
+        ('slope_rule = "table"\nslope_table = [[0, 1]]\nslope_csv = "a.csv"', "exclude each other"),
+        ("top_speed_m_per_s = 4", "top_speed_m_per_s: 4 is less than flat_speed_m_per_s = 10"),
+        ("max_climb_deg = 4", "max_climb_deg is about steps: set directional = true"),
+        ("max_descent_deg = 4", "max_descent_deg is about steps: set directional = true"),
+        ("flat_speed_m_per_s = 1000", "cost.flat_speed_m_per_s"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_in_one_sentence(text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match="scenario") as refused:
+        parse_scenario(f"[cost]\n{text}")
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+# --- tables in files --------------------------------------------------------------------------------------------
+
+
+def scenario_with(folder: Path, table: str, more: str = "") -> CostConfig:
+    (folder / "slopes.csv").write_text(table, encoding="utf-8")
+    (folder / "mine.toml").write_text(f'[cost]\nslope_rule = "table"\nslope_csv = "slopes.csv"\n{more}')
+    return load_scenario(folder / "mine.toml").cost
+
+
+def test_a_table_in_a_file_is_of_factors_paces_or_speeds_by_degrees_or_percent(tmp_path: Path) -> None:
+    by_factor = scenario_with(tmp_path, "slope_deg,factor\n-45,2\n0,1\n45,3\n")
+    assert by_factor.slope_table == ((-45.0, 2.0), (0.0, 1.0), (45.0, 3.0))
+    assert by_factor.slope_csv is None
+    by_speed = scenario_with(tmp_path, "slope_percent, speed_m_per_s\n-100, 5\n\n0, 10\n100, 3.3333333333\n")
+    by_pace = scenario_with(tmp_path, "\ufeffslope_percent,pace_s_per_m\n-100,0.2\n0,0.1\n100,0.3\n")
+    for other in (by_speed, by_pace):
+        np.testing.assert_allclose(other.slope_table, by_factor.slope_table, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("", "the first line is ''"),
+        ("slope,factor\n0,1\n", "expected two columns, slope_deg or slope_percent and factor or pace_s_per_m"),
+        ("slope_deg,factor\n0,1\n3,quick\n", "line 3 is '3,quick'"),
+        ("slope_deg,factor\n0,1\n3\n", "line 3 is '3'"),
+        ("slope_deg,factor\n0,nan\n", "line 2"),
+        ("slope_deg,factor\nnan,1\n", "line 2"),
+        ("slope_deg,speed_m_per_s\n0,0\n", "line 2"),
+        ("slope_deg,factor\n0,1\n95,2\n", "line 3"),
+        ("slope_percent,speed_m_per_s\n0,5\n", "level ground takes 2 times the flat pace"),
+        ("slope_deg,factor\n", "needs slope_table or slope_csv"),
+        ('slope_deg,factor\n"' + "0" * 200_000, "is no table of comma-separated values"),
+    ],
+)
+def test_a_table_that_cannot_be_read_names_file_and_line(tmp_path: Path, table: str, said: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        scenario_with(tmp_path, table)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_table_that_is_not_there_is_named(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('cost.slope_csv = "no.csv"\ncost.slope_rule = "table"')
+    with pytest.raises(ConfigError, match=r"cannot read slope table .*no\.csv"):
+        load_scenario(tmp_path / "mine.toml")

@@ -1,0 +1,99 @@
+"""Vehicles keep to the steps that are not too steep, and none is stuck on one that is."""
+
+from __future__ import annotations
+
+import math
+import random
+from itertools import pairwise
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shared_map.terrain.step_climb import Climb, climb_of
+from swarm.config.scenario import CostConfig, PlannerConfig
+from swarm.grid import GridSpec
+from vehicle_agent.bodies import Bodies
+from vehicle_agent.driving.driver import Driver
+from vehicle_agent.driving.vehicle import Vehicle
+from vehicle_agent.local_map import LocalMap
+from vehicle_agent.traffic.steering import Steering
+
+GRID = GridSpec(8, 8, 10.0)
+LEVEL = np.full((8, 8), 0.1, np.float32)
+
+
+def climb_on(elevation_m: np.ndarray) -> Climb:
+    cost = CostConfig(slope_rule="energy", directional=True, max_climb_deg=15.0, max_descent_deg=25.0)
+    climb = climb_of(GRID, elevation_m.astype(np.float32), cost)
+    assert climb is not None
+    return climb
+
+
+def steering_on(climb: Climb, pace: np.ndarray = LEVEL) -> Steering:
+    return Steering(GRID, pace, PlannerConfig(), 4, Bodies(GRID), climb)
+
+
+@given(st.integers(0, 1 << 32), st.floats(0.0, 0.3))
+@settings(max_examples=30, deadline=None)
+def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(seed: int, share: float) -> None:
+    chance = random.Random(seed)
+    heights = np.array([chance.gauss(0, 2) for _ in range(GRID.cells)]).reshape(8, 8)
+    pace = np.where([chance.random() < share for _ in range(GRID.cells)], np.inf, 0.1).astype(np.float32)
+    climb = climb_on(heights)
+    steering = steering_on(climb, pace.reshape(8, 8))
+    cells = [chance.randrange(GRID.cells)]
+    for _ in range(chance.randint(0, 20)):
+        cells.append(chance.choice([other for _, other in GRID.neighbours(cells[-1])]))
+    one_by_one = [steering.passable(tail, head) for tail, head in pairwise(cells)]
+    assert steering.passable_steps(cells) == [*one_by_one, False].index(False)
+    near = [other for _, other in GRID.neighbours(cells[0])]
+    assert sorted(steering.steps(cells[0])) == sorted(each for each in near if steering.passable(cells[0], each))
+    assert all(climb.allows(cells[0], each) for each in steering.steps(cells[0]))
+
+
+class Held:
+    """Holdings of one vehicle that was granted a path."""
+
+    def __init__(self, path: list[int]) -> None:
+        self.cells = path
+
+    def path(self, vehicle: str) -> list[int]:
+        return self.cells
+
+    def moved(self, vehicle: str, cell: int) -> None:
+        self.cells = self.cells[self.cells.index(cell) :]
+
+    def give_back(self, vehicle: str, keep: int) -> None:
+        self.cells = self.cells[:keep]
+
+
+def test_a_vehicle_stands_before_a_step_that_is_too_steep_and_gets_back_from_one_that_it_has_begun() -> None:
+    heights = np.zeros((8, 8))
+    heights[:, 3:] = 3.0  # 17 degrees: down it may drive, not up
+    climb = climb_on(heights)
+    below, above = GRID.cell(4, 2), GRID.cell(4, 3)
+    assert math.isinf(climb.of_step(below, above))
+    assert climb.of_step(above, below) < math.inf
+    vehicle = Vehicle("v", GRID, below)
+    held = Held([below, above])
+    steering = steering_on(climb)
+    driver = Driver(LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL, climb), held, steering.passable, None)  # type: ignore[arg-type]
+
+    def drive(seconds: float) -> None:
+        driver.begin(["v"], seconds)
+        driver.drive({"v": vehicle}, lambda _: False)
+
+    drive(60.0)
+    assert vehicle.cell == below
+    assert vehicle.motion.at_rest
+    # Downhill it sets out, and then turns back, up what it may not climb: it comes to rest all the same.
+    vehicle, held.cells = Vehicle("v", GRID, above), [above, below]
+    drive(0.3)
+    assert not vehicle.motion.at_rest
+    vehicle.motion.turn_back()
+    held.cells = [above]
+    for _ in range(100):
+        drive(1.0)
+    assert vehicle.motion.at_rest
+    assert vehicle.cell == above
