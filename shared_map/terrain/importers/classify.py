@@ -6,6 +6,7 @@ never water. So water must be level, smooth and bluish or nearly black, and is g
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,10 @@ STILL_GRADE = np.float32(0.004)
 LEVEL_M, LEVEL_PER_CELL = 0.25, 0.025
 """Standard deviation of a lake's heights: metres of the survey, and per metre of cell for the bank in a cell at the
 shore. Lakes that were measured have at most nine tenths of it; the shadow of a cloud lies over more."""
+EXPOSURES = ((1.1, 1.03), (0.9, 0.97))
+"""(gain, red over green): two photos of one place differ by as much, and more."""
+LEVEL_SAND = np.float32(0.1)
+"""On gentler ground what is as bright as snow, and not even, may be a beach, a roof or a quarry."""
 SMALLEST_LAKE = 12
 _LIGHT = np.array([0.299, 0.587, 0.114], np.float32)
 """How bright red, green and blue are to the eye (Rec. 601)."""
@@ -56,11 +61,22 @@ class Features:
         self.light = near @ _LIGHT
         self.around = mean
         self.texture = np.sqrt(np.maximum(square - mean * mean, np.float32(0)))
-        brightest = np.maximum(np.maximum(self.red, self.green), self.blue)
-        darkest = np.minimum(np.minimum(self.red, self.green), self.blue)
-        self.saturation = (brightest - darkest) / np.maximum(brightest, np.float32(1))
+        self.saturation = _saturation(self.red, self.green, self.blue)
         self.grade = grade
         self.sharp, self.rgb = colour, rgb
+
+    def exposed(self, gain: float, warm: float) -> Features:
+        """The means as they would be if the photo were brighter, and redder than blue, by these factors."""
+        other = copy.copy(self)
+        gains = [np.float32(each) for each in (gain * warm, gain, gain / warm)]
+        other.red, other.green, other.blue = (
+            each * by for each, by in zip((self.red, self.green, self.blue), gains, strict=True)
+        )
+        other.light, other.around, other.texture = (
+            each * np.float32(gain) for each in (self.light, self.around, self.texture)
+        )
+        other.saturation = _saturation(other.red, other.green, other.blue)
+        return other
 
     def columns(self) -> Floats:
         """float32 (cells, 11) for a learner, row by row; the last column is the grade."""
@@ -70,6 +86,13 @@ class Features:
             *(self.red / total, self.green / total, self.blue / total, self.grade),
         )
         return np.stack([part.reshape(-1) for part in parts], axis=1).astype(np.float32)
+
+
+def _saturation(red: Floats, green: Floats, blue: Floats) -> Floats:
+    brightest = np.maximum(np.maximum(red, green), blue)
+    darkest = np.minimum(np.minimum(red, green), blue)
+    saturation: Floats = (brightest - darkest) / np.maximum(brightest, np.float32(1))
+    return saturation
 
 
 def box_sum(values: NDArray[Any], reach: int) -> NDArray[Any]:
@@ -110,6 +133,7 @@ def by_rules(
     Returns
     -------
     uint8 (rows, cols), TerrainClass
+        UNKNOWN also where a photo that is exposed a little differently would show another class.
     """
     rows, cols = rgb.shape[:2]
     classes = np.empty((rows, cols), np.uint8)
@@ -118,7 +142,7 @@ def by_rules(
 
     def work(row0: int, row1: int) -> None:
         inner, features = _features(rgb, elevation_m, resolution_m, row0, row1)
-        classes[row0:row1] = _ground(features)[inner]
+        classes[row0:row1] = _sure_ground(features)[inner]
         wetness[row0:row1] = _water(features)[inner]
         if resolution_m <= COARSEST_M:
             strength = line_strength(features.rgb)
@@ -146,6 +170,16 @@ def _features(
     else:
         grade = np.nan_to_num(grade_of_padded(padded_rows(elevation_m, above, below), resolution_m))
     return slice(row0 - above, row1 - above), Features(rgb[above:below], grade)
+
+
+def _sure_ground(f: Features) -> Bytes:
+    """`_ground` where it does not hang on how the photo was exposed."""
+    classes = _ground(f)
+    doubtful = (classes == TerrainClass.SNOW) & (f.grade < LEVEL_SAND) & (f.texture > 8)
+    for gain, warm in EXPOSURES:
+        doubtful |= _ground(f.exposed(gain, warm)) != classes
+    classes[doubtful] = TerrainClass.UNKNOWN
+    return classes
 
 
 def _ground(f: Features) -> Bytes:

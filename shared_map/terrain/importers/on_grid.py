@@ -5,7 +5,6 @@ Cell coordinates are (column, row) from the north-west corner: cell (r, c) is th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -190,7 +189,8 @@ def _systems(grid: GridSpec, layer: Layer, given: str | None) -> tuple[Any, Any]
     if given == "local":
         return None, None
     try:
-        found = rasterio.CRS.from_user_input(given) if given is not None else None
+        with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
+            found = rasterio.CRS.from_user_input(given) if given is not None else None
     except (CRSError, ValueError) as error:
         raise TerrainError(
             f"{layer.what}: crs {given!r} is no coordinate system; write EPSG:32632 or alike"
@@ -302,26 +302,3 @@ def _clipped(shapes: NDArray[Any], box: Box) -> NDArray[Any]:
     import shapely
 
     return np.asarray(shapely.clip_by_rect(shapes, *box), object) if len(shapes) else shapes
-
-
-def cells_spanned(shapes: NDArray[Any]) -> float:
-    """Cells of the rectangles around shapes, in all."""
-    import shapely
-
-    if not len(shapes):
-        return 0.0
-    box = shapely.bounds(shapes)
-    return float(((box[:, 2] - box[:, 0] + 1) * (box[:, 3] - box[:, 1] + 1)).sum())
-
-
-def widened(line: Any, half_cells: float) -> list[Any]:
-    """Areas within a distance of a line or point. Long lines in pieces, as one that crosses itself often would take
-    for ever."""
-    import shapely
-
-    points = shapely.get_coordinates(line)
-    most = 50
-    if len(points) <= most or math.isclose(half_cells, 0.0):
-        return [line.buffer(half_cells)]
-    pieces = [points[n : n + most + 1] for n in range(0, len(points) - 1, most)]
-    return [shapely.LineString(piece).buffer(half_cells) for piece in pieces]
