@@ -36,7 +36,7 @@ def blobs(draw: st.DrawFn) -> Any:
     return shapely.Polygon(outer, [hole])
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(blobs(), st.sampled_from(["EPSG:4326", "EPSG:32632", "EPSG:3857"]))
 def test_areas_cover_the_cells_whose_middle_they_hold_and_lethal_ones_all_that_they_touch(
     tmp_path_factory: pytest.TempPathFactory, blob: Any, crs: str
@@ -54,7 +54,7 @@ def test_areas_cover_the_cells_whose_middle_they_hold_and_lethal_ones_all_that_t
     assert np.isfinite(closed[beyond]).all()
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(-10, 60), st.floats(-10, 50)), min_size=2, max_size=6, unique=True),
     st.integers(5, 900).map(lambda tenths: tenths / 10),
@@ -320,7 +320,7 @@ def test_a_terrain_across_180_degrees_has_zones_on_both_sides(tmp_path: Path) ->
         painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "uncut.geojson"))], grid)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     st.lists(st.floats(8, 42), min_size=3, max_size=7),
     st.lists(st.tuples(st.floats(0, 50), st.floats(0, 40)), min_size=2, max_size=6, unique=True),
@@ -339,7 +339,7 @@ def test_no_road_crosses_a_river_without_a_bridge(
     assert not np.intersect1d(parts[:, 0], parts[:, -1]).any()
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     st.floats(-0.7, 0.7),
     st.floats(20, 30),
