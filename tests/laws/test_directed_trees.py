@@ -161,6 +161,26 @@ def test_growth_by_buckets_by_decrease_key_and_by_scipy_agree(seed: int) -> None
     assert np.isinf(best[np.isfinite(ground.pace)]).any() or seed % 3 < 2
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_costs_are_tightened_and_relabelled_to_what_is_driven(seed: int) -> None:
+    ground = Ground(seed, RULES[seed])
+    tree, costs = ground.tree, ground.costs
+    moved = 0
+    for _ in range(20):
+        here = tree.root
+        there = [cell for _, cell in costs.grid.neighbours(here) if np.isfinite(ground.pace.flat[cell])]
+        cell = int(ground.rng.choice(there or [here]))
+        moved += bool(tree.move(cell, costs.grid.around(cell, 4)))
+    assert moved > 5
+    starts = np.flatnonzero(np.isfinite(tree.cost) & (tree.parent != NONE))
+    driven = costs.walk(tree.parent, costs.pad(tree.root), starts, 0, costs.cell_cost).driven
+    assert (tree.cost[starts] + tree.offset > driven * 1.0001).any()
+    tree.tighten(starts)
+    np.testing.assert_allclose(tree.cost[starts] + tree.offset, driven, rtol=1e-5)
+    tree.relabel()
+    np.testing.assert_allclose(tree.cost[starts], driven, rtol=1e-5)
+
+
 def one_way() -> Climb:
     """A terrace: from column 20 on the ground lies 1 m lower, which may be driven down and not up."""
     heights = np.zeros((30, 40), np.float32)
