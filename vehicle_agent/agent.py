@@ -6,6 +6,7 @@ import math
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,7 +191,7 @@ class Agent:
     @property
     def places(self) -> list[int]:
         """The cells that our vehicles hold."""
-        return [cell for id in self.vehicles for cell in self.holdings.path(id)]
+        return list(chain.from_iterable(map(self.holdings.path, self.vehicles)))
 
     # --- driving --------------------------------------------------------------------------------------------
 

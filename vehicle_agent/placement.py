@@ -97,7 +97,7 @@ def _explicit_cells(
         row, col = grid.row_col(cell)
         if not (np.isfinite(prior[row, col]) and np.isfinite(truth[row, col])):
             lethal = written(frame, cell)
-            raise ConfigError(f"groups: {group.name}: cell {lethal} is lethal; choose a passable cell")
+            raise ConfigError(f"groups: {group.name}: {lethal} is lethal; choose a passable cell")
         cells.append(cell)
     return cells
 

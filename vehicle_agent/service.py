@@ -229,12 +229,13 @@ class AgentService:
             self._entering.tick(self._right_of_way.core.informed, now_ns)
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
-        self._zones.update(agent.places, now_ns, agent.bodies.standing | agent.seen_lethal)
+        places = agent.places
+        self._zones.update(places, now_ns, agent.bodies.standing | agent.seen_lethal)
         agent.set_ways_out(self._zones.ways_out)
         self._obey(now_ns)
         agent.map_changed(self._cost_map.take_dirty(), now_ns, look=True)
-        if agent.places:
-            self._sync.enter(self._near_marks.update(agent.places))
+        if places:
+            self._sync.enter(self._near_marks.update(places))
         self._hear_bodies(now_ns)
         agent.begin_drive(now_ns)
         while (found := agent.drive()) is not None:
@@ -242,12 +243,12 @@ class AgentService:
                 self.counters.count("marks", len(findings))
                 self._sync.publish(self._replica.write(findings.cells, findings.kinds, findings.paces, now_ns))
                 agent.map_changed(self._cost_map.take_dirty(), now_ns)
-        places = Places(self._cost_map.grid, agent.vehicles.values())
-        self._tell_sighted(places, now_ns)
+        columns = Places(self._cost_map.grid, agent.vehicles.values())
+        self._tell_sighted(columns, now_ns)
         self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
-        for region, fleet in self._fleet.reports(places, now_ns):
+        for region, fleet in self._fleet.reports(columns, now_ns):
             self._bus.publish(FLEET, fleet, region=region, author=self._author)
         chasing = ((id, vehicle.target, agent.holdings.path(id)) for id, vehicle in agent.vehicles.items())
         for chasers in self._chasers.reports(chasing, now_ns):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch_scripts.commands.shared_options import AsJson, Tls, spread
+from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, spread
 from swarm.places import extent_of, fields_of, written
 
 if TYPE_CHECKING:
@@ -74,6 +74,7 @@ def route(
     out: Annotated[
         Path | None, typer.Option(help="Write .geojson, .gpx, .kml or .csv; with --terrain also .png, a picture.")
     ] = None,
+    preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
     """Ask a planner for the cheapest route from a place to its target; or find one on a terrain, without a swarm.
@@ -84,7 +85,7 @@ def route(
 
     swarm route --target t3 --row 40 --col 200 --json | jq .routes[0].cost_s
 
-    swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --out way.gpx
+    swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --preset hiker --out way.gpx
     """
     from launch_scripts.commands.route_files import check_route_file
     from swarm.errors import ConfigError
@@ -94,8 +95,10 @@ def route(
         if start is None or end is None or target is not None or row is not None or col is not None:
             raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
         check_route_file(out)
-        _route_on_terrain(terrain, start, end, out, as_json)
+        _route_on_terrain(terrain, start, end, preset, out, as_json)
         return
+    if preset is not None:
+        raise ConfigError("--preset goes with --terrain: planners of a running swarm go by its scenario")
     by_cell = row is not None and col is not None
     if target is None or (start is None) == (not by_cell) or end is not None or (cost and out is not None):
         raise ConfigError(
@@ -114,13 +117,15 @@ def route(
         swarm_route.show(answer)
 
 
-def _route_on_terrain(terrain: str, start: str, end: str, out: Path | None, as_json: bool) -> None:
+def _route_on_terrain(
+    terrain: str, start: str, end: str, preset: str | None, out: Path | None, as_json: bool
+) -> None:
     from launch_scripts.commands.route_files import profile_of, write_route
     from launch_scripts.commands.route_on_terrain import find_route
     from shared_map.terrain.places import MapFrame
     from swarm.places import written
 
-    found = find_route(terrain, start, end)
+    found = find_route(terrain, start, end, preset)
     if out is not None:
         write_route(found, out)
     facts = found.facts()

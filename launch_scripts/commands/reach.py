@@ -50,15 +50,15 @@ class Reach:
         return float(np.median(known)), float(known.max())
 
 
-def reach(source: str, place: str) -> Reach:
+def reach(source: str, place: str, preset: str | None = None) -> Reach:
     """What driving to a place takes from everywhere. Raises TerrainError or ConfigError with one sentence."""
     goal = read_place(place, "--to")
-    scenario = find_scenario(source)
+    scenario = find_scenario(source, preset)
     terrain = build_terrain(scenario)
     return Reach(terrain.grid, _to(scenario, terrain, cell_of(goal, MapFrame(terrain.grid), "--to"), "--to"))
 
 
-def corridor(source: str, start: str, end: str, slack: float) -> Reach:
+def corridor(source: str, start: str, end: str, slack: float, preset: str | None = None) -> Reach:
     """Cells through which a way between two places leads that takes at most `slack` (a share) more than the best.
 
     Each cell has the time of a way that passes it and can be driven: to the cell along the cheapest way back from
@@ -71,7 +71,7 @@ def corridor(source: str, start: str, end: str, slack: float) -> Reach:
         With one sentence, also if there is no way.
     """
     first_place, last_place = read_place(start, "--from"), read_place(end, "--to")
-    scenario = find_scenario(source)
+    scenario = find_scenario(source, preset)
     terrain = build_terrain(scenario)
     if terrain.climb is not None or scenario.planner.length_weight:
         raise ConfigError("--from: no corridors with cost.directional = true or with planner.length_weight")

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.report.geo_shapes import in_degrees
 from shared_map.arrays import Floats
 from shared_map.terrain.places import MapFrame, middles_of
 from shared_map.terrain.terrain import Terrain
@@ -65,7 +66,7 @@ class DescribedRoute:
         if self.height_m is None:
             return None
         rise = np.diff(self.height_m[np.isfinite(self.height_m)])
-        return float(rise[rise > 0].sum()), float(-rise[rise < 0].sum())
+        return float(rise[rise > 0].sum()), float(np.abs(rise[rise < 0]).sum())
 
     def metres(self) -> NDArray[np.float64]:
         """float64 (2, n): x and y in metres of the map."""
@@ -156,7 +157,8 @@ def _points(xs: NDArray[np.float64], ys: NDArray[np.float64], heights: Any, digi
 
 def _geojson(route: DescribedRoute, path: Path) -> None:
     """RFC 7946: WGS 84, longitude first. A terrain without a place is written in its own metres, and says so."""
-    xs, ys = route.degrees()[::-1] if route.placed else route.metres()
+    points = route.metres().T
+    xs, ys = (in_degrees(points, MapFrame(route.grid)) if route.placed else points).T
     properties = {"name": route.name, **route.facts(), "at_m": route.at_m.round(2).tolist()}
     if route.at_s is not None:
         properties["at_s"] = route.at_s.round(2).tolist()

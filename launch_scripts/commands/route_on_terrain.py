@@ -16,7 +16,7 @@ from swarm.places import cell_of, read_place, written
 from swarm.wire.routes import RouteStatus
 
 
-def find_route(source: str, start: str, end: str) -> DescribedRoute:
+def find_route(source: str, start: str, end: str, preset: str | None = None) -> DescribedRoute:
     """The cheapest route between two places of a terrain file, a scenario or a built-in one.
 
     Raises
@@ -25,7 +25,7 @@ def find_route(source: str, start: str, end: str) -> DescribedRoute:
         With one sentence, also if there is no way.
     """
     first_place, last_place = read_place(start, "--from"), read_place(end, "--to")
-    scenario = find_scenario(source)
+    scenario = find_scenario(source, preset)
     terrain = build_terrain(scenario)
     frame = MapFrame(terrain.grid)
     first, last = cell_of(first_place, frame, "--from"), cell_of(last_place, frame, "--to")

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 Namespace = Annotated[str | None, typer.Option(help="Prefix of all keys: runs in different ones do not meet.")]
 Runs = Annotated[Path, typer.Option(help="Folder in which each run gets a folder of its own.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
+PresetOption = Annotated[
+    str | None,
+    typer.Option("--preset", help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset."),
+]
 Rank = Annotated[
     int,
     typer.Option(

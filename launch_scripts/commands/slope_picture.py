@@ -14,6 +14,8 @@ from swarm.errors import TerrainError
 
 _STEEPEST_PERCENT = 60
 _MOST_FACTOR = 8.0
+_ALIKE = 4.0
+"""Vehicles of which one is quicker than another by more are shown on a logarithmic scale."""
 _COLOURS = ("#1b6ca8", "#c8553d", "#4f9d69", "#8e6bb0", "#b8860b", "#3a3a3a", "#d48fb0", "#1fa3a3")
 _STYLES = ("-", "--")
 
@@ -33,6 +35,7 @@ def draw_rules(shown: Shown, path: Path) -> None:
 
 def _panel(panel: Axes, title: str, curves: list[Curve]) -> None:
     slopes = np.linspace(-_STEEPEST_PERCENT, _STEEPEST_PERCENT, 1201)
+    speeds = [curve.cost.flat_speed_m_per_s for curve in curves]
     for number, curve in enumerate(curves):
         values = curve.at(slopes)
         values[~np.isfinite(values) | (values == 0)] = np.nan
@@ -46,6 +49,9 @@ def _panel(panel: Axes, title: str, curves: list[Curve]) -> None:
         panel.set_ylabel("pace over that of level ground")
         panel.axhline(1, color="#999", linewidth=0.8)
         panel.set_ylim(0, _MOST_FACTOR)
+    elif max(speeds) < _ALIKE * min(speeds):
+        panel.set_ylabel("speed on open ground, m/s")
+        panel.set_ylim(bottom=0)
     else:
         panel.set_ylabel("speed on open ground, m/s")
         panel.set_yscale("log")

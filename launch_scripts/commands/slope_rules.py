@@ -93,15 +93,15 @@ def _toml(value: object) -> str:
     return f'"{value}"' if isinstance(value, str) else f"{value:g}"
 
 
-def of_scenario(scenario: Scenario) -> Shown:
-    """What steps cost where `directional`, what cells cost where not."""
+def of_scenario(scenario: Scenario, name: str) -> Shown:
+    """What steps cost where `directional`; where not, what cells cost, and what steps would."""
     cost, row = scenario.cost, SLOPE_RULES[scenario.cost.slope_rule]
     climb_deg, descent_deg = step_limits_deg(cost)
     limits = f"{cost.max_slope_deg:g} degrees of ground"
     if cost.directional:
         limits += f", steps to {climb_deg:g} degrees up and {descent_deg:g} down"
     notes = {"about": row.about, "source": row.source, "limits": limits}
-    title = f"{scenario.name}: slope rule {cost.slope_rule}{f', preset {cost.preset}' if cost.preset else ''}"
+    title = f"{name}: slope rule {cost.slope_rule}{f', preset {cost.preset}' if cost.preset else ''}"
     step = Curve("each step" if cost.directional else "if directional", "m/s", msgspec.structs.replace(cost), notes)
     cell = Curve("each cell", "m/s", cost, notes, is_mean=True)
     return Shown({title: [step] if cost.directional else [cell, step]})

@@ -13,11 +13,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from launch_scripts.commands.shared_options import AsJson
+from launch_scripts.commands.shared_options import AsJson, PresetOption
 from launch_scripts.commands.terrain_files import write_geotiff
 from launch_scripts.launcher.progress import progress
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass
+from swarm.config.cost_rules import cost_of_preset
 from swarm.config.scenario import ElevationEncoding, Scenario, TerrainConfig
 from swarm.errors import ConfigError, SwarmError, TerrainError
 
@@ -79,10 +80,10 @@ def _check_target(path: Path | None, option: str, *endings: str) -> None:
         raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
 
 
-def _scenario(name: str) -> Scenario:
+def _scenario(name: str, preset: str | None = None) -> Scenario:
     from launch_scripts.launcher.options import find_scenario
 
-    return find_scenario(name)
+    return find_scenario(name, preset)
 
 
 @app.command()
@@ -95,6 +96,7 @@ def info(
     cover: Cover = None,
     cover_codes: CoverCodes = None,
     elevation_encoding: Encoding = None,
+    preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what a terrain file or a scenario holds, and what was done to bring it onto a metric grid.
@@ -106,7 +108,7 @@ def info(
     --height-scale. The lines after the table
     say what was done to the file, and what you should know about it; those
     with a ! what looks wrong. Costs are those of the scenario, of a file
-    those of an empty one.
+    those of an empty one or of a preset.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
@@ -116,7 +118,7 @@ def info(
     from shared_map.terrain.terrain_report import doubts_about, facts_of
 
     if file.endswith(".toml"):
-        scenario = _scenario(file)
+        scenario = _scenario(file, preset)
     else:
         nodata = "fill" if fill else "lethal"
         raw = {
@@ -129,7 +131,7 @@ def info(
             "cover_codes": cover_codes,
             "elevation_encoding": elevation_encoding,
         }
-        scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig))
+        scenario = Scenario(terrain=msgspec.convert(raw, TerrainConfig), cost=cost_of_preset(preset))
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
     rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
@@ -167,6 +169,7 @@ def cost(
     ],
     out: Annotated[Path | None, typer.Option(help="Write seconds per metre as GeoTIFF; lethal is -1.")] = None,
     picture: PictureOption = None,
+    preset: PresetOption = None,
 ) -> None:
     """Build the prior cost map of a scenario; write it and a picture of it.
 
@@ -181,7 +184,7 @@ def cost(
 
     _check_target(out, "--out", *_TIFF)
     _check_target(picture, "--picture", ".png")
-    loaded = _scenario(scenario)
+    loaded = _scenario(scenario, preset)
     with progress() as tell:
         started = time.perf_counter()
         terrain = build_terrain(loaded, tell)
@@ -241,7 +244,10 @@ def rules(
     from launch_scripts.commands import slope_rules
 
     _check_target(picture, "--picture", ".png")
-    shown = slope_rules.of_all() if scenario is None else slope_rules.of_scenario(_scenario(scenario))
+    if scenario is None:
+        shown = slope_rules.of_all()
+    else:
+        shown = slope_rules.of_scenario(_scenario(scenario), Path(scenario).stem)
     if picture is not None:
         from launch_scripts.commands.slope_picture import draw_rules
 
@@ -319,6 +325,7 @@ def reach(
     every_s: Annotated[
         float, typer.Option(min=0.001, max=1e9, help="How far apart the areas of a .geojson are, in seconds.")
     ] = 600.0,
+    preset: PresetOption = None,
     as_json: AsJson = False,
 ) -> None:
     """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as GeoJSON.
@@ -327,7 +334,7 @@ def reach(
     its cells has the time of the best way that passes it; the areas of a
     .geojson are seconds lost against the best way of all.
 
-    swarm terrain reach dem.tif --to 46.78,9.87 --out seconds.tif
+    swarm terrain reach dem.tif --to 46.78,9.87 --preset hiker --out seconds.tif
     swarm terrain reach mine.toml --to cell:40,200 --out areas.geojson --every-s 300
     swarm terrain reach dem.tif --from 46.81,9.84 --to 46.78,9.87 --slack 0.1 --out corridor.tif
     """
@@ -335,7 +342,7 @@ def reach(
     from launch_scripts.commands.reach import reach as reach_of
 
     _check_target(out, "--out", *_TIFF, ".geojson")
-    found = reach_of(terrain, to) if start is None else corridor(terrain, start, to, slack)
+    found = reach_of(terrain, to, preset) if start is None else corridor(terrain, start, to, slack, preset)
     if out is not None:
         write_reach(found, out, every_s)
     median_s, longest_s = found.quantiles_s()
@@ -420,18 +427,25 @@ def _compare(terrain: Terrain, path: Path) -> None:
 
 
 def _print_confusion(title: str, counts: Any) -> None:
+    labelled = [kind for kind in TerrainClass if counts[kind].any()]
     present = [kind for kind in TerrainClass if counts[kind].any() or counts[:, kind].any()]
+    unknown = counts[:, TerrainClass.UNKNOWN].sum() / counts.sum()
+    right = np.trace(counts) / counts.sum()
     table = Table(
-        title=f"{title}: {np.trace(counts) / counts.sum():.1%} of the labelled cells", title_justify="left"
+        title=f"{title}: {right:.1%} of the labelled cells, {unknown:.1%} unknown, {1 - right - unknown:.1%} wrong",
+        title_justify="left",
     )
     table.add_column("labelled")
     for kind in present:
         table.add_column(kind.name.lower(), justify="right")
     table.add_column("IoU", justify="right")
-    for kind in present:
+    overlaps = []
+    for kind in labelled:
         union = counts[kind].sum() + counts[:, kind].sum() - counts[kind, kind]
         cells = [str(counts[kind, other]) for other in present]
-        table.add_row(kind.name.lower(), *cells, f"{counts[kind, kind] / union:.2f}")
+        overlaps.append(counts[kind, kind] / union)
+        table.add_row(kind.name.lower(), *cells, f"{overlaps[-1]:.2f}")
+    table.caption = f"mean IoU {np.mean(overlaps):.2f}"
     console.print(table)
 
 

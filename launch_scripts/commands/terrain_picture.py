@@ -35,7 +35,12 @@ _HEIGHTS = LinearSegmentedColormap.from_list(
     "heights", ["#6d9a6b", "#a9bd85", "#e3d9a8", "#c9a77c", "#9a7a62", "#b5aaa3", "#ffffff"]
 )
 _PACES = LinearSegmentedColormap.from_list("paces", ["#fbf7dc", "#f6d27a", "#ee9140", "#cf4a2c", "#7d1626"])
-_CLASS_TINT: dict[TerrainClass, str] = {TerrainClass.ROAD: "#ffe9b0", TerrainClass.BUILT: "#c0625a"}
+_CLASS_TINT: dict[TerrainClass, str] = {
+    TerrainClass.ROAD: "#ffe9b0",
+    TerrainClass.BUILT: "#c0625a",
+    TerrainClass.SHRUB: "#b3a44e",
+    TerrainClass.WETLAND: "#5f9e93",
+}
 """Colours of classes which a photo's own colours do not tell apart."""
 
 

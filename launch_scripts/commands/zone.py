@@ -6,6 +6,7 @@ import json
 import math
 import re
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -49,6 +50,13 @@ def add(
     polygon_m: Annotated[
         str | None, typer.Option("--polygon-m", help="Corners as 'x,y x,y ...' in metres, as poses have them.")
     ] = None,
+    file: Annotated[
+        Path | None, typer.Option(help="A GeoJSON, GeoPackage or Shapefile of areas instead, in any system.")
+    ] = None,
+    layer: Annotated[str | None, typer.Option(help="Which layer, of a file that has several.")] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Coordinate system, where the file names none: EPSG:32632, or local.")
+    ] = None,
     kind: Annotated[str, typer.Option(help="lethal, or pace:X for X seconds per metre.")] = "lethal",
     until: Annotated[
         str | None, typer.Option(help="How long it lasts: 90s, 10m, 2h. Until it is removed, if not given.")
@@ -61,14 +69,29 @@ def add(
     swarm zone add --polygon "10,10 10,30 25,30 25,10" --kind lethal --until 10m --name bridge
 
     swarm zone add --polygon "46.80,9.84 46.81,9.84 46.81,9.86" --kind pace:0.5
+
+    swarm zone add --file quarry.geojson --name quarry
+
+    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several.
     """
+    from swarm.errors import ConfigError
     from swarm.wire.messages.orders import ZoneOrder
 
     fields: dict[str, object] = {"action": "add", "name": name, **_kind(kind), "lasts_s": _seconds(until)}
     places = _places("--polygon", polygon)
     fields["polygon"] = [(0.0, 0.0) for _ in places]
     fields["polygon_m"] = _corners("--polygon-m", polygon_m)
-    _give(checked(ZoneOrder, fields), where, tls, as_json, places)
+    if file is None:
+        if layer is not None or crs is not None:
+            raise ConfigError("zone add: --layer and --crs go with --file")
+        _give(checked(ZoneOrder, fields), where, tls, as_json, places)
+        return
+    if polygon is not None or polygon_m is not None:
+        raise ConfigError("zone add: give either --file or a polygon")
+    if not file.is_file():
+        raise ConfigError(f"--file: {file} does not exist")
+    checked(ZoneOrder, fields | {"polygon": [(0.0, 0.0)] * 3})
+    _give_file(file, layer, crs, fields, where, tls, as_json)
 
 
 @app.command()
@@ -112,6 +135,39 @@ def _give(order: ZoneOrder, where: Where, tls: Tls, as_json: bool, corners: Sequ
         zones, acknowledged = Operator(bus).zone(order)
     _print(zones, frame, acknowledged, as_json)
     if acknowledged.silent:
+        raise typer.Exit(1)
+
+
+def _give_file(
+    file: Path, layer: str | None, crs: str | None, fields: dict[str, object], where: Where, tls: Tls, as_json: bool
+) -> None:
+    """Order a zone for each area of a file."""
+    from launch_scripts.commands.run_frame import frame_of_run
+    from shared_map.terrain.importers.zone_outlines import outlines_of
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.orders import Acknowledged, Operator
+    from swarm.wire.messages.orders import MOST_CORNERS, ZoneOrder
+
+    with open_bus(where.network(tls)) as bus:
+        frame = frame_of_run(bus, where)
+        outlines = outlines_of(file, frame.grid, layer, crs, MOST_CORNERS)
+        name = fields["name"]
+        names = (
+            [f"{name}-{n}" if name else "" for n in range(1, len(outlines) + 1)] if len(outlines) > 1 else [name]
+        )
+        orders = [
+            checked(ZoneOrder, fields | {"name": each, "polygon": outline})
+            for each, outline in zip(names, outlines, strict=True)
+        ]
+        obeyed: dict[str, float] = {}
+        silent: set[str] = set()
+        for order in orders:
+            assert isinstance(order, ZoneOrder)
+            zones, acknowledged = Operator(bus).zone(order)
+            obeyed, silent = obeyed | acknowledged.obeyed, silent | set(acknowledged.silent)
+            if not as_json or order is orders[-1]:
+                _print(zones, frame, Acknowledged(obeyed, sorted(silent)), as_json)
+    if silent:
         raise typer.Exit(1)
 
 

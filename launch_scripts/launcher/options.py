@@ -16,6 +16,7 @@ import msgspec
 from launch_scripts.process_table import certificate_name
 from shared_map.terrain.importers.sources import is_terrain
 from swarm.bus.endpoints import host_port
+from swarm.config.cost_rules import cost_of_preset
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TerrainConfig, TlsConfig
@@ -25,12 +26,14 @@ from swarm.wire.fields import check_id
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 
 
-def find_scenario(name: str) -> Scenario:
+def find_scenario(name: str, preset: str | None = None) -> Scenario:
     """Loads a built-in scenario by name, or one from a file. A file of elevation stands for a scenario on it that
-    says nothing else."""
+    says nothing else, but the preset of its cost."""
     path = Path(name)
     if path.is_file() and is_terrain(path):
-        return Scenario(name=path.stem, terrain=TerrainConfig(source=name))
+        return Scenario(name=path.stem, terrain=TerrainConfig(source=name), cost=cost_of_preset(preset))
+    if preset is not None:
+        raise ConfigError(f"--preset goes with a terrain file: in the scenario {name} set cost.preset")
     if path.suffix == ".toml" or path.is_file():
         return load_scenario(path)
     built_in = SCENARIOS / f"{name}.toml"

@@ -70,7 +70,17 @@ def schema(root: Section = Scenario) -> str:
         for key, value in definition["properties"].items():
             value["description"] = said[key]
     found = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "terrain-swarm scenario", **found}
-    return json.dumps(found, indent=1) + "\n"
+    return json.dumps(_plain(found), indent=1) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """The value with whole numbers as such. `typing` keeps one of two bounds that are equal, 10000 and 1e4, by
+    which module is imported first."""
+    if isinstance(value, dict):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _sections(root: Section) -> list[tuple[str, Section]]:

@@ -103,8 +103,8 @@ def mark_layer(
     codes[kinds == MarkKind.LETHAL] = 1
     paced = kinds == MarkKind.PACE
     codes[paced] = 2 + np.unique(_two_digits(paces[paced]), return_inverse=True)[1]
-    numbered: Any = label
-    numbers: NDArray[np.int32] = np.asarray(numbered(codes, background=0, connectivity=1), np.int32)
+    labelled = label(codes, background=0, connectivity=1)  # type: ignore[no-untyped-call]
+    numbers: NDArray[np.int32] = np.asarray(labelled, np.int32)
     flat, inside = numbers.reshape(-1), np.flatnonzero(numbers)
     many = int(numbers.max(initial=0)) + 1
     cells = np.bincount(flat, minlength=many)

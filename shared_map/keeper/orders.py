@@ -5,14 +5,16 @@ from __future__ import annotations
 import msgspec
 
 from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, plan_agents
 from swarm.config.scenario import Scenario
-from swarm.errors import StoreError
+from swarm.errors import ConfigError, StoreError
 from swarm.liveness import Peer
 from swarm.order_book import OrderBook, judged
+from swarm.places import cell_of
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.orders import GiveOrder, Order, Orders
 from swarm.wire.topics import GIVE_ORDER, ORDERS
@@ -97,7 +99,10 @@ class KeptOrders:
         self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
 
     def _take(self, given: GiveOrder, now_ns: int) -> Order | str:
-        given = self._placed(given)
+        try:
+            given = self._placed(given)
+        except ConfigError as error:
+            return f"{given.subject} {given.name}: {error}"
         vehicles = [id for plan in plan_agents(self._scenario) for id in plan.vehicle_ids]
         if agent_of(given.name) in self._added:
             vehicles.append(given.name)
@@ -118,8 +123,10 @@ class KeptOrders:
         return order
 
     def _placed(self, given: GiveOrder) -> GiveOrder:
-        """With a cell instead of row and column; outside the grid it is no cell."""
+        """With a cell for a place, or for row and column: outside the grid that is none. Raises ConfigError."""
         grid = self._terrain.grid
+        if given.at:
+            return msgspec.structs.replace(given, cell=cell_of(given.at, MapFrame(grid), "at"), at="")
         if given.row is None or given.col is None:
             return given
         inside = grid.inside(given.row, given.col)

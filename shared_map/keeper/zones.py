@@ -26,9 +26,12 @@ from shared_map.replication.marks import (
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import tile_cells
 from shared_map.terrain.layers import polygon_mask
+from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
+from swarm.errors import ConfigError
 from swarm.grid import GridSpec
+from swarm.places import corners_of
 from swarm.wire.fields import column
 from swarm.wire.messages.marks import DIGEST_ROW, SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import MOST_ZONES, Corners, Zone, ZoneOrder
@@ -138,6 +141,11 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
     """Cells whose middle lies in the zone; why there is no such zone."""
     grid = terrain.grid
     corners = order.polygon
+    if order.corners:
+        try:
+            corners = corners_of(order.corners, MapFrame(grid), "corners")
+        except ConfigError as error:
+            return str(error)
     if order.polygon_m:
         corners = [_row_col(x_m, y_m, grid) for x_m, y_m in order.polygon_m]
     if (crossing := _crossing(corners)) is not None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shared_map.arrays import Floats
+from shared_map.arrays import Bools, Floats
 
 BAND_ROWS = 128
 Progress = Callable[[str, float], None]
@@ -44,6 +46,23 @@ def in_bands(
         for done, future in enumerate(as_completed(futures)):
             future.result()
             progress(what, (done + 1) / len(todo))
+
+
+def counted(labels: NDArray[np.signedinteger[Any]], count: int, where: Bools | None = None) -> NDArray[np.int64]:
+    """Cells of each label below `count`, where `where` is true. NumPy's own takes a wide copy of all labels."""
+    cells = np.zeros(count, np.int64)
+    for row0, row1 in bands(labels.shape[0]):
+        band = labels[row0:row1]
+        cells += np.bincount(band.reshape(-1) if where is None else band[where[row0:row1]], minlength=count)
+    return cells
+
+
+def looked_up(flags: Bools, labels: NDArray[np.signedinteger[Any]]) -> Bools:
+    """`flags[labels]`, band by band."""
+    found = np.empty(labels.shape, np.bool_)
+    for row0, row1 in bands(labels.shape[0]):
+        np.take(flags, labels[row0:row1], out=found[row0:row1])
+    return found
 
 
 def padded_rows(elevation_m: Floats, row0: int, row1: int) -> Floats:

@@ -43,6 +43,7 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.plugins.find import source_of
 from swarm.runtime.role import RoleSetup
+from swarm.wire.statements import PACE_MOST
 
 if TYPE_CHECKING:
     from shared_map.terrain.importers.sources import Source
@@ -155,8 +156,9 @@ def _add_cross_slopes(
     ground: Floats, elevation_m: Floats, cost: CostConfig, grid: GridSpec, progress: Progress
 ) -> None:
     def work(row0: int, row1: int) -> None:
-        padded_m = padded_rows(elevation_m, row0, row1)
-        ground[row0:row1] *= along_slope_of_padded(padded_m, grid.resolution_m, cost)
+        padded_m, part = padded_rows(elevation_m, row0, row1), ground[row0:row1]
+        dearer = part * along_slope_of_padded(padded_m, grid.resolution_m, cost)
+        np.minimum(dearer, np.float32(PACE_MOST), out=part, where=np.isfinite(part))
 
     in_bands(grid.rows, work, "slope and cost", progress)
 

@@ -9,14 +9,19 @@ import numpy as np
 from shared_map.arrays import Bools
 from shared_map.terrain.layers import TerrainClass, slope_deg
 from shared_map.terrain.places import MapFrame
+from shared_map.terrain.step_climb import Climb
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import GridSpec
 from swarm.places import bounds_of, extent_of
 
 _MOST_SIDE = 2048
 """Slopes and parts of larger terrains are taken from every second, third, ... cell."""
+_JOINED_SIDE = 1024
+"""One-way steps are followed on terrains of up to the square of so many cells: a second or less."""
 _MUCH_LETHAL, _SCATTERED = 0.5, 0.8
 _STEEP_DEG = 60.0
+_LOWEST_LAND_M = -450.0
+"""The shore of the Dead Sea is at -430 m."""
 
 
 def facts_of(terrain: Terrain) -> dict[str, Any]:
@@ -37,6 +42,7 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
     stride = -(-max(grid.rows, grid.cols) // _MOST_SIDE)
     known = elevation_m[~np.isnan(elevation_m)]
     if known.size:
+        facts["below_sea_share"] = round(float(np.count_nonzero(known < 0) / elevation_m.size), 4)
         facts["lowest_m"], facts["highest_m"] = round(float(known.min()), 1), round(float(known.max()), 1)
         slopes = slope_deg(np.ascontiguousarray(elevation_m[::stride, ::stride]), grid.resolution_m * stride)
         for name, share in (("slope_median_deg", 50), ("slope_95_deg", 95), ("slope_max_deg", 100)):
@@ -51,7 +57,52 @@ def facts_of(terrain: Terrain) -> dict[str, Any]:
     for name, quantile in (("pace_least_s_per_m", 0.0), ("pace_median_s_per_m", 0.5), ("pace_most_s_per_m", 1.0)):
         facts[name] = float(f"{np.quantile(finite, quantile):.4g}")
     facts["largest_part_share"] = round(_largest_part(~lethal[::stride, ::stride]), 4)
+    if terrain.climb is not None:
+        facts |= _facts_of_steps(terrain.climb, ~lethal)
     return facts
+
+
+def _facts_of_steps(climb: Climb, passable: Bools) -> dict[str, float]:
+    """Of all steps between passable neighbours the share that is too steep, and the largest part of the passable
+    cells in which there is a way from each cell to each other. Of a large terrain the share of its middle alone."""
+    if np.isfinite(climb.factors).all():
+        return {}
+    cells = np.arange(passable.size, dtype=np.int32).reshape(passable.shape)
+    allowed: list[tuple[Any, Any]] = []
+    counted = steep = 0
+    keep = passable.size <= _JOINED_SIDE**2
+    if not keep:
+        row0, col0 = (max(side - _JOINED_SIDE, 0) // 2 for side in passable.shape)
+        middle = np.s_[row0 : row0 + _JOINED_SIDE, col0 : col0 + _JOINED_SIDE]
+        cells, passable = cells[middle], passable[middle]
+    # East, south, and both diagonals to the south: each pair of neighbours once, driven both ways.
+    for here, there in (
+        (np.s_[:, :-1], np.s_[:, 1:]),
+        (np.s_[:-1], np.s_[1:]),
+        (np.s_[:-1, :-1], np.s_[1:, 1:]),
+        (np.s_[:-1, 1:], np.s_[1:, :-1]),
+    ):
+        both = passable[here] & passable[there]
+        one, other = cells[here][both], cells[there][both]
+        for tails, heads in ((one, other), (other, one)):
+            free = np.isfinite(climb.along(tails, heads))
+            counted, steep = counted + free.size, steep + int(free.size - np.count_nonzero(free))
+            if keep:
+                allowed.append((tails[free], heads[free]))
+    facts = {"too_steep_steps_share": round(steep / max(counted, 1), 4)}
+    if keep:
+        facts["both_ways_share"] = round(_largest_strong_part(allowed, passable), 4)
+    return facts
+
+
+def _largest_strong_part(steps: list[tuple[Any, Any]], passable: Bools) -> float:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    tails, heads = (np.concatenate(each) for each in zip(*steps, strict=True))
+    graph = coo_array((np.ones(tails.size, np.bool_), (tails, heads)), shape=(passable.size,) * 2)
+    _, labels = connected_components(graph.tocsr(), connection="strong")
+    return float(np.bincount(labels[passable.reshape(-1)]).max() / passable.sum())
 
 
 def bounds_deg(grid: GridSpec) -> dict[str, float]:
@@ -82,10 +133,21 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
             f"the passable ground is in parts: the largest has {facts['largest_part_share']:.0%} of it, and"
             " vehicles of one part reach no other"
         )
+    elif facts.get("both_ways_share", 1.0) < _SCATTERED:
+        doubts.append(
+            f"steps that are too steep part the ground: {facts['both_ways_share']:.0%} of it can be entered and"
+            " left again, and vehicles elsewhere find no way; look at cost.max_climb_deg and cost.max_descent_deg"
+        )
     if facts.get("slope_median_deg", 0.0) > _STEEP_DEG:
         doubts.append(
             f"half of the ground is steeper than {facts['slope_median_deg']:g} degrees; are heights in metres"
             " (terrain.height_scale), and cells (terrain.crs)?"
+        )
+    deep = facts.get("lowest_m", 0.0) < _LOWEST_LAND_M and not any(body in facts["crs"] for body in ("+a=", "+R="))
+    if deep and facts["class_shares"].get("water", 0.0) < facts.get("below_sea_share", 0.0):
+        doubts.append(
+            f"heights go down to {facts['lowest_m']:g} m, where no dry land is: a sea floor is ground here, unless"
+            " terrain.water_below_m = 0"
         )
     if facts.get("lowest_m") == facts.get("highest_m") and facts["voids"] < facts["rows"] * facts["cols"]:
         doubts.append("all heights are the same: slopes cost nothing here")

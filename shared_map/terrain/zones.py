@@ -270,7 +270,8 @@ class _Painter:
         )
         after = self._pace[_part(window)].copy()
         self._lay(window, after, values, open_, from_file=True)
-        self._set(painted, window, after)
+        painted.counts["opened"] += int((np.isinf(self._pace[_part(window)]) & np.isfinite(after)).sum())
+        self._pace[_part(window)] = after
 
     def forbidden(self, painted: _Painted) -> None:
         """What is forbidden is lethal, whatever else was painted there; so are roads of a lethal class."""

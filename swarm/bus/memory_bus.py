@@ -179,11 +179,13 @@ class MemoryBus:
             return
         self.sent(payload)
         named = topic.one(fields)
-        sample = _Sample(
-            topic, named, payload, code_of(self.authenticator, topic, topic.below(named), payload), in_json
-        )
+        key = topic.below(named)
+        code = code_of(self.authenticator, topic, key, payload)
+        sample = _Sample(topic, named, key, payload, code, in_json)
         network = self.network
         for subscription in network.subscribers(self.namespace, topic.name, named):
+            if subscription.bus is self and not topic.echoed:
+                continue
             for when_ns in network.arrivals_ns(self, subscription.bus, topic.name):
                 network.scheduler.at(when_ns, _Arrival(self, subscription, sample))
 
@@ -208,7 +210,7 @@ class MemoryBus:
             return heard[0] if heard and isinstance(heard[0], Heard) else None
 
         kept = self._kept.pop(topic.name, ())
-        return newest_of(topic, ((topic.below(sample.fields), sample) for sample in kept), hear)
+        return newest_of(topic, ((sample.key, sample) for sample in kept), hear)
 
     def keep(self, sample: _Sample) -> None:
         """Keep a sample for `collected`."""
@@ -355,13 +357,14 @@ class _Watcher:
 class _Sample:
     """One put, parsed and checked once: when the first subscription is reached."""
 
-    __slots__ = ("_checked_by", "_heard", "_parsed", "code", "fields", "in_json", "payload", "topic")
+    __slots__ = ("_checked_by", "_heard", "_parsed", "code", "fields", "in_json", "key", "payload", "topic")
 
     def __init__(
-        self, topic: Topic, fields: dict[str, str], payload: bytes, code: bytes | None, in_json: bool
+        self, topic: Topic, fields: dict[str, str], key: str, payload: bytes, code: bytes | None, in_json: bool
     ) -> None:
         self.topic = topic
         self.fields = fields
+        self.key = key
         self.payload = payload
         self.code = code
         self.in_json = in_json
@@ -373,7 +376,7 @@ class _Sample:
         """The event, as a bus takes it; None if the payload does not parse, or the bus does not trust it."""
         if self._checked_by is not bus.authenticator:
             try:
-                check_code(bus.authenticator, self.code, self.topic, self.topic.below(self.fields), self.payload)
+                check_code(bus.authenticator, self.code, self.topic, self.key, self.payload)
             except ProtocolError:
                 return None
             self._checked_by = bus.authenticator

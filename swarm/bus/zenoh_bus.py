@@ -157,6 +157,7 @@ class ZenohBus:
             attachment=code_of(self._authenticator, topic, key, payload),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=_PRIORITIES[topic.priority],
+            allowed_destination=zenoh.Locality.ANY if topic.echoed else zenoh.Locality.REMOTE,
         )
 
     def subscribe(

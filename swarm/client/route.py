@@ -64,6 +64,11 @@ class Route:
         """(x_m, y_m) of the middles of its cells."""
         return tuple(map(self.frame.centre_m, self.cells))
 
+    @cached_property
+    def points_wgs84(self) -> tuple[Point, ...]:
+        """(lat_deg, lon_deg) of the middles of its cells. Raises as `Frame.to_wgs84`."""
+        return tuple(self.frame.to_wgs84(*point) for point in self.points_m)
+
     @property
     def length_m(self) -> float:
         """Of its points."""

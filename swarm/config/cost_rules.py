@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, read_text, shown
 from swarm.config.scenario import CostConfig, Preset, Slope, SlopeFactor
 from swarm.errors import ConfigError
@@ -105,8 +106,13 @@ def with_preset(raw: dict[str, Any]) -> dict[str, Any]:
     return {**raw, "cost": settings}
 
 
-def cost_of_preset(name: Preset) -> CostConfig:
-    """The cost of a scenario which says nothing but this preset."""
+def cost_of_preset(name: str | None) -> CostConfig:
+    """The cost of a scenario which says nothing but this preset, if that. Raises ConfigError on an unknown one."""
+    if name is None:
+        return CostConfig()
+    if name not in PRESETS:
+        names: list[str] = list(PRESETS)
+        raise ConfigError(f"no preset {shown(name)}{nearest(name, names)}; there are {', '.join(names)}")
     return msgspec.convert(with_preset({"cost": {"preset": name}})["cost"], CostConfig)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import takewhile
+from itertools import chain, takewhile
 
 from swarm.right_of_way.lives import BEAT_NS, FURTHEST_EPOCH
 from swarm.right_of_way.plots import Plots
@@ -143,7 +143,7 @@ class Holdings:
 
     def occupied(self) -> set[int]:
         """The cells that vehicles hold, of all to which one of ours at rest could go, as far as wardens tell."""
-        occupied = {cell for path in self._paths.values() for cell in path}
+        occupied = set(chain.from_iterable(self._paths.values()))
         for plot in self.plots:
             occupied |= self._views[plot].others
         return occupied

@@ -217,6 +217,11 @@ class Bounded(msgspec.Struct, frozen=True):
         """Raise ValueError where fields contradict each other. What one field says alone is in its type."""
 
 
+class Part(msgspec.Struct, frozen=True):
+    """Base of structs of which a message lists hundreds: the `Bounded` that lists them checks their ids all at
+    once, because a call for each takes as long as all else about it."""
+
+
 Rule = Callable[[Any], None]
 _RULES: dict[type[Bounded], tuple[Rule, ...]] = {}
 """Of each struct type that was made so far."""
@@ -233,6 +238,9 @@ def _rules_of(struct: type[Bounded]) -> tuple[Rule, ...]:
             ids.append(name)
         if any(isinstance(note, Characters) for note in parts):
             rules.append(_id_or_none(name) if NoneType in typing.get_args(bare) else _all_ids(name))
+        for part in typing.get_args(bare):
+            if isinstance(part, type) and issubclass(part, Part):
+                rules.extend(_ids_of_parts(name, id) for id in _ids_in(part))
         rules.extend(_column_rule(name, note) for note in notes if isinstance(note, Column) and note.checked)
         rules.extend(_columns_rule(name, note) for note in parts if isinstance(note, Column))
     if ids:
@@ -242,6 +250,13 @@ def _rules_of(struct: type[Bounded]) -> tuple[Rule, ...]:
     # The empty tuple would be looked for again and again.
     _RULES[struct] = tuple(rules) or (Bounded.relate,)
     return _RULES[struct]
+
+
+def _ids_in(part: type[Part]) -> list[str]:
+    """The fields of a part that are ids: it may state no other rule."""
+    notes = {name: taken_apart(hint)[1] for name, hint in typing.get_type_hints(part, include_extras=True).items()}
+    assert not any(isinstance(note, Column) for each in notes.values() for note in each), part
+    return [name for name, each in notes.items() if any(isinstance(note, Characters) for note in each)]
 
 
 def taken_apart(hint: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -285,6 +300,19 @@ def _all_ids(name: str) -> Rule:
         if not _KNOWN_IDS.issuperset(values):
             for value in values:
                 check_id(name, value)
+
+    return rule
+
+
+def _ids_of_parts(name: str, id: str) -> Rule:
+    """An id of each part in a list."""
+    get, get_id = attrgetter(name), attrgetter(id)
+
+    def rule(struct: Any) -> None:
+        parts = get(struct)
+        if not _KNOWN_IDS.issuperset(map(get_id, parts)):
+            for index, part in enumerate(parts):
+                check_id(f"{name}[{index}].{id}", get_id(part))
 
     return rule
 

@@ -54,6 +54,7 @@ class Topic:
     published  whether values are put, not only answered
     trusted    only with a code of the run's secret does a message on it count (`swarm.wire.authentication`)
     newest     each value carries the whole state of its key, so a reader may skip to the newest
+    echoed     whether a process that puts and subscribes hears what it has put itself
     buffer     samples that wait for a slow reader; the oldest are dropped first
     fields     names of the chunks in `key`, in order
     """
@@ -69,6 +70,7 @@ class Topic:
     published: bool = True
     trusted: bool = False
     newest: bool = True
+    echoed: bool = True
     priority: Priority = Priority.DATA
     buffer: int = 1024
     fields: tuple[str, ...] = field(init=False, repr=False, compare=False)
@@ -205,7 +207,7 @@ TABLE = Topic(
     "which cells the warden of a plot has granted, for its members; a member that is asked promises an epoch and "
     "answers with what it has stored", "on change, at least 5 Hz where vehicles are",
     access(put="agent:agent", serve="agent:agent", ask="agent", hear="agent"),
-    request=Claim, trusted=True, priority=Priority.INTERACTIVE,
+    request=Claim, trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 GRANTED = Topic(
     "granted", "granted/{plot}/{host}/{agent}", Granted,
@@ -215,7 +217,7 @@ GRANTED = Topic(
 STORED = Topic(
     "stored", "stored/{plot}/{agent}", Stored, "which table a member has on file",
     "per table by one member, 5 Hz by the other",
-    access(put="agent:agent", hear="agent"), trusted=True, priority=Priority.INTERACTIVE,
+    access(put="agent:agent", hear="agent"), trusted=True, echoed=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 KNOWN = Topic(
     "known", "known/{agent}", Known, "what an agent has on file about another, or a guest, for a new life of that",

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from support.traffic_world import Faults, Process, TrafficWorld
 
 from swarm.right_of_way.holdings import Holdings
+from swarm.wire.messages.traffic import Grant
 from vehicle_agent.traffic.member import Member
 from vehicle_agent.traffic.right_of_way import RightOfWay
 from vehicle_agent.traffic.warden import Warden
@@ -183,7 +184,7 @@ def frees_what_nobody_reported(patch: pytest.MonkeyPatch) -> None:
     tick = Warden.tick
 
     def greedy(self: Warden, now_ns: int):  # type: ignore[no-untyped-def]
-        self._grants = {vehicle: (cells[-1:], stamp) for vehicle, (cells, stamp) in self._grants.items()}
+        self._grants = {vehicle: Grant(each.cells[-1:], each.stamp) for vehicle, each in self._grants.items()}
         return tick(self, now_ns)
 
     patch.setattr(Warden, "tick", greedy)

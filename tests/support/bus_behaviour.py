@@ -14,8 +14,9 @@ from swarm.liveness import Peer
 from swarm.wire.codec import encode
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.marks import MarksRequest
+from swarm.wire.messages.traffic import Stored
 from swarm.wire.readable import encode_readable
-from swarm.wire.topics import MARKS, NOTE, RUN, TRUE_POSE
+from swarm.wire.topics import MARKS, NOTE, RUN, STORED, TRUE_POSE
 
 # --- publish and subscribe ----------------------------------------------------------------------------------
 
@@ -40,6 +41,20 @@ def test_a_process_hears_itself(world: World):
     a.publish(TRUE_POSE, pose(), target="t0")
     world.until(lambda: box)
     assert [event.message for event in box] == [pose()]
+
+
+def test_a_process_does_not_hear_itself_where_the_topic_says_so(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    own, others = Box(), Box()
+    a.subscribe(STORED, own, plot=1)
+    b.subscribe(STORED, others, plot=1)
+    world.settle()
+    stored = Stored(plot=1, agent="a0", epoch=3, seq=4)
+    a.publish(STORED, stored, plot=1, agent="a0")
+    b.publish(STORED, stored, plot=1, agent="a0")
+    world.until(lambda: own and others)
+    world.settle()
+    assert [[event.message for event in box] for box in (own, others)] == [[stored], [stored]]
 
 
 def test_samples_that_wait_are_heard_together_in_order_with_their_keys_and_without_garbage(world: World):

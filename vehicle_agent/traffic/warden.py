@@ -33,6 +33,7 @@ MOST_CELLS_OF_GUEST = 1024
 MOST_CELLS_OF_GUESTS = 1 << 14
 """Cells of one plot that all guests together hold: a quarter of it."""
 _MOST_BESIDE = 1 << 12
+_NO_CELLS: Sequence[int] = []
 _MOST_CELLS = 64
 """Of one vehicle: what a `Grant` has room for."""
 
@@ -88,15 +89,14 @@ class Warden:
         self._me = me
         self._fleets = fleets
         self._lives = dict(table.hosts)  # agent -> (life, seq) of the newest standing that counts
-        self._grants: dict[str, tuple[list[int], Stamp]] = {
-            vehicle: (list(grant.cells), grant.stamp) for vehicle, grant in table.grants.items()
-        }
+        self._grants: dict[str, Grant] = dict(table.grants)
+        """Vehicle -> what it is granted. Each is made once and stands in every table until it changes."""
         self._shut = {(each.agent, each.life): list(each.cells) for each in table.shut}
         self._guests: dict[str, dict[str, int]] = {}
         """Guest -> its vehicles that are granted cells here, and how many cells."""
-        for vehicle, (cells, _) in self._grants.items():
+        for vehicle, grant in self._grants.items():
             if agent_of(vehicle) not in fleets:
-                self._guests.setdefault(agent_of(vehicle), {})[vehicle] = len(cells)
+                self._guests.setdefault(agent_of(vehicle), {})[vehicle] = len(grant.cells)
         self._hosts: dict[str, _Host] = {}
         self._beside: dict[int, tuple[int, ...]] = {}
         """Cells beside which vehicles ended lately -> the cells beside them."""
@@ -138,7 +138,9 @@ class Warden:
             self._changed = True  # it leaves the plot as soon as a table counts this
         holds = {stand.vehicle: stand.holds for stand in standing.vehicles}
         for vehicle in self._granted_to(host):
-            self._free(vehicle, holds.get(vehicle, []), standing.knows)
+            held = holds.get(vehicle, _NO_CELLS)
+            if held != self._grants[vehicle].cells:
+                self._free(vehicle, held, standing.knows)
         known.standing, known.heard_ns = standing, now_ns
         # Only now: a life that is itself replaced and has not stopped must not open what a vehicle may stand on.
         self._enter_again(standing, self._open(standing))
@@ -159,15 +161,15 @@ class Warden:
         """A guest that stands on a cell which was shut for an earlier life of it gets it before all others."""
         if not opened:
             return
-        opened.difference_update(cell for cells, _ in self._grants.values() for cell in cells)
+        opened.difference_update(cell for grant in self._grants.values() for cell in grant.cells)
         for (host, _), cells in self._shut.items():
             if host != standing.agent:
                 opened.difference_update(cells)
         for stand in standing.vehicles:
-            before = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+            before = self._cells_of(stand.vehicle)
             ours = self._is_of(stand.vehicle, standing.agent)
             if ours and _is_entering(stand) and stand.cell in opened and len(before) < _MOST_CELLS:
-                self._grants[stand.vehicle] = ([*before, stand.cell], self._next_stamp)
+                self._grants[stand.vehicle] = Grant([*before, stand.cell], self._next_stamp)
                 self._count_guest(stand.vehicle, len(before) + 1)
                 self._granted = True
 
@@ -181,6 +183,11 @@ class Warden:
     def _is_of(self, vehicle: str, host: str) -> bool:
         """Whether a vehicle is one that the host may speak for."""
         return vehicle in self._fleets[host] if host in self._fleets else agent_of(vehicle) == host
+
+    def _cells_of(self, vehicle: str) -> Sequence[int]:
+        """The cells that a vehicle is granted."""
+        grant = self._grants.get(vehicle)
+        return _NO_CELLS if grant is None else grant.cells
 
     def _granted_to(self, host: str) -> list[str]:
         """The vehicles of a host that are granted cells."""
@@ -205,17 +212,15 @@ class Warden:
         if (host, before) in self._shut:
             del self._shut[host, before]
         elif before and mine:
-            self._shut[host, before] = [cell for vehicle in mine for cell in self._grants[vehicle][0]]
+            self._shut[host, before] = [cell for vehicle in mine for cell in self._grants[vehicle].cells]
         for vehicle in mine:
-            self._grants[vehicle] = (self._grants[vehicle][0], self._next_stamp)
+            self._grants[vehicle] = Grant(self._grants[vehicle].cells, self._next_stamp)
         self._hosts[host].standing = self._hosts[host].told = None
         self._granted = True
 
     def _free(self, vehicle: str, holds: Sequence[int], knows: Stamp) -> None:
         """Drop what a vehicle has left behind; if its host knew of the last grant, all that it does not hold."""
-        cells, stamp = self._grants[vehicle]
-        if cells == holds:
-            return
+        cells, stamp = self._grants[vehicle].cells, self._grants[vehicle].stamp
         if knows >= stamp:
             kept = [cell for cell in cells if cell in holds]
         elif holds and holds[0] in cells:
@@ -225,7 +230,7 @@ class Warden:
         if len(kept) < len(cells):
             self._changed = True
             if kept:
-                self._grants[vehicle] = (kept, stamp)
+                self._grants[vehicle] = Grant(kept, stamp)
             else:
                 del self._grants[vehicle]
             self._count_guest(vehicle, len(kept))
@@ -262,7 +267,7 @@ class Warden:
             epoch=self.epoch,
             seq=self.seq,
             hosts=dict(self._lives),
-            grants={vehicle: Grant(list(cells), stamp) for vehicle, (cells, stamp) in self._grants.items()},
+            grants=dict(self._grants),
             shut=[Shut(host, life, list(cells)) for (host, life), cells in self._shut.items()],
             pushed=dict(self._pushed),
         )
@@ -272,8 +277,8 @@ class Warden:
         if table is self._said_of and 0 <= now_ns - self._said_ns < _TOLD_AGAIN_NS:
             return
         self._said_of, self._said_ns = table, now_ns
-        holders = {cell: vehicle for vehicle, grant in table.grants.items() for cell in grant.cells}
-        holders.update((cell, "") for shut in table.shut for cell in shut.cells)
+        shut = {cell for shut in table.shut for cell in shut.cells}
+        held = shut.union(*(grant.cells for grant in table.grants.values()))
         by_host: dict[str, dict[str, list[int]]] = {name: {} for name in self._hosts}
         for vehicle, grant in table.grants.items():
             by_host.setdefault(agent_of(vehicle), {})[vehicle] = grant.cells
@@ -285,7 +290,7 @@ class Warden:
             # Also around those under way: what they want once they come to rest depends on who is there.
             stands = () if host.standing is None else host.standing.vehicles
             near = set(chain.from_iterable(map(self._around, {stand.end for stand in stands})))
-            occupied = sorted(cell for cell in near & holders.keys() if holders[cell] not in grants)
+            occupied = sorted((near & held).difference(*grants.values()) | (near & shut))
             pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
             says = (life, grants, pushed, occupied, 0 if stands else heard)
             if says == host.told and 0 <= now_ns - host.told_ns < _TOLD_AGAIN_NS:
@@ -317,12 +322,12 @@ class Warden:
 
     def _plan(self, now_ns: int) -> None:
         stands = self._stands(now_ns)
-        held = {cell for cells, _ in self._grants.values() for cell in cells}
-        held.update(cell for cells in self._shut.values() for cell in cells)
+        held = {cell for cells in self._shut.values() for cell in cells}
+        held.update(chain.from_iterable([grant.cells for grant in self._grants.values()]))
         closed = set(held)
         movers: dict[str, Mover] = {}
         for stand in stands:
-            cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+            cells = self._cells_of(stand.vehicle)
             if not cells and _is_entering(stand):
                 continue  # nobody makes way for it
             if stand.cell != stand.end or (cells and cells != [stand.cell]):
@@ -353,18 +358,20 @@ class Warden:
 
     def _stands(self, now_ns: int) -> list[Stand]:
         """The vehicles of all who have spoken lately, whoever has been on its way for longest first."""
-        stands = [
-            stand
-            for name, host in self._hosts.items()
-            if host.standing is not None and now_ns - host.heard_ns <= SILENT_NS
-            for stand in host.standing.vehicles
-            if self._is_of(stand.vehicle, name)
-        ]
+        stands: list[Stand] = []
+        for name, host in self._hosts.items():
+            if host.standing is None or now_ns - host.heard_ns > SILENT_NS:
+                continue
+            fleet = self._fleets.get(name)
+            if fleet is not None:
+                stands += [stand for stand in host.standing.vehicles if stand.vehicle in fleet]
+            else:
+                stands += [stand for stand in host.standing.vehicles if agent_of(stand.vehicle) == name]
         return sorted(stands, key=_turn)
 
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
         """The cells ahead of one that is under way, from where all that it has been granted ends."""
-        cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+        cells = self._cells_of(stand.vehicle)
         if not cells or cells[-1] == stand.end or stand.end not in cells:
             return stand.ahead if not cells or stand.end in cells else []
         last = cells[-1]
@@ -376,11 +383,11 @@ class Warden:
             mine = taken.setdefault(cell, stand.vehicle) == stand.vehicle
             if not mine or cell in held or self._plots.of(cell) != self._plot:
                 return
-            cells = self._grants[stand.vehicle][0] if stand.vehicle in self._grants else []
+            cells = self._cells_of(stand.vehicle)
             if len(cells) >= _MOST_CELLS or not self._guest_may_hold_more(stand.vehicle):
                 return
             held.add(cell)
-            self._grants[stand.vehicle] = ([*cells, cell], self._next_stamp)
+            self._grants[stand.vehicle] = Grant([*cells, cell], self._next_stamp)
             self._count_guest(stand.vehicle, len(cells) + 1)
             self._granted = True
 

@@ -25,6 +25,7 @@ _TURN_NS = 4 * NS_PER_S
 Each vehicle's turns begin at another time, so that no tick has all wishes to make."""
 _WAITING_TURN_NS = NS_PER_S
 """The same for one that waits on its way: ties between cells fall another way more often."""
+_MS = NS_PER_S // 1000
 _STAYS = Wish()
 
 
@@ -97,27 +98,31 @@ class Wishes:
         changed = held ^ self._held
         self._held = held
         self._forget_near(vehicles)
+        ways_out, known, beside = steering.ways_out, self._made_of, self._beside
         for vehicle in vehicles:
-            id, route, target = vehicle.id, vehicle.route, vehicle.target
-            path, pushed_ms = holdings.path(id), holdings.pushed(id)
-            idle = (vehicle.in_reach or target is None) and path[0] not in steering.ways_out
-            turn_ns = _TURN_NS if idle or len(path) > 1 else _WAITING_TURN_NS
-            turn, began_ns = self._turn(id, turn_ns, now_ns)
-            age_ms = 0
-            if idle:
-                self._since_ns.pop(id, None)
-            else:
-                age_ms = max(began_ns - self._since_ns.setdefault(id, now_ns), 0) // (NS_PER_S // 1000)
-            place = self._target_cell(target) if vehicle.in_reach else None
-            ends = path[0], path[-1], len(path)
-            made_of = ends, route.version, target, vehicle.in_reach, place, pushed_ms, turn, age_ms
-            if self._made_of.get(id) == made_of and changed.isdisjoint(self._beside.get(id, ())):
+            id, target, near = vehicle.id, vehicle.target, vehicle.in_reach
+            path = holdings.path(id)
+            still = len(path) == 1
+            idle = (near or target is None) and path[0] not in ways_out
+            turn_ns = _WAITING_TURN_NS if still and not idle else _TURN_NS
+            phase_ns = self._phases_ns.get(id)
+            if phase_ns is None:
+                phase_ns = self._phases_ns[id] = crc32(id.encode()) % 4000 * (_TURN_NS // 4000)
+            turn = (now_ns + phase_ns) // turn_ns
+            since_ns = None
+            if not idle:
+                since_ns = self._since_ns.setdefault(id, now_ns)
+            elif id in self._since_ns:
+                del self._since_ns[id]
+            place = self._target_cell(target) if near else None
+            pushed_ms = holdings.pushed(id)
+            made_of = path, vehicle.route.version, target, near, place, pushed_ms, turn, since_ns
+            if known.get(id) == made_of and (not still or changed.isdisjoint(beside[id])):
                 continue
-            self._made_of[id] = made_of
-            if len(path) > 1:
-                self._beside.pop(id, None)
-            else:
-                self._beside[id] = self._around(path[0])
+            known[id] = made_of
+            if still:
+                beside[id] = self._around(path[0])
+            age_ms = 0 if since_ns is None else max(turn * turn_ns - phase_ns - since_ns, 0) // _MS
             lot = crc32(f"{self._seed}/{id}/{turn}".encode())
             wish = steering.wish(vehicle, path, pushed_ms, age_ms, held, self._in_reach, lot)
             if wish != self.of.get(id):
@@ -133,14 +138,6 @@ class Wishes:
         places = np.stack(np.divmod(cells, self._cols), axis=1)
         for index in np.flatnonzero(meet(np.hstack((places, places)), changed, self._near_cells)).tolist():
             self._made_of.pop(vehicles[index].id, None)
-
-    def _turn(self, vehicle: str, turn_ns: int, now_ns: int) -> tuple[int, int]:
-        """The number of a vehicle's turn, and when that began."""
-        phase_ns = self._phases_ns.get(vehicle)
-        if phase_ns is None:
-            phase_ns = self._phases_ns[vehicle] = crc32(vehicle.encode()) % 4000 * (_TURN_NS // 4000)
-        turn = (now_ns + phase_ns) // turn_ns
-        return turn, turn * turn_ns - phase_ns
 
     def _around(self, cell: int) -> frozenset[int]:
         """The cells beside a cell; at a border of the grid also some that are far away, which does no harm."""

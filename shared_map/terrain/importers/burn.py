@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,41 +10,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
-from shared_map.terrain.importers.on_grid import cells_spanned, widened
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 
 _MOST_BURNT_CELLS = 1 << 34
 _HEAVY = 50_000_000
 """Corners times rows of a polygon: GDAL looks at every corner in every row."""
-_LINE_TYPES = (0, 1, 2)
+_CHUNK = 4096
+"""Shapes that are handed to GDAL at once, as Python's lists of numbers, which are large."""
+_PIECE = 50
+"""Corners of a line that is widened at once: one of many that crosses itself often would take for ever."""
+_POLYGON = 3
+_NUDGE = (1.3e-4, 0.7e-4)
+"""In cells. A line through the very corner of cells passes two of them that have no side in common, and no vehicle
+drives from one to the other between closed cells. Only coordinates that somebody rounded to cells do that."""
 
 
 @dataclass
 class Drawing:
-    """Shapes with a value each. Lines and points have a width; lines are never thinner than the cells they pass.
+    """Simple shapes, each with a value and a width.
 
-    by_middle  polygons that cover the cells whose middle they contain
-    touched    shapes that cover every cell which they touch
+    everywhere  whether an area covers all cells that it touches, or those whose middle it holds. A line covers all
+                that it passes in either case, so that it has no gaps, and as an area those within half its width
+    widths      in cells; of polygons without meaning
     """
 
-    by_middle: list[tuple[Any, float]] = field(default_factory=list)
-    touched: list[tuple[Any, float]] = field(default_factory=list)
+    everywhere: bool
+    shapes: list[Any] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    widths: list[float] = field(default_factory=list)
 
-    def add(self, shape: Any, value: float, width_cells: float, everywhere: bool) -> None:
-        """One shape; `everywhere`: areas cover all cells that they touch, not those whose middle they have."""
-        is_line = shape.geom_type != "Polygon"
-        if is_line:
-            self.touched.append((shape, value))
-            if width_cells <= 0:
-                return
-            areas = widened(shape, width_cells / 2)
-        else:
-            areas = [shape]
-        (self.touched if everywhere else self.by_middle).extend((area, value) for area in areas)
-
-    def __bool__(self) -> bool:
-        return bool(self.by_middle or self.touched)
+    def add(self, shape: Any, value: float, width_cells: float) -> None:
+        self.shapes.append(shape)
+        self.values.append(value)
+        self.widths.append(width_cells)
 
 
 def burn(drawing: Drawing, grid: GridSpec, what: str, *, least_wins: bool = False) -> tuple[Window, Floats]:
@@ -53,16 +51,33 @@ def burn(drawing: Drawing, grid: GridSpec, what: str, *, least_wins: bool = Fals
 
     least_wins  where shapes overlap the least value counts, else the largest
 
-    Raises TerrainError, which `what` begins, if shapes lie upon each other a thousandfold.
+    Raises TerrainError, which `what` begins, if shapes lie upon each other too often.
     """
-    window = _window(drawing, grid, what)
-    values = np.full((max(window.row1 - window.row0, 0), max(window.col1 - window.col0, 0)), np.nan, np.float32)
+    import shapely
+
+    shapes = np.array(drawing.shapes, object)
+    if not len(shapes):
+        return Window(0, 0, 0, 0), np.zeros((0, 0), np.float32)
+    values, halves = np.array(drawing.values), np.array(drawing.widths) / 2
+    areas = shapely.get_type_id(shapes) == _POLYGON
+    halves[areas] = 0.0
+    window = _window(shapes, halves, grid, what)
+    size = (max(window.row1 - window.row0, 0), max(window.col1 - window.col0, 0))
+    passed, held = np.full(size, np.nan, np.float32), np.full(size, np.nan, np.float32)
     if window.empty:
-        return window, values
-    for pairs, everywhere in ((drawing.by_middle, False), (drawing.touched, True)):
-        found = _burnt(pairs, window, least_wins, everywhere)
-        (np.fmin if least_wins else np.fmax)(values, found, out=values)
-    return window, values
+        return window, passed
+    order = np.argsort(-values if least_wins else values, kind="stable")  # the last one burnt stays
+    for first in range(0, len(order), _CHUNK):
+        some = order[first : first + _CHUNK]
+        lines = some[~areas[some]]
+        nudged = shapely.transform(shapes[lines], lambda points: points + _NUDGE)
+        _rasterize(nudged, values[lines], passed, window, everywhere=True)
+        # The middle of a cell that a line does not pass is half a cell away from it, at least.
+        wide = some[areas[some] | (halves[some] > (0.0 if drawing.everywhere else 0.5))]
+        widened, of = _widened(shapes[wide], halves[wide])
+        _rasterize(widened, values[wide][of], held, window, everywhere=drawing.everywhere)
+    (np.fmin if least_wins else np.fmax)(passed, held, out=passed)
+    return window, passed
 
 
 def burn_mask(drawing: Drawing, grid: GridSpec, what: str) -> tuple[Window, Bools]:
@@ -71,61 +86,75 @@ def burn_mask(drawing: Drawing, grid: GridSpec, what: str) -> tuple[Window, Bool
     return window, ~np.isnan(values)
 
 
-def _window(drawing: Drawing, grid: GridSpec, what: str) -> Window:
+def _window(shapes: NDArray[Any], halves: NDArray[np.float64], grid: GridSpec, what: str) -> Window:
     import shapely
 
-    shapes = np.array([shape for shape, _ in (*drawing.by_middle, *drawing.touched)], object)
-    if not len(shapes):
-        return Window(0, 0, 0, 0)
-    if cells_spanned(shapes) > _MOST_BURNT_CELLS:
-        raise TerrainError(
-            f"{what} lies upon itself too often ({len(shapes)} shapes); dissolve it, or split the file"
-        )
-    west, north, east, south = shapely.total_bounds(shapes)
+    box = shapely.bounds(shapes)
+    west, north, east, south = box[:, 0] - halves, box[:, 1] - halves, box[:, 2] + halves, box[:, 3] + halves
+    if ((east - west + 1) * (south - north + 1)).sum() > _MOST_BURNT_CELLS:
+        raise TerrainError(f"{what} lies upon itself too often ({len(shapes)} shapes); dissolve it")
     return Window(
-        int(np.clip(np.floor(north) - 1, 0, grid.rows)),
-        int(np.clip(np.floor(west) - 1, 0, grid.cols)),
-        int(np.clip(np.ceil(south) + 1, 0, grid.rows)),
-        int(np.clip(np.ceil(east) + 1, 0, grid.cols)),
+        int(np.clip(np.floor(north.min()) - 1, 0, grid.rows)),
+        int(np.clip(np.floor(west.min()) - 1, 0, grid.cols)),
+        int(np.clip(np.ceil(south.max()) + 1, 0, grid.rows)),
+        int(np.clip(np.ceil(east.max()) + 1, 0, grid.cols)),
     )
 
 
-def _burnt(pairs: list[tuple[Any, float]], window: Window, least_wins: bool, everywhere: bool) -> Floats:
+def _widened(shapes: NDArray[Any], halves: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[np.intp]]:
+    """Polygons as they are, lines and points as areas, long ones in pieces; and of which shape each is a part."""
+    import shapely
+
+    of = np.arange(len(shapes))
+    long = np.flatnonzero((halves > 0) & (shapely.get_num_coordinates(shapes) > _PIECE)) if len(shapes) else of
+    if len(long):
+        pieces, owners = [], []
+        for n in long.tolist():
+            points = shapely.get_coordinates(shapes[n])
+            starts = range(0, len(points) - 1, _PIECE)
+            pieces += [shapely.LineString(points[start : start + _PIECE + 1]) for start in starts]
+            owners += [n] * len(starts)
+        short = np.setdiff1d(of, long)
+        of = np.concatenate([short, np.array(owners, np.intp)])
+        by_owner = np.argsort(of, kind="stable")
+        shapes = np.concatenate([shapes[short], np.array(pieces, object)])[by_owner]
+        of = of[by_owner]
+    lines = halves[of] > 0
+    widened = shapes.copy()
+    widened[lines] = shapely.buffer(shapes[lines], halves[of][lines])
+    return widened, of
+
+
+def _rasterize(
+    shapes: NDArray[Any], values: NDArray[np.float64], out: Floats, window: Window, *, everywhere: bool
+) -> None:
     from rasterio.errors import NotGeoreferencedWarning
     from rasterio.features import rasterize
     from rasterio.transform import Affine
 
-    shape = (window.row1 - window.row0, window.col1 - window.col0)
+    pairs = [(part, value) for shape, value in zip(shapes, values.tolist(), strict=True) for part in _parts(shape)]
     if not pairs:
-        return np.full(shape, np.nan, np.float32)
-    ordered = sorted(pairs, key=lambda pair: pair[1], reverse=least_wins)  # the last one burnt stays
+        return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        found: Floats = rasterize(
-            _light(ordered),
-            out_shape=shape,
-            fill=np.nan,
-            dtype="float32",
+        rasterize(
+            pairs,
+            out=out,
             transform=Affine.translation(window.col0, window.row0),
             all_touched=everywhere,
             skip_invalid=True,
         )
-    return found
 
 
-def _light(pairs: Iterable[tuple[Any, float]]) -> list[tuple[Any, float]]:
-    """The same shapes, polygons of very many corners cut along rows of cells."""
-    return [(part, value) for shape, value in pairs for part in _cut(shape)]
-
-
-def _cut(shape: Any) -> NDArray[Any] | list[Any]:
+def _parts(shape: Any) -> list[dict[str, Any]]:
+    """A shape as rasterio takes it; a polygon of very many corners is cut along rows of cells."""
     import shapely
 
-    if shape.geom_type not in ("Polygon", "MultiPolygon"):
-        return [shape]
+    if shape.geom_type != "Polygon":
+        return [{"type": shape.geom_type, "coordinates": _coordinates(shape)}]
     west, north, east, south = shape.bounds
     if shapely.get_num_coordinates(shape) * (south - north) <= _HEAVY or south - north < 2:
-        return [shape]
+        return [{"type": "Polygon", "coordinates": [_coordinates(ring) for ring in shapely.get_rings(shape)]}]
     middle = float(np.floor((north + south) / 2))
     halves = [
         shapely.clip_by_rect(shape, west - 1, top, east + 1, bottom)
@@ -136,5 +165,12 @@ def _cut(shape: Any) -> NDArray[Any] | list[Any]:
         for half in halves
         for polygon in shapely.get_parts(half)
         if polygon.geom_type == "Polygon"
-        for part in _cut(polygon)
+        for part in _parts(polygon)
     ]
+
+
+def _coordinates(shape: Any) -> Any:
+    import shapely
+
+    points = shapely.get_coordinates(shape).tolist()
+    return points[0] if shape.geom_type == "Point" else points

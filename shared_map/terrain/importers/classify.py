@@ -6,6 +6,7 @@ never water. So water must be level, smooth and bluish or nearly black, and is g
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.importers.photo_roads import COARSEST_M, REACH, line_strength, long_lines
 from shared_map.terrain.layers import TerrainClass, grade_of_padded, spread
-from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress, padded_rows
 
 HALO = REACH
 """Rows around a band that its features look at."""
@@ -25,7 +26,13 @@ STILL_GRADE = np.float32(0.004)
 LEVEL_M, LEVEL_PER_CELL = 0.25, 0.025
 """Standard deviation of a lake's heights: metres of the survey, and per metre of cell for the bank in a cell at the
 shore. Lakes that were measured have at most nine tenths of it; the shadow of a cloud lies over more."""
+EXPOSURES = ((1.1, 1.03), (0.9, 0.97))
+"""(gain, red over green): two photos of one place differ by as much, and more."""
+LEVEL_SAND = np.float32(0.1)
+"""On gentler ground what is as bright as snow, and not even, may be a beach, a roof or a quarry."""
 SMALLEST_LAKE = 12
+_LIGHT = np.array([0.299, 0.587, 0.114], np.float32)
+"""How bright red, green and blue are to the eye (Rec. 601)."""
 SHORE = (2, 2, 2)
 """Around lakes, as `spread` takes it: a beach is a bright line, too."""
 ROAD_GRADE = np.float32(0.5)
@@ -44,21 +51,32 @@ class Features:
     """
 
     def __init__(self, rgb: Bytes, grade: Floats) -> None:
-        from scipy import ndimage
-
         colour = rgb.astype(np.float32)
-        self.red, self.green, self.blue = (ndimage.uniform_filter(colour[..., n], 3) for n in range(3))
-        light = colour @ np.array([0.299, 0.587, 0.114], np.float32)
-        mean = ndimage.uniform_filter(light, 5)
-        square = ndimage.uniform_filter(light * light, 5)
-        self.light = ndimage.uniform_filter(light, 3)
-        self.around = mean
-        self.texture = np.sqrt(np.maximum(square - mean * mean, np.float32(0)))
-        brightest = np.maximum(np.maximum(self.red, self.green), self.blue)
-        darkest = np.minimum(np.minimum(self.red, self.green), self.blue)
-        self.saturation = (brightest - darkest) / np.maximum(brightest, np.float32(1))
+        # Sums of bytes are exact, and the light of a mean is the mean of the light.
+        near = box_sum(rgb.astype(np.uint16), 1).astype(np.float32) * np.float32(1 / 9)
+        self.red: Floats
+        self.green: Floats
+        self.blue: Floats
+        self.red, self.green, self.blue = (np.ascontiguousarray(near[..., n]) for n in range(3))
+        light = colour @ _LIGHT
+        mean = box_sum(light, 2) * np.float32(1 / 25)
+        square = box_sum(light * light, 2) * np.float32(1 / 25)
+        self.light = np.asarray(near @ _LIGHT, np.float32)
+        self.around: Floats = mean
+        self.texture = np.asarray(np.sqrt(np.maximum(square - mean * mean, np.float32(0))), np.float32)
+        self.saturation = _saturation(self.red, self.green, self.blue)
         self.grade = grade
         self.sharp, self.rgb = colour, rgb
+
+    def exposed(self, gain: float, warm: float) -> Features:
+        """The means as they would be if the photo were brighter, and redder than blue, by these factors."""
+        other = copy.copy(self)
+        by = np.float32(gain)
+        other.red, other.green, other.blue = self.red * (by * np.float32(warm)), self.green * by, self.blue * by
+        other.blue /= np.float32(warm)
+        other.light, other.around, other.texture = self.light * by, self.around * by, self.texture * by
+        other.saturation = _saturation(other.red, other.green, other.blue)
+        return other
 
     def columns(self) -> Floats:
         """float32 (cells, 11) for a learner, row by row; the last column is the grade."""
@@ -68,6 +86,26 @@ class Features:
             *(self.red / total, self.green / total, self.blue / total, self.grade),
         )
         return np.stack([part.reshape(-1) for part in parts], axis=1).astype(np.float32)
+
+
+def _saturation(red: Floats, green: Floats, blue: Floats) -> Floats:
+    brightest = np.maximum(np.maximum(red, green), blue)
+    darkest = np.minimum(np.minimum(red, green), blue)
+    return np.asarray((brightest - darkest) / np.maximum(brightest, np.float32(1)), np.float32)
+
+
+def box_sum(values: NDArray[Any], reach: int) -> NDArray[Any]:
+    """Sums over squares of `reach` cells to each side; the border is mirrored. Of the type of `values`."""
+    pads = [(reach, reach), (reach, reach), (0, 0)][: values.ndim]
+    padded = np.pad(values, pads, mode="symmetric")
+    rows, cols = values.shape[:2]
+    down = padded[:rows].copy()
+    for n in range(1, 2 * reach + 1):
+        down += padded[n : n + rows]
+    across = down[:, :cols].copy()
+    for n in range(1, 2 * reach + 1):
+        across += down[:, n : n + cols]
+    return across
 
 
 def by_rules(
@@ -94,6 +132,7 @@ def by_rules(
     Returns
     -------
     uint8 (rows, cols), TerrainClass
+        UNKNOWN also where a photo that is exposed a little differently would show another class.
     """
     rows, cols = rgb.shape[:2]
     classes = np.empty((rows, cols), np.uint8)
@@ -102,7 +141,7 @@ def by_rules(
 
     def work(row0: int, row1: int) -> None:
         inner, features = _features(rgb, elevation_m, resolution_m, row0, row1)
-        classes[row0:row1] = _ground(features)[inner]
+        classes[row0:row1] = _sure_ground(features)[inner]
         wetness[row0:row1] = _water(features)[inner]
         if resolution_m <= COARSEST_M:
             strength = line_strength(features.rgb)
@@ -130,6 +169,16 @@ def _features(
     else:
         grade = np.nan_to_num(grade_of_padded(padded_rows(elevation_m, above, below), resolution_m))
     return slice(row0 - above, row1 - above), Features(rgb[above:below], grade)
+
+
+def _sure_ground(f: Features) -> Bytes:
+    """`_ground` where it does not hang on how the photo was exposed."""
+    classes = _ground(f)
+    doubtful = (classes == TerrainClass.SNOW) & (f.grade < LEVEL_SAND) & (f.texture > 8)
+    for gain, warm in EXPOSURES:
+        doubtful |= _ground(f.exposed(gain, warm)) != classes
+    classes[doubtful] = TerrainClass.UNKNOWN
+    return classes
 
 
 def _ground(f: Features) -> Bytes:
@@ -191,8 +240,8 @@ def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats | None, resoluti
     from scipy import ndimage
 
     labels, count = ndimage.label(likely)
-    sizes = np.bincount(labels.reshape(-1))
-    certain = np.bincount(labels[(wetness & CERTAIN) > 0], minlength=count + 1)
+    sizes = counted(labels, count + 1)
+    certain = counted(labels, count + 1, (wetness & CERTAIN) > 0)
     wet = (sizes >= SMALLEST_LAKE) & (5 * certain >= sizes)
     wet[0] = False
     tilted = np.zeros(count + 1, np.bool_)
@@ -202,7 +251,7 @@ def _patches(likely: Bools, wetness: Bytes, elevation_m: Floats | None, resoluti
         mean = np.bincount(of_cell, heights, count + 1) / np.maximum(sizes, 1)
         variance = np.bincount(of_cell, (heights - mean[of_cell]) ** 2, count + 1) / np.maximum(sizes, 1)
         tilted = wet & (variance > (LEVEL_M + LEVEL_PER_CELL * resolution_m) ** 2)
-    return np.asarray((wet & ~tilted)[labels], np.bool_), np.asarray(tilted[labels], np.bool_)
+    return looked_up(wet & ~tilted, labels), looked_up(tilted, labels)
 
 
 # --- learnt -------------------------------------------------------------------------------------------------

@@ -245,7 +245,7 @@ def read_cover_table(path: Path) -> CoverTable:
     Parameters
     ----------
     path : Path
-        CSV. A first line that begins with no number is a header.
+        CSV. A first line whose first cell has no digit is a header.
 
     Raises
     ------
@@ -259,7 +259,7 @@ def read_cover_table(path: Path) -> CoverTable:
             continue
         what = f"cover codes {path}, line {number}"
         if not cells[0].isdecimal():
-            if number == 1:
+            if number == 1 and not any(char.isdigit() for char in cells[0]):
                 continue
             raise TerrainError(f"{what}: {cells[0][:40]!r} is no code; expected a whole number")
         code = int(cells[0][:12])

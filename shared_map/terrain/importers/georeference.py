@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from shared_map.terrain.importers.degrees import equidistant
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
@@ -19,6 +20,8 @@ MAX_SPAN_DEG = 12.0
 """Beyond this, a local projection stretches by more than half a percent at its borders."""
 MOST_STRETCH = 0.02
 """Mercator's metres, and those of maps in equal degrees, are true on one line only."""
+_LIKE_WGS84 = (4326, 4258, 4269)
+"""Degrees within a metre of WGS 84's. Those of other datums PROJ has to move, for which it needs the datum."""
 _EARTH_M = 6_371_000.0
 HIGHEST_DEG = 85.0
 """Degrees nearer to a pole than this are not put on metres."""
@@ -73,6 +76,8 @@ def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) ->
             return crs
     stretch = math.radians(lat_span_deg / 2) * abs(math.tan(math.radians(lat_deg)))
     if crs.is_geographic and stretch < 0.01:
+        if crs.to_epsg() in _LIKE_WGS84:
+            return rasterio.CRS.from_proj4(equidistant(lat_deg, lon_deg))
         text = f"+proj=eqc +lat_ts={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
         return rasterio.CRS.from_proj4(text)
     return local

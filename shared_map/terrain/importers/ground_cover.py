@@ -55,7 +55,8 @@ def with_photo(source: Source, path: Path, config: TerrainConfig, progress: Prog
     from shared_map.terrain.importers.photos import read_photo
 
     photo = read_photo(path, source.grid, config.crs, progress)
-    return replace(source, photo=photo.rgb, seen=photo.seen, notes=(*source.notes, str(path), *photo.notes))
+    notes = (*source.notes, str(path), *photo.notes)
+    return replace(source, photo=photo.rgb, seen=photo.seen, drawn=photo.drawn, notes=notes)
 
 
 def classified(source: Source, config: TerrainConfig, seed: int, progress: Progress) -> Source:
@@ -65,7 +66,7 @@ def classified(source: Source, config: TerrainConfig, seed: int, progress: Progr
     assert source.photo is not None
     inputs = (source.photo, source.elevation_m, source.grid.resolution_m)
     seen = np.ones(source.classes.shape, np.bool_) if source.seen is None else source.seen
-    other = why_not_true_colour(source.photo, seen)
+    other = source.drawn or why_not_true_colour(source.photo, seen)
     if config.labels is None and other is not None:
         note = (
             f"the photo is {other}; no classes are read from it: give a true-colour one, terrain.labels, or its"
@@ -74,7 +75,11 @@ def classified(source: Source, config: TerrainConfig, seed: int, progress: Progr
         return replace(source, notes=(*source.notes, note))
     if config.labels is None:
         classes = by_rules(*inputs, source.seen, progress)
-        note = "classes from the photo, by rules"
+        doubtful = float((classes[seen] == TerrainClass.UNKNOWN).mean()) if seen.any() else 0.0
+        note = (
+            f"classes from the photo, by rules; {doubtful:.0%} of what it shows would be another class in a photo"
+            " exposed a little differently, and is unknown: see terrain.labels and cost.class_factor.unknown"
+        )
     else:
         from shared_map.terrain.importers.labels import read_labels
 

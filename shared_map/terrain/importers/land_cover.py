@@ -15,23 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.terrain.importers.cover_recognition import (
-    NO_COLOUR,
-    NOTHING,
-    Evidence,
-    evidence_of,
-    legend_codes,
-    legend_of,
-    recognise,
-    some,
-)
-from shared_map.terrain.importers.cover_tables import (
-    HIGHEST_CODE,
-    TABLES,
-    CoverTable,
-    own_grounds,
-    table_named,
-)
+from shared_map.terrain.importers.cover_meaning import Meaning, joined, meaning_of, why_unknown
+from shared_map.terrain.importers.cover_recognition import NO_COLOUR, NOTHING, some
+from shared_map.terrain.importers.cover_tables import HIGHEST_CODE, CoverTable
 from shared_map.terrain.importers.georeference import crs_of, resampling
 from shared_map.terrain.importers.photos import overlap, transform_of
 from shared_map.terrain.importers.rasters import opened
@@ -43,7 +29,6 @@ from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
 _READ_ROWS = 512
-_MOST_SAMPLED = 1 << 20
 _TOLD_CODES = 6
 _NO_CODE = -1
 
@@ -62,20 +47,6 @@ class Cover:
     factor: Floats
     known: Bools
     notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Meaning:
-    """How the values of a file become grounds.
-
-    table  what the codes stand for
-    how    how that is known, for people
-    codes  code of each colour (`legend_codes`) or of each entry of a palette; None where values are codes
-    """
-
-    table: CoverTable
-    how: str
-    codes: NDArray[np.uint16] | None = None
 
 
 def with_cover(source: Source, config: TerrainConfig, progress: Progress) -> Source:
@@ -127,7 +98,7 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
     with opened(path, "land cover") as dataset:
         meaning = meaning_of(dataset, what, config)
         if meaning is None:
-            raise TerrainError(_unknown(dataset, what))
+            raise TerrainError(why_unknown(dataset, what))
         same_shape = (dataset.height, dataset.width) == (grid.rows, grid.cols)
         crs = target = None
         notes = []
@@ -152,17 +123,6 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
         return _read(dataset, meaning, grid, crs, target, notes, progress)
 
 
-def is_drawn(path: Path, config: TerrainConfig) -> bool:
-    """Whether an image that is named as a photo is a map of land cover, in a legend's colours or with its codes."""
-    from rasterio.enums import ColorInterp
-
-    with opened(path, "photo") as dataset:
-        if dataset.count >= 3:
-            return legend_of(sampled_colours(dataset), f"photo {path}") is not None
-        has_palette = dataset.colorinterp[0] == ColorInterp.palette
-        return has_palette and meaning_of(dataset, f"photo {path}", config) is not None
-
-
 def _taken(dataset: Any, crs: Any, grid: GridSpec, target: Any) -> str:
     most = _method(dataset, crs, grid, target).name == "mode"
     return f"each cell takes the {'most frequent' if most else 'nearest'} code"
@@ -173,103 +133,6 @@ def _method(dataset: Any, crs: Any, grid: GridSpec, target: Any) -> Any:
 
     coarser = resampling(dataset, crs, grid, target) == Resampling.average
     return Resampling.mode if coarser else Resampling.nearest
-
-
-# --- what the values mean -----------------------------------------------------------------------------------
-
-
-def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> Meaning | None:
-    """How the values of a file become grounds; None if nothing tells.
-
-    Raises TerrainError if it holds no codes, or if several tables fit.
-    """
-    own = own_grounds(config.cover_classes)
-    given = None if config.cover_codes is None else table_named(config.cover_codes)
-    if dataset.count >= 3:
-        if given is None:
-            given, how = legend_of(sampled_colours(dataset), what), "drawn in the colours of its legend"
-        else:
-            how = f"drawn in its colours, as terrain.cover_codes = {config.cover_codes!r} says"
-        if given is None:
-            return None
-        if not any(ground.colour for ground in given.grounds.values()):
-            raise TerrainError(f"{what} has colours, and terrain.cover_codes names a table without; expected codes")
-        return Meaning(given.replaced(own), how, legend_codes(given))
-    sample = sampled_codes(dataset, what)
-    if given is not None:
-        return Meaning(given.replaced(own), f"as terrain.cover_codes = {config.cover_codes!r} says")
-    if own and set(np.unique(sample).tolist()) <= own.keys() | {0}:
-        return Meaning(CoverTable("own", "codes of one's own", own), "as terrain.cover_classes says")
-    found = evidence_of(dataset, sample)
-    known = recognise(found, what)
-    if known is not None:
-        return Meaning(known.table.replaced(own), f"known by {known.how}")
-    if found.palette:
-        colours = _palette_colours(found)
-        entries = sample[sample < len(colours)].astype(np.intp)
-        table = legend_of(colours[entries], what)
-        if table is not None:
-            codes = legend_codes(table)[colours]
-            return Meaning(table.replaced(own), "its palette has the colours of its legend", codes)
-    if own:
-        return Meaning(CoverTable("own", "codes of one's own", own), "as terrain.cover_classes says")
-    return None
-
-
-def sampled_codes(dataset: Any, what: str) -> NDArray[Any]:
-    """Values of some cells, (cells,), as stored, no-data left out. Raises TerrainError if they are not whole."""
-    from rasterio.enums import Resampling
-
-    kind = np.dtype(dataset.dtypes[0]).kind
-    every = max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0)
-    shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
-    values: NDArray[Any] = dataset.read(1, out_shape=shape, resampling=Resampling.nearest)
-    values = values[dataset.read_masks(1, out_shape=shape, resampling=Resampling.nearest) > 0]
-    if kind == "f":
-        values = values[np.isfinite(values)]
-    if kind not in "iuf" or (kind == "f" and (values % 1 != 0).any()):
-        raise TerrainError(f"{what} holds {'real' if kind == 'f' else dataset.dtypes[0]} numbers; codes are whole")
-    return values[values >= 0]
-
-
-def _palette_colours(found: Evidence) -> NDArray[np.int32]:
-    colours = np.zeros(max(found.palette) + 1, np.int32)
-    for code, (red, green, blue) in found.palette.items():
-        colours[code] = red << 16 | green << 8 | blue
-    return colours
-
-
-def sampled_colours(dataset: Any) -> NDArray[np.int32]:
-    """Of some cells of an image, (cells,), red << 16 | green << 8 | blue; what it does not show left out."""
-    from rasterio.enums import Resampling
-
-    if any(dtype != "uint8" for dtype in dataset.dtypes[:3]):
-        return np.zeros(0, np.int32)
-    every = max((dataset.height * dataset.width / _MOST_SAMPLED) ** 0.5, 1.0)
-    shape = (max(int(dataset.height / every), 1), max(int(dataset.width / every), 1))
-    rgb = dataset.read((1, 2, 3), out_shape=(3, *shape), resampling=Resampling.nearest)
-    shown: Bools = dataset.dataset_mask(out_shape=shape, resampling=Resampling.nearest) > 0
-    return _joined(rgb)[shown]
-
-
-def _joined(rgb: NDArray[Any]) -> NDArray[np.int32]:
-    red, green, blue = (band.astype(np.int32) for band in rgb)
-    joined: NDArray[np.int32] = red << 16 | green << 8 | blue
-    return joined
-
-
-def _unknown(dataset: Any, what: str) -> str:
-    titles = ", ".join(table.title for table in TABLES.values())
-    if dataset.count >= 3:
-        return (
-            f"{what} is an image, and not in the colours of {titles}; a photo belongs into terrain.photo, codes"
-            " into one band"
-        )
-    codes = np.unique(sampled_codes(dataset, what)).tolist()
-    return (
-        f"{what}: its codes ({some(codes)}) are those of no built-in table ({titles}); name a CSV file of code and"
-        " class in terrain.cover_codes"
-    )
 
 
 # --- onto the grid ------------------------------------------------------------------------------------------
@@ -343,7 +206,7 @@ def _codes_in_memory(dataset: Any, meaning: Meaning) -> NDArray[Any] | None:
         window = Window(0, row0, dataset.width, row1 - row0)
         if dataset.count >= 3:
             assert meaning.codes is not None
-            codes[row0:row1] = meaning.codes[_joined(dataset.read((1, 2, 3), window=window))]
+            codes[row0:row1] = meaning.codes[joined(dataset.read((1, 2, 3), window=window))]
         else:
             values = dataset.read(1, window=window)
             if meaning.codes is not None:

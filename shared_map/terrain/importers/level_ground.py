@@ -15,19 +15,12 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.level_patches import Patches, level_patches
-from shared_map.terrain.importers.voids import HIGHEST_M
-from shared_map.terrain.row_bands import bands
+from shared_map.terrain.importers.voids import HIGHEST_M, undeclared_voids, without
+from shared_map.terrain.row_bands import bands, looked_up
 from swarm.config.scenario import TerrainConfig
 
 MOST_SAMPLED = 1 << 24
 """Cells of a file in which level ground is looked for, and in rasters voids: of larger ones in every second, ..."""
-_CODES = (-32768.0, -32767.0, -99999.0, -9999.0, -9998.0, -999.0, -500.0, 9999.0, 32767.0, 65535.0)
-"""What programs write where they know no height."""
-_CODE_GAP_M = 100.0
-_ZERO_GAP_M = 30.0
-_ALONE = 3.0
-"""A code is a void if no other height is nearer to it than this, and than so many times the widest gap between
-other heights: real ground is never alone in its height."""
 _SAME_M = 0.005
 """Levelled water differs by rounding, or by what a resampling before ours left."""
 _STILL_M = 0.02
@@ -77,37 +70,6 @@ class LevelGround:
     uncertain: float = 0.0
 
 
-def undeclared_voids(heights: NDArray[np.floating] | NDArray[np.integer]) -> tuple[float, ...]:
-    """The values of a height model that stand for no height, though the file does not say so.
-
-    Parameters
-    ----------
-    heights : (rows, cols), as stored
-        NaN is a declared void.
-
-    Returns
-    -------
-    tuple of float
-        Usual codes for "no height", and 0, where no other height is near them.
-    """
-    known = heights[np.isfinite(heights)]
-    gaps_m = {**dict.fromkeys(_CODES, _CODE_GAP_M), 0.0: _ZERO_GAP_M}
-    is_code = np.isin(known, np.array(list(gaps_m), known.dtype))
-    if not is_code.any():
-        return ()
-    if is_code.all():
-        # Nothing but the sea is a map; nothing but -9999 is none.
-        return tuple(code for code in np.unique(known.astype(np.float64)).tolist() if code != 0)
-    rest = np.unique(known[~is_code].astype(np.float64))
-    widest = np.diff(rest).max(initial=0.0)
-    found = []
-    for code in np.unique(known[is_code].astype(np.float64)).tolist():
-        nearest = np.abs(rest - code).min()
-        if nearest >= gaps_m[code] and nearest > _ALONE * widest:
-            found.append(code)
-    return tuple(found)
-
-
 def level_ground(elevation_m: Floats) -> LevelGround:
     """The patches that are exactly level and lie no higher than what surrounds them: still water, as a rule.
 
@@ -131,7 +93,7 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     coarse = step_m >= _COARSE_M
     found = level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE if coarse else _LEAST_CELLS_FINE, step_m)
     water, unsure = _judged(found, _STILL_M)
-    mask = water[found.labels]
+    mask = looked_up(water, found.labels)
     rippled = water & (found.ripple > _LEAST_RIPPLES * found.differ)
     if rippled.any():
         _add_ripples(elevation_m, found, rippled, mask)
@@ -170,15 +132,17 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
     if rows < 1 or cols < 1:
         return []
     mean_m = np.empty((rows, cols), np.float32)
-    rough, noisy = (np.empty((rows, cols), np.bool_) for _ in range(2))
+    rough, noisy = np.empty((rows, cols), np.bool_), np.zeros((rows, cols), np.bool_)
     for row0, row1 in bands(rows, _BLOCK_ROWS):
-        part = elevation_m[row0 * side : row1 * side, : cols * side].reshape(row1 - row0, side, cols, side)
-        mean_m[row0:row1] = part.mean(axis=(1, 3))
+        part = elevation_m[row0 * side : row1 * side, : cols * side].reshape(row1 - row0, side, cols * side)
+        mean_m[row0:row1] = _of_columns(np.add, part.sum(axis=1)) / np.float32(side * side)
+        range_m = _of_columns(np.maximum, part.max(axis=1)) - _of_columns(np.minimum, part.min(axis=1))
         with np.errstate(invalid="ignore"):
-            range_m = part.max(axis=(1, 3)) - part.min(axis=(1, 3))
             rough[row0:row1] = ~(range_m <= np.float32(_ROUGH_M))
-        steps_m = np.abs(np.diff(part, axis=1)).mean(axis=(1, 3)) + np.abs(np.diff(part, axis=3)).mean(axis=(1, 3))
-        noisy[row0:row1] = steps_m > np.float32(2 * _NOISY) * range_m
+        row, col = np.nonzero(~rough[row0:row1])
+        blocks = part.reshape(row1 - row0, side, cols, side)[row, :, col, :]
+        steps_m = sum(np.abs(np.diff(blocks, axis=axis)).mean(axis=(1, 2)) for axis in (1, 2))
+        noisy[row + row0, col] = steps_m > np.float32(2 * _NOISY) * range_m[row, col]
     # A rough block can be a shore, but no part of a patch.
     still_m = np.where(rough, np.float32(np.nan), mean_m)
     found = level_patches(still_m, _BLOCK_SAME_M, _LEAST_BLOCKS, 0.0, mean_m)
@@ -214,6 +178,14 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
     return [(float(height_m[n]), int(taken[n])) for n in np.flatnonzero(water).tolist()]
 
 
+def _of_columns(ufunc: np.ufunc, values: Floats) -> Floats:
+    """Every `_BLOCK_CELLS` columns made one."""
+    found = values[:, ::_BLOCK_CELLS]
+    for n in range(1, _BLOCK_CELLS):
+        found = ufunc(found, values[:, n::_BLOCK_CELLS])
+    return found
+
+
 def _means_of(mean_m: Floats, found: Patches) -> Floats:
     total = np.bincount(found.labels.reshape(-1), np.nan_to_num(mean_m).reshape(-1), len(found.cells))
     means: Floats = (total / np.maximum(found.cells, 1)).astype(np.float32)
@@ -238,13 +210,6 @@ def _add_ripples(elevation_m: Floats, found: Patches, rippled: Bools, mask: Bool
             mask[row0:row1] |= (above_m <= _SAME_M) & (above_m >= -_SUNK_M)
 
 
-def without(heights: Floats, voids: Sequence[float]) -> Floats:
-    """Heights as stored, with NaN for each value that stands for no height."""
-    if not voids:
-        return heights
-    return np.where(np.isin(heights, np.array(voids, np.float32)), np.float32(np.nan), heights)
-
-
 def looked_at(
     stored: Floats, config: TerrainConfig, scale: float = 1.0, offset: float = 0.0
 ) -> tuple[tuple[float, ...], Bools, list[str]]:
@@ -256,7 +221,7 @@ def looked_at(
         As in the file; `scale` and `offset` make metres of it. Of a large one only some cells are looked at for
         what is level.
     """
-    unknown = undeclared_voids(without(stored, config.nodata_values))
+    unknown = undeclared_voids(without(stored, config.nodata_values), scale, offset)
     voids = (*config.nodata_values, *unknown)
     rows, cols = stored.shape
     every = math.ceil(math.sqrt(max(stored.size / MOST_SAMPLED, 1.0)))

@@ -18,7 +18,7 @@ _LEAST_ALIKE, _LEAST_ALIKE_MEANS = 2, 3
 """So many of its eight neighbours are as high as a cell of a patch: those of a creek one cell wide are two. Among
 means of blocks a chain of equal ones is a contour line."""
 _STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
-_PAINTED_RUNS = 1 << 18
+_RUNS_AT_ONCE = 1 << 18
 _COUNTS = ("edge", "differ", "beside", "below", "lower", "ripple", "terrace", "steep")
 _RIPPLE_CELLS, _RIPPLE = 3, 4.0
 """A cubic filter undershoots beside a rise by less than a quarter of it, and leaves no more than these cells."""
@@ -150,19 +150,13 @@ def _labelled(
     elevation_m: Floats, same_m: np.float32, least_cells: int, least_alike: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """(labels, cells of each patch), numbered as they come from the north-west."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     rows, cols = elevation_m.shape
     labels = np.zeros((rows, cols), np.int32)
     starts, ends = _runs(elevation_m, same_m, least_alike)
     if starts.size == 0:
         return labels, np.zeros(1, np.int64)
-    above, below = _touching(elevation_m.reshape(-1), starts, ends, cols, same_m)
-    graph = coo_matrix((np.ones(above.size, np.int8), (above, below)), (starts.size, starts.size))
-    _, of_run = connected_components(graph, directed=False)
-    del graph, above, below
-    lengths = (ends - starts + 1).astype(np.int64)
+    of_run = _connected(starts.size, *_touching(elevation_m.reshape(-1), starts, ends, cols, same_m))
+    lengths = ends - starts + 1
     cells = np.bincount(of_run, lengths).astype(np.int64)
     number = np.zeros(cells.size, np.int32)
     kept = np.flatnonzero(cells >= least_cells)
@@ -170,16 +164,33 @@ def _labelled(
     of_run = number[of_run]
     large = np.flatnonzero(of_run)
     flat = labels.reshape(-1)
-    for n in range(0, large.size, _PAINTED_RUNS):
-        some = large[n : n + _PAINTED_RUNS]
-        long = lengths[some]
+    for n in range(0, large.size, _RUNS_AT_ONCE):
+        some = large[n : n + _RUNS_AT_ONCE]
+        long = lengths[some].astype(np.int64)
         before = np.cumsum(long) - long
         at = np.arange(long.sum()) + np.repeat(starts[some] - before, long)
         flat[at] = np.repeat(of_run[some], long)
     return labels, np.concatenate((np.zeros(1, np.int64), cells[kept]))
 
 
-def _runs(elevation_m: Floats, same_m: np.float32, least_alike: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _connected(count: int, one: NDArray[np.int32], other: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Of each of `count` runs the least number of those that it is connected with, over pairs that touch.
+
+    Roots are hooked onto lower ones and paths are halved, as Shiloach and Vishkin do it (1982): scipy's function
+    takes a matrix of the pairs, both ways.
+    """
+    root = np.arange(count, dtype=np.int32)
+    while one.size:
+        low, high = root[one], root[other]
+        apart = low != high
+        one, other, low, high = one[apart], other[apart], low[apart], high[apart]
+        np.minimum.at(root, np.maximum(low, high), np.minimum(low, high))
+        while not np.array_equal(root, halved := root[root]):
+            root = halved
+    return root
+
+
+def _runs(elevation_m: Floats, same_m: np.float32, least_alike: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """First and last cell of each run of cells that are as high as their neighbours, as flat numbers."""
     rows, cols = elevation_m.shape
     starts, ends = [], []
@@ -202,22 +213,27 @@ def _runs(elevation_m: Floats, same_m: np.float32, least_alike: int) -> tuple[ND
         begins, finishes = level.copy(), level.copy()
         begins[:, 1:] &= ~joined
         finishes[:, :-1] &= ~joined
-        starts.append(np.flatnonzero(begins) + row0 * cols)
-        ends.append(np.flatnonzero(finishes) + row0 * cols)
+        starts.append((np.flatnonzero(begins) + row0 * cols).astype(np.int32))
+        ends.append((np.flatnonzero(finishes) + row0 * cols).astype(np.int32))
     return np.concatenate(starts), np.concatenate(ends)
 
 
 def _touching(
-    flat_m: Floats, starts: NDArray[np.int64], ends: NDArray[np.int64], cols: int, same_m: np.float32
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    flat_m: Floats, starts: NDArray[np.int32], ends: NDArray[np.int32], cols: int, same_m: np.float32
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Numbers of runs, and of runs in the row below that touch them, be it at a corner, and are as high."""
-    row = starts // cols
-    first = np.searchsorted(ends, np.maximum(starts + cols - 1, (row + 1) * cols))
-    last = np.searchsorted(starts, np.minimum(ends + cols + 1, (row + 2) * cols - 1), "right")
-    many = np.maximum(last - first, 0)
-    above = np.repeat(np.arange(starts.size), many)
-    below = np.arange(above.size) + np.repeat(first - (np.cumsum(many) - many), many)
-    at = np.clip(starts[below] - cols, starts[above], ends[above])
-    under = np.clip(at + cols, starts[below], ends[below])
-    same = np.abs(flat_m[at] - flat_m[under]) <= same_m
-    return above[same], below[same]
+    ones, others = [], []
+    for n in range(0, starts.size, _RUNS_AT_ONCE):
+        begin, end = starts[n : n + _RUNS_AT_ONCE], ends[n : n + _RUNS_AT_ONCE]
+        row = begin // cols
+        first = np.searchsorted(ends, np.maximum(begin + (cols - 1), (row + 1) * cols))
+        last = np.searchsorted(starts, np.minimum(end + (cols + 1), (row + 2) * cols - 1), "right")
+        many = np.maximum(last - first, 0)
+        above = np.repeat(np.arange(begin.size), many)
+        below = np.arange(above.size) + np.repeat(first - (np.cumsum(many) - many), many)
+        at = np.clip(starts[below] - cols, begin[above], end[above])
+        under = np.clip(at + cols, starts[below], ends[below])
+        same = np.abs(flat_m[at] - flat_m[under]) <= same_m
+        ones.append((above[same] + n).astype(np.int32))
+        others.append(below[same].astype(np.int32))
+    return np.concatenate(ones), np.concatenate(others)

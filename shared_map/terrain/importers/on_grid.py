@@ -5,7 +5,8 @@ Cell coordinates are (column, row) from the north-west corner: cell (r, c) is th
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,7 +65,8 @@ class Placing:
         self.grid, self.layer = grid, layer
         self._target, self._crs = _systems(grid, layer, crs)
         self._margin_cells = margin_m / grid.resolution_m + 2.0
-        self._box = self._extent()
+        with self._reprojecting():
+            self._box = self._extent()
         self.shifts = [0.0]
         if self._crs is not None and self._crs.is_geographic:
             self.shifts = [0.0, -360.0, 360.0]
@@ -122,6 +124,10 @@ class Placing:
 
     def place(self, features: Features, box: Box, shift: float) -> Shapes:
         """Features that were read from a box, in cells."""
+        with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
+            return self._place(features, box, shift)
+
+    def _place(self, features: Features, box: Box, shift: float) -> Shapes:
         import shapely
 
         geometries = features.geometries
@@ -144,11 +150,25 @@ class Placing:
         if self._crs is not None and self._crs != self._target:
             unit_m = _DEG_M if self._crs.is_geographic else float(self._crs.linear_units_factor[1])
             shapes = shapely.segmentize(shapes, _STEP_M / unit_m)
-        shapes = shapely.transform(shapes, lambda points: self._to_cells(points, shift))
+        with self._reprojecting():
+            shapes = shapely.transform(shapes, lambda points: self._to_cells(points, shift))
         shapes, within = _simple(shapes)
         of = of[within]
         good = np.isfinite(shapely.bounds(shapes)).all(axis=1)
         return Shapes(shapes[good], of[good], mended, unusable, int(lacking.sum()))
+
+    @contextmanager
+    def _reprojecting(self) -> Iterator[None]:
+        """Makes what PROJ says of systems that do not go together a TerrainError."""
+        from rasterio._err import CPLE_BaseError
+        from rasterio.errors import RasterioError
+
+        try:
+            yield
+        except (RasterioError, CPLE_BaseError) as error:
+            raise TerrainError(
+                f"{self.layer.what} cannot be brought from {self.crs} to the terrain's system; is crs right?"
+            ) from error
 
     def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
         from rasterio.warp import transform as to_crs
@@ -169,7 +189,8 @@ def _systems(grid: GridSpec, layer: Layer, given: str | None) -> tuple[Any, Any]
     if given == "local":
         return None, None
     try:
-        found = rasterio.CRS.from_user_input(given) if given is not None else None
+        with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too
+            found = rasterio.CRS.from_user_input(given) if given is not None else None
     except (CRSError, ValueError) as error:
         raise TerrainError(
             f"{layer.what}: crs {given!r} is no coordinate system; write EPSG:32632 or alike"
@@ -281,26 +302,3 @@ def _clipped(shapes: NDArray[Any], box: Box) -> NDArray[Any]:
     import shapely
 
     return np.asarray(shapely.clip_by_rect(shapes, *box), object) if len(shapes) else shapes
-
-
-def cells_spanned(shapes: NDArray[Any]) -> float:
-    """Cells of the rectangles around shapes, in all."""
-    import shapely
-
-    if not len(shapes):
-        return 0.0
-    box = shapely.bounds(shapes)
-    return float(((box[:, 2] - box[:, 0] + 1) * (box[:, 3] - box[:, 1] + 1)).sum())
-
-
-def widened(line: Any, half_cells: float) -> list[Any]:
-    """Areas within a distance of a line or point. Long lines in pieces, as one that crosses itself often would take
-    for ever."""
-    import shapely
-
-    points = shapely.get_coordinates(line)
-    most = 50
-    if len(points) <= most or math.isclose(half_cells, 0.0):
-        return [line.buffer(half_cells)]
-    pieces = [points[n : n + most + 1] for n in range(0, len(points) - 1, most)]
-    return [shapely.LineString(piece).buffer(half_cells) for piece in pieces]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
 from shared_map.terrain.layers import spread
+from shared_map.terrain.row_bands import counted, looked_up
 
 COARSEST_M = 30.0
 """On coarser cells a thin line is a ridge, a river or a seam of the photo."""
@@ -108,8 +109,9 @@ def long_lines(strength: Bytes) -> Bools:
 
     strong = strength >= _STRONG
     labels, count = ndimage.label(spread(strong, (1, 1)), np.ones((3, 3), np.int8))
-    sizes = np.bincount(labels[strong], minlength=count + 1)
-    line = strong & (sizes >= _SHORTEST)[labels]
+    sizes = counted(labels, count + 1, strong)
+    line = strong & looked_up(sizes >= _SHORTEST, labels)
+    del labels
     padded = np.pad(line, 1)
     rows, cols = line.shape
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):

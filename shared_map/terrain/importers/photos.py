@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes
 from shared_map.terrain.importers.georeference import bounds_in, crs_name, crs_of, resampling
-from shared_map.terrain.importers.rasters import opened
+from shared_map.terrain.importers.rasters import opened, thinned
+from shared_map.terrain.importers.true_colour import MOST_SIDE, why_drawn
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -27,11 +28,13 @@ class Photo:
     rgb    uint8 (rows, cols, 3): red, green, blue; black where it shows nothing
     seen   bool (rows, cols): where it shows anything
     notes  what was done to it, for people
+    drawn  that its own pixels are those of a drawn map, for people; None if they may be a photo's
     """
 
     rgb: Bytes
     seen: Bools
     notes: tuple[str, ...]
+    drawn: str | None = None
 
 
 def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Progress = no_progress) -> Photo:
@@ -139,7 +142,22 @@ def _read(dataset: Any, grid: GridSpec, crs: Any, target: Any, notes: list[str],
         raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
     if not seen.all():
         notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
-    return Photo(rgb, seen, tuple(notes))
+    return Photo(rgb, seen, tuple(notes), _why_drawn(dataset, indexes, palette))
+
+
+def _why_drawn(dataset: Any, indexes: list[int], palette: NDArray[np.uint8] | None) -> str | None:
+    """Looked for in the file's own pixels, in its middle."""
+    from rasterio.windows import Window
+
+    if len(indexes) == 1 and palette is None:
+        return None
+    if any(dataset.dtypes[index - 1] != "uint8" for index in indexes):
+        return None
+    rows, cols = min(dataset.height, MOST_SIDE), min(dataset.width, MOST_SIDE)
+    window = Window((dataset.width - cols) // 2, (dataset.height - rows) // 2, cols, rows)
+    stored = dataset.read(indexes, window=window)
+    rgb = np.moveaxis(stored, 0, -1) if palette is None else palette[stored[0]]
+    return why_drawn(rgb, dataset.dataset_mask(window=window) > 0)
 
 
 def _band(dataset: Any, index: int, row0: int, row1: int, grid: GridSpec, crs: Any, target: Any) -> NDArray[Any]:
@@ -220,8 +238,8 @@ def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float,
     """Darkest and brightest of a photo that is not in bytes; (0, 0) for bytes."""
     if all(dataset.dtypes[index - 1] == "uint8" for index in indexes):
         return 0.0, 0.0
-    shape = (len(indexes), min(dataset.height, 512), min(dataset.width, 512))
-    sample = dataset.read(indexes, out_shape=shape).astype(np.float64)
+    every = -(-max(dataset.height, dataset.width) // 512)
+    sample = thinned(dataset.read, dataset, indexes, every).astype(np.float64)
     sample = sample[np.isfinite(sample) & (sample != (0 if dataset.nodata is None else dataset.nodata))]
     if sample.size == 0:
         return 0.0, 1.0

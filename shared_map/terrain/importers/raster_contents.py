@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from shared_map.terrain.importers.cover_meaning import meaning_of, sampled_codes, sampled_colours
 from shared_map.terrain.importers.cover_recognition import evidence_of, legend_of, recognise, some
 from shared_map.terrain.importers.cover_tables import TABLES
 from shared_map.terrain.importers.encoded_heights import TITLES, Encoding, encodings_of
-from shared_map.terrain.importers.land_cover import meaning_of, sampled_codes, sampled_colours
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 

@@ -47,6 +47,7 @@ _DRIVERS_BY_ENDING = {
 """Endings of formats without a beginning of their own; a header lies beside most of these files."""
 _IN_ARCHIVES = (".tif", ".tiff", ".img", *_DRIVERS_BY_ENDING)
 _LONGEST_REASON = 200
+_MOST_TIMES, _DEEPEST = 32, 4
 
 
 def is_raster(path: Path) -> bool:
@@ -70,7 +71,7 @@ def kind_of(path: Path, what: str) -> tuple[str | Path, str]:
         driver = _driver(file.read(16), path.suffix.lower(), f"{what} {path}")
     if driver == "VRT":
         check_bytes(path, FileKind.VIRTUAL_RASTER)
-        _check_named(path, f"{what} {path}")
+        _check_virtual(path, f"{what} {path}", {})
     header = path.with_suffix(".hdr")
     if driver == "EHdr" and header.is_file() and header.read_bytes()[:4] == b"ENVI":
         driver = "ENVI"
@@ -86,13 +87,17 @@ def _driver(head: bytes, ending: str, what: str) -> str:
     return found
 
 
-def _check_named(path: Path, what: str) -> None:
-    """A .vrt names other files: each must be an ordinary one on this machine. GDAL would ask a web server, and wait
-    at a pipe for ever."""
+def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int = 1) -> float:
+    """How many times over a .vrt is painted by its sources; `known` holds that of others.
+
+    It names other files: each must be an ordinary one on this machine. GDAL would ask a web server, and wait at a
+    pipe for ever. It has no limit of time either, and a megabyte of XML can ask for the same pixels often.
+    """
     try:
         root = ElementTree.fromstring(path.read_bytes())
     except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise TerrainError(f"{what} is truncated or no raster: {str(error)[:_LONGEST_REASON]}") from error
+    nested = 1.0
     for node in root.iter():
         if not node.tag.endswith(("SourceFilename", "SourceDataset")):
             continue
@@ -105,6 +110,40 @@ def _check_named(path: Path, what: str) -> None:
             raise TerrainError(
                 f"{what} names {name[:_LONGEST_REASON]!r}; expected a file that lies on this machine"
             )
+        source = path.parent / name
+        with source.open("rb") as file:
+            virtual = file.read(16).startswith(b"<VRTDataset")
+        if virtual:
+            if depth >= _DEEPEST:
+                raise TerrainError(f"{what} names .vrt files that name others, more than {_DEEPEST} deep")
+            if source not in known:
+                check_bytes(source, FileKind.VIRTUAL_RASTER)
+                known[source] = _check_virtual(source, what, known, depth + 1)
+            nested = max(nested, known[source])
+    times = nested * max((_painted(root, band) for band in root.iter("VRTRasterBand")), default=1.0)
+    if times > _MOST_TIMES:
+        raise TerrainError(
+            f"{what} paints its pixels {times:.0f} times over, as its sources overlap; at most {_MOST_TIMES} times"
+            " are read: gdal_translate makes one file of it"
+        )
+    return times
+
+
+def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
+    """How many times over the pixels of a band are painted, at least once."""
+    try:
+        cells = max(float(root.get("rasterXSize", 1)) * float(root.get("rasterYSize", 1)), 1.0)
+        sources = [node for node in band if node.tag.endswith("Source")]
+        painted = 0.0
+        for source in sources:
+            place = source.find("DstRect")
+            if place is None:
+                painted += cells
+            else:
+                painted += abs(float(place.get("xSize", 0)) * float(place.get("ySize", 0)))
+    except ValueError:
+        return 1.0  # GDAL says what is wrong with it
+    return max(painted / cells, 1.0)
 
 
 def _in_archive(path: Path, what: str) -> tuple[str, str]:

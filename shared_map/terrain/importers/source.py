@@ -15,6 +15,7 @@ class Source:
     elevation_m  float32 (rows, cols), m; NaN is a void
     classes      uint8 (rows, cols), TerrainClass
     photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
+    drawn        that the photo's own pixels are those of a drawn map, for people; None if they may be a photo's
     factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
     level        bool (rows, cols), level ground as the file has it, before any resampling; None if nobody looked
     notes        where it comes from and what was done to it, for people
@@ -25,6 +26,7 @@ class Source:
     classes: Bytes
     photo: Bytes | None = None
     seen: Bools | None = None
+    drawn: str | None = None
     factor: Floats | None = None
     level: Bools | None = None
     notes: tuple[str, ...] = ()

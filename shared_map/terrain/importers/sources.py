@@ -12,6 +12,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from shared_map.arrays import Bools, Floats
+from shared_map.terrain.importers.degrees import equidistant, metres_per_degree
 from shared_map.terrain.importers.ground_cover import classified, with_photo, with_water, without_voids
 from shared_map.terrain.importers.raster_kinds import is_raster
 from shared_map.terrain.importers.source import Source as Source
@@ -79,7 +80,7 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
 
 def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
     """The settings with a photo that is a drawn map of land cover named as such."""
-    from shared_map.terrain.importers.land_cover import is_drawn
+    from shared_map.terrain.importers.cover_meaning import is_drawn
 
     if config.photo is None or config.cover is not None or config.labels is not None:
         return config
@@ -193,7 +194,8 @@ def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
     """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
-    from shared_map.terrain.importers.level_ground import looked_at, without
+    from shared_map.terrain.importers.level_ground import looked_at
+    from shared_map.terrain.importers.voids import without
 
     voids, level, told = looked_at(stored.astype(np.float32), config, scale)
     return without(stored.astype(np.float32), voids) * np.float32(scale), level, told
@@ -300,14 +302,6 @@ def is_terrain(path: Path) -> bool:
 # --- onto the grid ------------------------------------------------------------------------------------------
 
 
-def metres_per_degree(latitude_deg: float) -> tuple[float, float]:
-    """Metres in one degree of latitude and of longitude on WGS 84, to the millimetre."""
-    phi = math.radians(latitude_deg)
-    lat = 111132.954 - 559.822 * math.cos(2 * phi) + 1.175 * math.cos(4 * phi)
-    lon = 111412.84 * math.cos(phi) - 93.5 * math.cos(3 * phi)
-    return round(lat, 3), round(lon, 3)
-
-
 def _from_degrees(
     heights: Floats, step: tuple[float, float], west: float, north: float, config: TerrainConfig, what: str
 ) -> tuple[Floats, GridSpec, str]:
@@ -316,7 +310,7 @@ def _from_degrees(
     if not (abs(middle) < 85 and abs(west) <= 360):
         raise TerrainError(f"{what}: its middle is at latitude {middle:g}; degrees must lie between -85 and 85")
     per_lat, per_lon = metres_per_degree(middle)
-    crs = f"+proj=eqc +lat_ts={middle:.6f} +lon_0={west:.6f} +datum=WGS84 +units=m +no_defs"
+    crs = equidistant(middle, west)
     metric = (step[0] * per_lon, step[1] * per_lat)
     if what == JACKSBORO_FILE and config.resolution_m is None:
         config = _at(config, JACKSBORO_RESOLUTION_M)

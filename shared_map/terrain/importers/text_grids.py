@@ -195,6 +195,12 @@ def _bad_line(path: Path, text: str, number: int, layout: _Layout) -> TerrainErr
     return TerrainError(f"terrain {path} holds what are no numbers")
 
 
+def _heights(numbers: Points) -> Floats:
+    """What is too large for float32 becomes infinite, which is a void."""
+    with np.errstate(over="ignore"):
+        return numbers.astype(np.float32)
+
+
 # --- rows of heights ----------------------------------------------------------------------------------------
 
 
@@ -209,7 +215,7 @@ def _rows_of_heights(path: Path, layout: _Layout) -> PlainGrid:
         cells += part.size
         if cells > MAX_CELLS:
             raise TerrainError(f"terrain {path} has more than {MAX_CELLS} heights; crop it")
-        parts.append(part.astype(np.float32))
+        parts.append(_heights(part))
     heights = np.concatenate(parts)
     note = f"{heights.shape[0]} lines of {heights.shape[1]} heights, the first taken for the north"
     return PlainGrid(heights, None, (0.0, 0.0), notes=(note,))
@@ -254,7 +260,7 @@ def _points(path: Path, layout: _Layout) -> PlainGrid:
     for part in _numbers(path, layout) if kept is None else kept:
         col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)
         row = np.rint((down.last - part[:, 1]) / down.step).astype(np.intp)
-        at, z = row * across.count + col, part[:, 2].astype(np.float32)
+        at, z = row * across.count + col, _heights(part[:, 2])
         before = heights[at]
         heights[at] = z
         other = (~np.isnan(before) & (before != z)) | (~np.isnan(z) & (heights[at] != z))

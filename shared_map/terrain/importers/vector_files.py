@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, size
-from swarm.errors import TerrainError
+from swarm.errors import SwarmError, TerrainError
 
 MOST_FEATURES = 500_000
 """Which touch the terrain."""
@@ -28,6 +28,7 @@ _MAGIC = {b"SQLite format 3\0": "GPKG", b"\0\0\x27\x0a": "ESRI Shapefile"}
 """First bytes -> GDAL's driver; a GeoJSON begins with a brace. GDAL knows 80 formats, some of which
 name other files."""
 _IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json")
+_BAD_ZIP = (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError)
 _LONGEST_REASON = 200
 _IDS = ("id", "@id", "osm_id", "osm_way_id", "full_id")
 
@@ -69,7 +70,7 @@ class Features:
 
 def is_vector(path: Path) -> bool:
     """Whether a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
-    with contextlib.suppress(OSError, TerrainError, zipfile.BadZipFile):
+    with contextlib.suppress(OSError, TerrainError, *_BAD_ZIP):
         return _found(path, "") is not None
     return False
 
@@ -145,7 +146,8 @@ def read_features(layer: Layer, bounds: tuple[float, float, float, float], colum
         raise TerrainError(
             f"{layer.what} has {vertices} corners on the terrain, at most {MOST_VERTICES}; simplify it"
         )
-    geometries = shapely.from_wkb(stored, on_invalid="ignore")
+    with np.errstate(all="ignore"):
+        geometries = shapely.from_wkb(stored, on_invalid="ignore")
     found = {str(name): _plain(values) for name, values in zip(meta["fields"], fields, strict=True)}
     ids = [str(number) for number in numbers]
     for name in _IDS:
@@ -163,17 +165,15 @@ def _plain(values: NDArray[Any]) -> list[Any]:
 @contextlib.contextmanager
 def _refused(what: str) -> Iterator[None]:
     """Makes what GDAL says a TerrainError of one sentence."""
-    from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except (DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError, ValueError) as error:
+    except (SwarmError, MemoryError):
+        raise
+    except Exception as error:  # of damaged files pyogrio raises whatever its own code runs into
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise TerrainError(f"{what} is damaged: {lines[0][:_LONGEST_REASON]}") from error
-    except UnicodeDecodeError as error:
-        raise TerrainError(f"{what} is damaged: its text is not {error.encoding}") from error
 
 
 # --- which file ---------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ def _source(path: Path, what: str) -> str:
     check_bytes(path, FileKind.VECTORS)
     try:
         found = _found(path, what)
-    except zipfile.BadZipFile as error:
+    except _BAD_ZIP as error:
         raise TerrainError(f"{what} is damaged or no .zip: {error}") from error
     except OSError as error:
         raise FileKind.VECTORS.unreadable(path, error) from error

@@ -126,7 +126,7 @@ class _Drawings:
     """What is drawn of a file, by what becomes of it."""
 
     def __init__(self) -> None:
-        self.values, self.lethal, self.bridges = Drawing(), Drawing(), Drawing()
+        self.values, self.lethal, self.bridges = Drawing(False), Drawing(True), Drawing(False)
 
     def burnt(self, grid: GridSpec, what: str, facts: FileFacts, zone: ZoneConfig) -> Burnt:
         return Burnt(
@@ -167,11 +167,11 @@ def _draw(
             continue
         width_cells = item.width_m / grid.resolution_m
         if item.factor is None:
-            drawings.lethal.add(shape, 1.0, width_cells, everywhere=True)
+            drawings.lethal.add(shape, 1.0, width_cells)
         else:
-            drawings.values.add(shape, item.factor, width_cells, everywhere=False)
+            drawings.values.add(shape, item.factor, width_cells)
         if item.bridge:
-            drawings.bridges.add(shape, 1.0, width_cells, everywhere=False)
+            drawings.bridges.add(shape, 1.0, width_cells)
     facts.bridges += sum(item.bridge for item in wanted.values())
     return {features.ids[n] for n in wanted}
 

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from swarm.errors import ConfigError
+from swarm.places import read_place
 from swarm.wire.fields import (
     IDS,
     Bounded,
@@ -32,6 +34,8 @@ ZoneName = Annotated[str, Meta(max_length=40)]
 """Empty where none is given."""
 _ZONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
 Corners = Annotated[list[tuple[Metres, Metres]], Meta(max_length=MOST_CORNERS)]
+PlaceText = Annotated[str, Meta(max_length=80)]
+"""A place as `swarm.places` reads it: "46.81,9.84" (latitude, longitude), "xy:X,Y" in metres of the map."""
 _Pace = Annotated[float, Meta(ge=PACE_LEAST, le=PACE_MOST)]
 _Seconds = Annotated[float, Meta(gt=0, le=1e9)]
 
@@ -44,6 +48,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
                   `pace_s_per_m`, whatever is found there
     polygon       corners [row, col]; (0, 0) is the north-west corner of the terrain, (1, 1) of the cell one further
     polygon_m     corners [x_m, y_m] instead, as poses have them
+    corners       places instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
     lasts_s       after so long the zone ends by itself; without it never
     """
 
@@ -54,6 +59,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     polygon: Corners = []
     polygon_m: Corners = []
     lasts_s: _Seconds | None = None
+    corners: Annotated[list[PlaceText], Meta(max_length=MOST_CORNERS)] = []
 
     def relate(self) -> None:
         if self.name and _ZONE_NAME.fullmatch(self.name) is None:
@@ -62,13 +68,22 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
             raise ValueError("name is missing: which zone is to be removed?")
         if self.action != "add":
             return
-        if bool(self.polygon) == bool(self.polygon_m):
-            raise ValueError("give either polygon or polygon_m")
-        corners = len(self.polygon or self.polygon_m)
+        if bool(self.polygon) + bool(self.polygon_m) + bool(self.corners) != 1:
+            raise ValueError("give either polygon or polygon_m or corners")
+        for place in self.corners:
+            _check_place("corners", place)
+        corners = len(self.polygon or self.polygon_m or self.corners)
         if corners < 3:
             raise ValueError(f"polygon has {corners} corners, expected 3 ... {MOST_CORNERS}")
         if (self.kind == "pace") != (self.pace_s_per_m is not None):
             raise ValueError("pace_s_per_m goes with kind pace, and only with it")
+
+
+def _check_place(name: str, place: str) -> None:
+    try:
+        read_place(place, name)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
 
 
 class Zone(Bounded, frozen=True, kw_only=True):
@@ -145,6 +160,7 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
 
     subject   None only asks what is ordered
     row, col  instead of a cell
+    at        a place instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
     new       the target must not be there yet; otherwise it must
     """
 
@@ -159,16 +175,20 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
     walk: SimulatedWalk = _WALK
     speed_m_per_s: _Speed = _SPEED_M_PER_S
     new: bool = False
+    at: PlaceText = ""
 
     def relate(self) -> None:
         if self.name:
             check_id("name", self.name)
         elif self.subject not in (None, "pause"):
             raise ValueError(f"name is missing: which {self.subject} is it about?")
-        if (self.row is None) != (self.col is None) or (self.row is not None and self.cell is not None):
-            raise ValueError("give either cell, or row and col")
-        if self.subject == "target" and not self.off and self.cell is None and self.row is None:
-            raise ValueError("give the target's place: cell, or row and col")
+        places = (self.row is not None) + (self.cell is not None) + bool(self.at)
+        if (self.row is None) != (self.col is None) or places > 1:
+            raise ValueError("give either cell, or row and col, or at")
+        if self.at:
+            _check_place("at", self.at)
+        if self.subject == "target" and not self.off and not places:
+            raise ValueError("give the target's place: cell, or row and col, or at")
 
 
 class Orders(Message, frozen=True, kw_only=True, tag=schema_of("orders")):

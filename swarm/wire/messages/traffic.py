@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Plot, VehicleId
+from swarm.wire.fields import IDS, LARGE, SMALL, Bounded, Cell, Id, Natural, Part, Plot, VehicleId
 from swarm.wire.messages.base import Message, schema_of
 
 Stamp = tuple[Natural, Natural]
@@ -17,7 +17,7 @@ Held = Annotated[list[Cell], Meta(max_length=64)]
 Milliseconds = Annotated[int, Meta(ge=0, lt=1 << 32)]
 
 
-class Stand(Bounded, frozen=True, array_like=True):
+class Stand(Part, frozen=True, array_like=True):
     """One vehicle, as its host tells it to the members of one plot.
 
     cell    where it stands, and `end` where what it holds ends; both may lie in another plot

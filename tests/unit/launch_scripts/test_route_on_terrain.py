@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.query import app
 from launch_scripts.commands.reach import corridor
-from launch_scripts.commands.route_files import profile_of
+from launch_scripts.commands.route_files import DescribedRoute, metres_along, profile_of, write_route
 from launch_scripts.commands.route_on_terrain import find_route
 from launch_scripts.commands.terrain import app as terrain_app
 from launch_scripts.launcher.options import find_scenario
@@ -187,3 +187,28 @@ def cheapest_s(pace: NDArray[np.float32], side_m: float, root: tuple[int, int], 
     ends = (np.concatenate(each) for each in ((tos, froms) if to else (froms, tos)))
     graph = csr_array((np.concatenate(seconds), tuple(ends)), shape=(rows * cols, rows * cols))
     return np.asarray(dijkstra(graph, indices=cells[root]).reshape(rows, cols), np.float64)
+
+
+def test_a_route_across_180_degrees_is_one_line(tmp_path: Path) -> None:
+    grid = GridSpec(10, 200, 100.0, 170_000.0, 8_200_000.0, "EPSG:32701")
+    cells = np.arange(5 * 200, 6 * 200)
+    route = DescribedRoute("across", grid, cells, 1.0, 1.0, metres_along(grid, cells))
+    for ending in ("geojson", "gpx", "kml", "csv"):
+        write_route(route, tmp_path / f"way.{ending}")
+    (feature,) = json.loads((tmp_path / "way.geojson").read_text())["features"]
+    lon = np.array(feature["geometry"]["coordinates"])[:, 0]
+    assert lon[0] < 180 < lon[-1]
+    assert np.abs(np.diff(lon)).max() < 0.01
+    points = ElementTree.parse(tmp_path / "way.gpx").iter("{http://www.topografix.com/GPX/1/1}trkpt")
+    within = np.array([float(point.attrib["lon"]) for point in points])
+    assert np.abs((within - lon + 180) % 360 - 180).max() < 1e-7
+    assert -180 <= within.min() < within.max() < 180
+    line = next(ElementTree.parse(tmp_path / "way.kml").iter("{http://www.opengis.net/kml/2.2}LineString"))
+    # The order that the schema asks for; heights are not known here.
+    assert [each.tag.rpartition("}")[2] for each in line] == ["tessellate", "altitudeMode", "coordinates"]
+    assert all(point.count(",") == 1 for point in (line[2].text or "").split())
+    with pytest.raises(SwarmError, match="a picture needs the terrain"):
+        write_route(route, tmp_path / "way.png")
+    site = DescribedRoute("site", GridSpec(9, 9, 1.0), np.arange(9), 1.0, 1.0, np.arange(9.0))
+    with pytest.raises(SwarmError, match="has no place on Earth"):
+        write_route(site, tmp_path / "way.kml")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from launch_scripts.commands.route_on_terrain import find_route
 from launch_scripts.commands.terrain import app
 from shared_map.terrain.slope_rules import SLOPE_RULES
 from swarm.config.cost_rules import PRESETS
@@ -62,3 +64,26 @@ def test_a_scenario_that_is_none_is_refused(tmp_path: Path) -> None:
         runner.invoke(app, ["rules", "nowhere"], catch_exceptions=False)
     with pytest.raises(ConfigError, match=r"write \.png"):
         runner.invoke(app, ["rules", "--picture", str(tmp_path / "a.gif")], catch_exceptions=False)
+
+
+def test_a_terrain_file_is_told_its_vehicles_by_an_option_and_a_scenario_says_them_itself(tmp_path: Path) -> None:
+    file = tmp_path / "hill.npz"
+    row, col = np.mgrid[:20, :20]
+    np.savez(file, elevation=(0.1 * 10.0 * col + 0.3 * row).astype(np.float32), resolution_m=10.0)
+
+    def told(*words: object) -> dict[str, float]:
+        result = runner.invoke(app, [*map(str, words), "--json"], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return json.loads(result.output)
+
+    assert told("info", file)["preset"] == "none"
+    facts = told("info", file, "--preset", "hiker")
+    assert (facts["slope_rule"], facts["preset"]) == ("tobler", "hiker")
+    there = ("reach", file, "--to", "cell:10,10")
+    assert told(*there, "--preset", "hiker")["longest_s"] > 8 * told(*there)["longest_s"]
+    on_foot, driven = (find_route(str(file), "cell:1,1", "cell:10,15", preset).cost_s for preset in ("hiker", None))
+    assert on_foot > 8 * driven
+    with pytest.raises(ConfigError, match=r"no preset 'hikr'; did you mean 'hiker'\?; there are hiker, wheeled"):
+        told("info", file, "--preset", "hikr")
+    with pytest.raises(ConfigError, match=r"in the scenario jacksboro set cost\.preset"):
+        told("reach", "jacksboro", "--to", "cell:1,1", "--preset", "hiker")

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from support import slow_twins
 
 from planner_service.target_tree import TargetTree
+from shared_map.terrain.layers import terrain_pace
 from shared_map.terrain.slope_rules import SLOPE_RULES
 from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.scenario import CostConfig, PlannerConfig
@@ -104,3 +106,30 @@ def test_a_pit_can_be_entered_and_not_left() -> None:
     assert tree.routes([outside])[0].status is RouteStatus.OK
     tree.update(pace, outside, [], 0)
     assert tree.routes([inside])[0].status is not RouteStatus.OK
+
+
+@pytest.mark.parametrize("rule", SLOPE_RULES)
+@pytest.mark.parametrize("directional", [False, True])
+def test_certificates_hold_while_the_tree_follows_a_target_by_windows(rule: str, directional: bool) -> None:
+    rng = np.random.default_rng(40 + sorted(SLOPE_RULES).index(rule))
+    climb = climbs(rule, landscape(rng)) if directional else None
+    grades = np.abs(rng.normal(0, 0.3, (GRID.rows, GRID.cols))).astype(np.float32)
+    table = {"slope_table": ((-30.0, 0.6), (0.0, 1.0), (20.0, 4.0))} if rule == "table" else {}
+    pace = terrain_pace(grades, np.zeros(grades.shape, np.uint8), CostConfig(slope_rule=rule, **table))
+    tree = TargetTree(GRID, PlannerConfig(strategy="rotation", k_min=0), climb)
+    root = int(np.flatnonzero(np.isfinite(pace))[30])
+    served = 0
+    for version in range(4):
+        tree.update(pace, root, [], version)
+        if climb is None:
+            best = slow_twins.cost_to_go(pace, root).reshape(-1) * GRID.resolution_m
+        else:
+            best = optimum(pace, climb, root)
+        for route in tree.routes(np.arange(0, GRID.cells, 3)):
+            if route.status is RouteStatus.OK:
+                assert route.lower_bound_s <= best[route.start] * (1 + 1e-6)
+                assert route.cost_s >= best[route.start] * (1 - 1e-4)
+                served += 1
+        near = [cell for _, cell in GRID.neighbours(root) if np.isfinite(pace.reshape(-1)[cell])]
+        root = near[version % len(near)]
+    assert served > 50

@@ -12,8 +12,9 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from shared_map.terrain.importers.level_ground import level_ground, undeclared_voids
+from shared_map.terrain.importers.level_ground import level_ground
 from shared_map.terrain.importers.rasters import read_elevation
+from shared_map.terrain.importers.voids import undeclared_voids
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 
@@ -115,3 +116,72 @@ def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(m
     _, level, _ = _looked_at(heights, 1.0, TerrainConfig(source="dem.asc"))
     assert level.shape == heights.shape
     assert (level != (heights == 40)).mean() < 0.03
+
+
+def test_a_vrt_that_paints_the_same_pixels_many_times_is_refused(tmp_path: Path) -> None:
+    written(tmp_path / "dem.tif")
+    head, _, rest = VRT.partition("<SimpleSource>")
+    source = "<SimpleSource>" + rest[: rest.index("</VRTRasterBand>")].format("dem.tif")
+    path = tmp_path / "dem.vrt"
+    path.write_text(head + source * 30 + rest[rest.index("</VRTRasterBand>") :], encoding="utf-8")
+    assert np.array_equal(read_elevation(path, TerrainConfig(source=str(path))).elevation_m, HEIGHTS)
+    other = tmp_path / "other.vrt"
+    other.write_text(VRT.format("dem.vrt"), encoding="utf-8")
+    assert np.array_equal(read_elevation(other, TerrainConfig(source=str(other))).elevation_m, HEIGHTS)
+    path.write_text(head + source * 40 + rest[rest.index("</VRTRasterBand>") :], encoding="utf-8")
+    for file in (path, other):
+        with pytest.raises(TerrainError, match="paints its pixels 40 times over"):
+            read_elevation(file, TerrainConfig(source=str(file)))
+
+
+def test_a_vrt_that_names_itself_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "dem.vrt"
+    path.write_text(VRT.format("dem.vrt"), encoding="utf-8")
+    with pytest.raises(TerrainError, match="more than 4 deep"):
+        read_elevation(path, TerrainConfig(source=str(path)))
+
+
+def test_a_sparse_file_is_read_and_a_cut_one_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.tif"
+    kind = {"driver": "GTiff", "count": 1, "dtype": "float32", "nodata": -1.0, "tiled": True, "sparse_ok": True}
+    place = {"crs": "EPSG:32632", "transform": from_origin(500_000, 5_000_000, 30, 30)}
+    with rasterio.open(path, "w", width=512, height=512, blockxsize=256, blockysize=256, **kind, **place) as file:
+        file.write(
+            np.add.outer(np.arange(256.0), np.arange(256.0)).astype(np.float32)[None], window=((0, 256), (256, 512))
+        )
+    found = read_elevation(path, TerrainConfig(source=str(path))).elevation_m
+    assert np.isnan(found).mean() == 0.75
+    assert found[0, 256:].tolist() == list(range(256))
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(TerrainError, match="is truncated"):
+        read_elevation(path, TerrainConfig(source=str(path)))
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [
+        ("[m]", 1),
+        ("US survey foot", 1200 / 3937),
+        ("US_survey_foot", 1200 / 3937),
+        ("ft (US)", 1200 / 3937),
+        ("cm.", 0.01),
+    ],
+)
+def test_units_are_known_however_they_are_written(tmp_path: Path, unit: str, metres: float) -> None:
+    path = written(tmp_path / "dem.tif")
+    with rasterio.open(path, "r+") as file:
+        file.units = (unit,)
+    raster = read_elevation(path, TerrainConfig(source=str(path)))
+    np.testing.assert_allclose(raster.elevation_m, HEIGHTS * metres, rtol=1e-6)
+    assert not any("unknown" in note for note in raster.notes)
+
+
+def test_a_sea_floor_is_doubted(tmp_path: Path) -> None:
+    from shared_map.terrain.terrain import build_terrain
+    from shared_map.terrain.terrain_report import doubts_about, facts_of
+    from swarm.config.scenario import Scenario
+
+    path = str(written(tmp_path / "deep.tif", HEIGHTS * 8 - 600))
+    for water_below_m, told in ((None, 1), (0.0, 0)):
+        terrain = build_terrain(Scenario(terrain=TerrainConfig(source=path, water_below_m=water_below_m)))
+        assert sum("a sea floor" in doubt for doubt in doubts_about(facts_of(terrain))) == told

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.store import KeeperStore
+from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.load import parse_scenario
+from swarm.grid import GridSpec
 from swarm.liveness import Peer
+from swarm.places import brief
+from swarm.wire.codec import decode, encode
 from swarm.wire.messages.orders import GiveOrder, Order, Orders
 from swarm.wire.topics import GIVE_ORDER
 
@@ -23,9 +29,11 @@ PACE[3, 4] = np.inf
 class BookWorld(SwarmModel):
     """Keepers, and a person who gives orders."""
 
-    def __init__(self) -> None:
+    def __init__(self, grid: GridSpec | None = None) -> None:
         scenario = parse_scenario("[[targets]]\ncount = 2\n[[groups]]\nvehicles = 2")
-        super().__init__(terrain=terrain_of_pace(PACE), scenario=scenario)
+        terrain = terrain_of_pace(PACE)
+        terrain = terrain if grid is None else dataclasses.replace(terrain, grid=grid)
+        super().__init__(terrain=terrain, scenario=scenario)
         self.person = self.bus("person")
 
     def give(self, keeper: str = "k", **fields: Any) -> list[Order] | str | None:
@@ -100,3 +108,21 @@ def test_vehicles_of_agents_that_joined_later_are_stopped_too() -> None:
     world.run(0.2)
     assert isinstance(world.give(subject="vehicle", name="guest-03"), list)
     assert isinstance(world.give(subject="vehicle", name="a0-77"), str)
+
+
+PLACED = GridSpec(20, 30, 10.0, 500_000.0, 5_200_000.0, "EPSG:32632")
+
+
+@pytest.mark.parametrize("place", [brief(MapFrame(PLACED), 95), "xy:500053.5,5199967.0", "cell:3,5", "3,5"])
+def test_a_target_is_put_at_a_place(place: str) -> None:
+    world = BookWorld(PLACED)
+    world.keeper("k", KeeperStore(":memory:"))
+    order = decode(encode(GiveOrder(subject="target", name="x", at=place, new=True)), GiveOrder)
+    (given,) = world.give(subject=order.subject, name=order.name, at=order.at, new=order.new) or ()
+    assert isinstance(given, Order)
+    assert given.cell == 95
+    refusal = world.give(subject="target", name="y", at="47.5,9.0", new=True)
+    assert "target y: at is '47.5,9.0', outside the terrain: latitude 46.9" in str(refusal)
+    for wrong in ({"at": "there"}, {"at": "1,1", "cell": 3}, {}):
+        with pytest.raises(ValueError, match=r"at is 'there'|give either cell|or at"):
+            GiveOrder(subject="target", name="x", **wrong).relate()

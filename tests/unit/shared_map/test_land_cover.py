@@ -211,6 +211,7 @@ def test_codes_of_ones_own_come_from_the_scenario_or_a_csv_file(tmp_path: Path, 
         ("1,-2", "line 1: '-2' is no ground"),
         ("1,nan", "line 1: 'nan' is no ground"),
         ("1", "line 1: '' is no ground"),
+        ("1O,forest\n2,rock", "line 1: '1O' is no code"),
         ("code,class\nx,rock", "line 2: 'x' is no code"),
         ("70000,rock", "code 70000 is too large"),
         ("code,class\n", "has no line of code and class"),
@@ -336,6 +337,19 @@ def test_a_drawing_in_other_colours_is_refused_as_land_cover_and_not_read_as_a_p
     notes = load(dem, photo=str(path)).notes
     assert said(notes, "no classes are read from it")
     assert said(notes, "terrain.cover")
+
+
+@pytest.mark.parametrize("step", [13.0, 20.0, 31.0])
+def test_a_drawing_is_known_by_its_own_pixels_and_not_by_what_resampling_leaves(
+    tmp_path: Path, dem: Path, step: float
+) -> None:
+    path = drawn(tmp_path / "drawn.tif", patches([11, 31, 42]), "nlcd")
+    with rasterio.open(path, "r+") as file:
+        file.write(file.read()[::-1] // 2)
+        file.transform = from_origin(500_000, 5_000_000, step, step)
+    source = load(dem, photo=str(path))
+    assert said(source.notes, "the photo is a drawn map: it has 3 colours")
+    assert (source.classes == TerrainClass.UNKNOWN).all()
 
 
 # --- a land-cover map as the terrain ------------------------------------------------------------------------

@@ -14,9 +14,10 @@ from support.height_models import SIDE, hills, is_water, load, written
 from launch_scripts.bench.water import counted
 from launch_scripts.bench.water_models import MODELS, UNKNOWABLE
 from shared_map.terrain.importers import level_ground as module
-from shared_map.terrain.importers.level_ground import level_ground, undeclared_voids
+from shared_map.terrain.importers.level_ground import level_ground
 from shared_map.terrain.importers.plain_files import read_npz
 from shared_map.terrain.importers.sources import _jacksboro_path
+from shared_map.terrain.importers.voids import undeclared_voids
 
 # --- level ground -------------------------------------------------------------------------------------------
 
@@ -134,6 +135,26 @@ def test_a_code_that_is_far_from_all_heights_is_a_void(code: int) -> None:
     assert undeclared_voids(heights) == ()
     heights[:20] = code
     assert undeclared_voids(heights) == (code,)
+
+
+def test_a_sea_at_zero_stored_in_centimetres_is_no_void(tmp_path: Path) -> None:
+    """The lowest beach is 40 cm high: 40 of the file's units are no gap of 40 m."""
+    import rasterio
+
+    ground = np.maximum(hills(8, 900) - 300, 0)
+    ground[ground > 0] += 0.4
+    path = written(tmp_path / "cm.tif", np.round(ground * 100), "int32")
+    with rasterio.open(path, "r+") as file:
+        file.units = ("cm",)
+    source = load(path)
+    assert not np.isnan(source.elevation_m).any()
+    assert is_water(source).mean() == pytest.approx((ground == 0).mean(), abs=0.01)
+
+
+def test_what_is_beyond_all_heights_hides_no_code() -> None:
+    heights = 400 + hills(6, 300)
+    heights[0], heights[1] = -3.4e38, -9999
+    assert undeclared_voids(heights) == (-9999,)
 
 
 def test_two_codes_are_both_found() -> None:

@@ -12,8 +12,10 @@ import rasterio
 import shapely
 from rasterio.transform import Affine, from_origin
 from rasterio.warp import transform as to_crs
-from support.zone_shapes import UTM, feature, geojson, painted, written
+from support.zone_shapes import UTM, feature, geojson, middles, painted, written
 
+from shared_map.terrain.importers.zone_outlines import outlines_of
+from shared_map.terrain.layers import polygon_mask
 from swarm.config.scenario import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -199,3 +201,31 @@ def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> 
     local = GridSpec(UTM.rows, UTM.cols, 10.0, UTM.west_m, UTM.north_m)
     pace, _ = painted([ZoneConfig(kind="factor", file=nowhere, crs="local")], local)
     np.testing.assert_allclose(pace[[10, 11, 12], 20], [0.1, np.inf, 0.3])
+
+
+# --- areas for orders ---------------------------------------------------------------------------------------
+
+
+def test_areas_of_a_file_become_rings_that_a_keeper_takes(tmp_path: Path) -> None:
+    star = shapely.Polygon([(5, 5), (15, 6), (14, 15), (6, 14)])
+    overlapping = [shapely.box(25, 5, 35, 12), shapely.box(30, 10, 40, 20)]
+    file = geojson(tmp_path / "a.geojson", [feature(each) for each in (star, *overlapping)], crs="EPSG:4326")
+    rings = outlines_of(Path(file), UTM, None, None, 256)
+    assert sorted(len(ring) for ring in rings) == [4, 8]
+    for ring, shape in zip(sorted(rings, key=len), (star, shapely.union_all(overlapping)), strict=True):
+        corners = tuple((10.0 * col, 10.0 * row) for row, col in ring)
+        clear = shapely.distance(shape.boundary, middles()) > 0.02
+        assert (polygon_mask(corners, UTM) == shapely.contains(shape, middles()))[clear].all()
+    round_ = geojson(tmp_path / "b.geojson", [feature(shapely.Point(20, 20).buffer(15, 500))])
+    (ring,) = outlines_of(Path(round_), UTM, None, None, 256)
+    assert 20 < len(ring) <= 256
+    hole = geojson(tmp_path / "c.geojson", [feature(shapely.box(1, 1, 9, 9) - shapely.box(3, 3, 5, 5))])
+    with pytest.raises(TerrainError, match="an area with a hole, which an order cannot have"):
+        outlines_of(Path(hole), UTM, None, None, 256)
+    line = geojson(tmp_path / "d.geojson", [feature(shapely.LineString([(1, 1), (5, 5)]))])
+    with pytest.raises(TerrainError, match="holds no area on the terrain"):
+        outlines_of(Path(line), UTM, None, None, 256)
+    comb = shapely.union_all([shapely.box(n, 1, n + 0.5, 20) for n in range(1, 40)] + [shapely.box(1, 19, 40, 21)])
+    teeth = geojson(tmp_path / "e.geojson", [feature(comb)])
+    with pytest.raises(TerrainError, match=r"of 1\d\d corners, at most 64 are ordered; simplify it"):
+        outlines_of(Path(teeth), UTM, None, None, 64)

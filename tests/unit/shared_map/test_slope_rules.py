@@ -4,6 +4,7 @@ others."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from shared_map.terrain.slope_rules import (
     slope_factor,
 )
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from shared_map.terrain.terrain import build_terrain
+from shared_map.terrain.terrain import build_terrain, terrain_of_pace
+from shared_map.terrain.terrain_report import doubts_about, facts_of
 from swarm.config.cost_rules import PRESETS, check_cost, cost_of_preset
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import CostConfig
@@ -198,6 +200,20 @@ def test_a_step_of_just_the_limit_is_allowed_and_a_hair_more_is_not() -> None:
             climb = climb_on(np.array([[0.0, rise_m * share]]), cost)
             assert climb.allows(0, 1) == climb.allows(1, 0) == allowed
     assert "none is steeper than 60 degrees up or 60 degrees down" in climb.note
+
+
+def test_the_report_tells_how_much_of_the_ground_can_be_entered_and_left_again() -> None:
+    level = terrain_of_pace(np.full((30, 40), 0.1, np.float32))
+    heights = np.zeros((30, 40), np.float32)
+    heights[:, :20] = 3.0  # 17 degrees down, not up
+    both = CostConfig(directional=True, max_slope_deg=30.0)
+    one_way = CostConfig(directional=True, max_climb_deg=10.0, max_slope_deg=30.0)
+    for cost, share, doubts in ((both, 1.0, 0), (one_way, 0.5, 1)):
+        facts = facts_of(replace(level, elevation_m=heights, climb=climb_on(heights, cost)))
+        assert facts["both_ways_share"] == share
+        assert sum("cost.max_climb_deg" in doubt for doubt in doubts_about(facts)) == doubts
+    up_the_edge, steps = 30 + 2 * 29, 2 * (30 * 39 + 29 * 40 + 2 * 29 * 39)  # diagonal ones climb 12 degrees
+    assert facts["too_steep_steps_share"] == pytest.approx(up_the_edge / steps, abs=1e-4)
 
 
 # --- across the way ---------------------------------------------------------------------------------------------

@@ -13,7 +13,8 @@ import rasterio
 from rasterio.transform import Affine, from_origin
 
 from launch_scripts.commands.terrain import info
-from shared_map.terrain.importers.sources import FILE_KINDS, Source, load_source, metres_per_degree
+from shared_map.terrain.importers.degrees import metres_per_degree
+from shared_map.terrain.importers.sources import FILE_KINDS, Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.describe import meanings
@@ -252,8 +253,8 @@ def a_folder(folder: Path) -> dict[str, Any]:
 
 
 def strange_ending(folder: Path) -> dict[str, Any]:
-    (folder / "a.xyz").write_text("1 2 3")
-    return {"source": folder / "a.xyz"}
+    (folder / "a.qqq").write_text("1 2 3")
+    return {"source": folder / "a.qqq"}
 
 
 def wrong_crs(folder: Path) -> dict[str, Any]:
@@ -316,7 +317,7 @@ def photo_of_nan(folder: Path) -> dict[str, Any]:
         (no_raster, "no raster"),
         (missing, "nowhere.tif does not exist"),
         (a_folder, "is a folder"),
-        (strange_ending, ".xyz is unknown; give .tif"),
+        (strange_ending, ".qqq is unknown; give .tif"),
         (wrong_crs, "'EPSG:banana' is no coordinate system"),
         (coarser_than_all, "no cell of 5000 m fits"),
         (labels_without_photo, "needs a photo"),
@@ -356,3 +357,11 @@ def test_jacksboro_from_its_file_is_jacksboro() -> None:
 def test_the_words_about_kinds_of_files_name_every_reader() -> None:
     for text in (meanings(TerrainConfig)["source"], info.__doc__ or ""):
         assert set(re.findall(r"\.[a-z0-9]{2,4}\b", text)) >= set(FILE_KINDS.split(", "))
+
+
+def test_the_built_in_terrain_lies_where_its_degrees_are() -> None:
+    from rasterio.warp import transform
+
+    grid = load("jacksboro").grid
+    (lon,), (lat,) = transform(grid.crs, "EPSG:4326", [grid.west_m], [grid.north_m])
+    assert (lon, lat) == (pytest.approx(-84.41375, abs=1e-7), pytest.approx(36.73291667, abs=1e-7))

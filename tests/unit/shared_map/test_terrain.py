@@ -158,13 +158,18 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
     import re
 
     import rasterio
+    import rasterio.warp
+    import shapely
+    from pyogrio.raw import write
     from rasterio.transform import from_origin
 
     text = (Path(__file__).parents[3] / "docs" / "tutorial" / "terrain.md").read_text()
     blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     (tmp_path / "mine.toml").write_text("".join(blocks))
-    base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(5e5, 5e6, 20, 20)}
+    # The north-east corner of its no-go area is then 900 m east and 100 m south of the north-west one of the map.
+    (x_m,), (y_m,) = rasterio.warp.transform("EPSG:4326", "EPSG:32632", [9.03], [46.93])
+    base = {"driver": "GTiff", "crs": "EPSG:32632", "transform": from_origin(x_m - 900, y_m + 100, 20, 20)}
     with rasterio.open(tmp_path / "dem.tif", "w", height=60, width=70, count=1, dtype="float32", **base) as file:
         file.write(np.random.default_rng(1).uniform(0, 2, (60, 70)).astype(np.float32), 1)
     with rasterio.open(tmp_path / "photo.tif", "w", height=60, width=70, count=3, dtype="uint8", **base) as file:
@@ -175,6 +180,13 @@ def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
         tmp_path / "roads.png", "w", driver="PNG", height=60, width=70, count=1, dtype="uint8"
     ) as file:
         file.write(roads, 1)
+    # A river along the sixth column, from the sixth row to the 45th.
+    west_m, north_m = x_m - 900, y_m + 100
+    course = [(west_m + 110, north_m - 100), (west_m + 110, north_m - 900)]
+    river = shapely.to_wkb(np.array([shapely.LineString(course)]))
+    columns = {"field_data": [np.array(["river"])], "fields": ["waterway"], "geometry_type": "LineString"}
+    write(tmp_path / "extract.gpkg", geometry=river, layer="lines", crs="EPSG:32632", **columns)
     terrain = build_terrain(load_scenario(tmp_path / "mine.toml"))
+    assert np.isinf(terrain.pace_s_per_m[5:45, 5]).all()
     assert (terrain.pace_s_per_m[30, 45:] == np.float32(0.05)).all()
     assert np.isinf(terrain.pace_s_per_m[20, 40])

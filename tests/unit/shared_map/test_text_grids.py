@@ -167,3 +167,25 @@ def test_many_points_are_read_twice_instead_of_being_held(tmp_path: Path, monkey
     np.testing.assert_array_equal(plain.heights, GROUND)
     with pytest.raises(TerrainError, match="line 110: 'what' is no number"):
         read_text_grid(wrote(tmp_path / "b.csv", text_of(POINTS, ",", "x,y,z") + "1,2,what\n"))
+
+
+def test_degrees_lie_where_they_say_in_text_and_in_rasters(tmp_path: Path) -> None:
+    """The same degrees as points and as a raster become the same ground at the same place, in true metres."""
+    import rasterio.warp
+
+    place = from_origin(9.0, 46.5, 1 / 900, 1 / 1200)
+    ground = np.add.outer(np.arange(60) * 3.0, np.arange(50) * -2.0) + 500
+    raster = load(written(tmp_path / "a.tif", ground, crs="EPSG:4326", transform=place), resolution_m=90.0)
+    lon, lat = 9.0 + (np.arange(50) + 0.5) / 900, 46.5 - (np.arange(60) + 0.5) / 1200
+    points = [(a, b, ground[i, j]) for i, b in enumerate(lat) for j, a in enumerate(lon)]
+    text = load(wrote(tmp_path / "a.csv", text_of(points, ",", "lon,lat,z")), resolution_m=90.0)
+    assert (text.grid.rows, text.grid.cols) == (raster.grid.rows, raster.grid.cols)
+    # GDAL widens its kernel where cells grow, by a twentieth here: 0.05 of a pixel of 2 m.
+    np.testing.assert_allclose(text.elevation_m, raster.elevation_m, atol=0.12)
+    for grid in (text.grid, raster.grid):
+        corner = rasterio.warp.transform(grid.crs, "EPSG:4326", [grid.west_m], [grid.north_m])
+        np.testing.assert_allclose(np.ravel(corner), (9.0, 46.5), atol=2e-8)
+        # In a system of true metres, along the side: within 30 ppm over five kilometres.
+        south_m = grid.north_m - grid.rows * grid.resolution_m
+        _, ys = rasterio.warp.transform(grid.crs, "EPSG:32632", [0.0, 0.0], [grid.north_m, south_m])
+        assert (ys[0] - ys[1]) / 0.9996 == pytest.approx(grid.rows * 90.0, rel=3e-5)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from rasterio.warp import transform as to_crs
 from scipy import ndimage
@@ -36,7 +36,7 @@ def blobs(draw: st.DrawFn) -> Any:
     return shapely.Polygon(outer, [hole])
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(blobs(), st.sampled_from(["EPSG:4326", "EPSG:32632", "EPSG:3857"]))
 def test_areas_cover_the_cells_whose_middle_they_hold_and_lethal_ones_all_that_they_touch(
     tmp_path_factory: pytest.TempPathFactory, blob: Any, crs: str
@@ -54,7 +54,7 @@ def test_areas_cover_the_cells_whose_middle_they_hold_and_lethal_ones_all_that_t
     assert np.isfinite(closed[beyond]).all()
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(-10, 60), st.floats(-10, 50)), min_size=2, max_size=6, unique=True),
     st.integers(5, 900).map(lambda tenths: tenths / 10),
@@ -318,3 +318,51 @@ def test_a_terrain_across_180_degrees_has_zones_on_both_sides(tmp_path: Path) ->
     (tmp_path / "uncut.geojson").write_text(json.dumps(uncut))
     with pytest.raises(TerrainError, match=r"feature 0 of a forbidden zone cannot be used: an edge .* 180 degrees"):
         painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "uncut.geojson"))], grid)
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    st.lists(st.floats(8, 42), min_size=3, max_size=7),
+    st.lists(st.tuples(st.floats(0, 50), st.floats(0, 40)), min_size=2, max_size=6, unique=True),
+    st.sampled_from([0.5, 4.0, 15.0, 60.0]),
+)
+def test_no_road_crosses_a_river_without_a_bridge(
+    tmp_path_factory: pytest.TempPathFactory, bends: list[float], roads: list[tuple[float, float]], width_m: float
+) -> None:
+    rows = np.linspace(-2, UTM.rows + 2, len(bends))
+    river = shapely.LineString(np.stack([bends, rows], axis=1))
+    way = shapely.LineString([(-3, 20), *roads, (53, 20)])
+    features = [feature(river, waterway="river", width=width_m), feature(way, highway="primary", width=9)]
+    file = geojson(tmp_path_factory.mktemp("zone") / "a.geojson", features)
+    pace, _ = painted([ZoneConfig(kind="water", file=file), ZoneConfig(kind="road", file=file)])
+    parts, _ = ndimage.label(np.isfinite(pace), np.ones((3, 3)))
+    assert not np.intersect1d(parts[:, 0], parts[:, -1]).any()
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    st.floats(-0.7, 0.7),
+    st.floats(20, 30),
+    st.floats(18, 22),
+    st.floats(0, 1),
+    st.sampled_from([1.0, 8.0, 20.0, 70.0]),
+)
+@example(lean=0.0, col=20.0, row=19.0, turn=0.0, width_m=1.0)
+def test_a_bridge_as_long_as_its_river_is_wide_joins_both_banks(
+    tmp_path_factory: pytest.TempPathFactory, lean: float, col: float, row: float, turn: float, width_m: float
+) -> None:
+    """Where road and river meet at 45 degrees or more."""
+    river = shapely.LineString([(col - 60 * lean, row - 60), (col + 60 * lean, row + 60)])
+    slope = np.tan((turn - 0.5) * (np.pi / 2 - 2 * abs(np.arctan(lean))) * 0.9)
+    road = shapely.LineString([(col - 60, row - 60 * slope), (col + 60, row + 60 * slope)])
+    over = road.intersection(river.buffer(width_m / 2 / UTM.resolution_m))
+    features = [
+        feature(river, waterway="river", width=width_m),
+        feature(over, highway="primary", bridge="yes"),
+        *(feature(each, highway="primary") for each in shapely.get_parts(road.difference(over))),
+    ]
+    file = geojson(tmp_path_factory.mktemp("zone") / "a.geojson", features)
+    pace, _ = painted([ZoneConfig(kind="road", file=file), ZoneConfig(kind="water", file=file)])
+    parts, _ = ndimage.label(np.isfinite(pace))
+    assert parts[int(row), 1] != 0 or parts[:, 0].any()
+    assert np.intersect1d(parts[:, 0][parts[:, 0] > 0], parts[:, -1][parts[:, -1] > 0]).size

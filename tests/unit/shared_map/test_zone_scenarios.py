@@ -81,7 +81,7 @@ def test_hidden_zones_may_be_files_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("zone", "reason"),
     [
-        ('kind = "road"', r"missing required field `polygon_m` \(or `mask`, or `file`\)"),
+        ('kind = "road"', r"missing required field `polygon` \(or `polygon_m`, `mask`, `file`\)"),
         ('kind = "road"\nfile = "a"\nmask = "b"', "mask and file exclude each other"),
         ('kind = "road"\nmask = "a"\nlayer = "b"', "layer goes with file only, found mask"),
         ('kind = "factor"\nmask = "a"', "missing required field `factor`"),
@@ -111,3 +111,16 @@ def test_terrain_info_names_each_file_and_what_became_of_its_features(tmp_path: 
     assert any(
         "forbidden zone from area.geojson in local: 1 of 1 features; 50 cells" in note for note in facts["notes"]
     )
+
+
+def test_the_example_of_the_page_has_one_way_over_its_river() -> None:
+    path = Path(__file__).parents[3] / "docs" / "examples" / "roads_and_water" / "roads_and_water.toml"
+    scenario = load_scenario(path)
+    assert path.read_text().partition("[[cost.zones]]")[2] in (path.parents[2] / "zones.md").read_text()
+    terrain = build_terrain(scenario)
+    used = [zone.file.used for zone in terrain.zones if zone.file is not None]
+    assert used == [5, 3, 1]
+    assert terrain.zones[0].opened >= 2
+    water = terrain.zones[1].file
+    assert water is not None
+    assert dict(water.classes) == {"river": 1, "stream": 1, "water": 1}

@@ -186,6 +186,12 @@ def test_metres_are_those_of_poses() -> None:
     ]
     assert isinstance(world.order(action="add", name="z", polygon_m=corners), Zones)
     assert world.lethal() == SQUARE_CELLS
+    assert isinstance(world.order(action="remove", name="z"), Zones)
+    places = [f"xy:{x_m},{y_m}" for x_m, y_m in corners[:3]] + ["cell:6,3"]
+    assert isinstance(world.order(action="add", name="z", corners=places), Zones)
+    assert world.lethal() == SQUARE_CELLS
+    refusal = world.order(action="add", name="y", corners=["latlon:46,9", *places])
+    assert "corners is 'latlon:46,9', and the terrain has no place on Earth" in str(refusal)
 
 
 @pytest.mark.parametrize(
@@ -217,6 +223,8 @@ def test_a_zone_that_cannot_be_is_refused_in_a_sentence(fields: dict[str, Any], 
         ({"polygon": SQUARE, "name": "a.b"}, "name 'a.b' is not"),
         ({}, "give either polygon or polygon_m"),
         ({"polygon": SQUARE, "polygon_m": SQUARE}, "give either polygon or polygon_m"),
+        ({"corners": ["cell:1,1", "there", "cell:2,2"]}, "corners is 'there'; expected"),
+        ({"corners": ["cell:1,1", "cell:2,2"]}, "polygon has 2 corners"),
         ({"polygon": SQUARE, "kind": "pace"}, "pace_s_per_m goes with kind pace"),
         ({"polygon": SQUARE, "pace_s_per_m": 1.0}, "pace_s_per_m goes with kind pace"),
         ({"action": "remove"}, "which zone is to be removed"),

@@ -50,7 +50,7 @@ def refusal(text: str) -> str:
         ("[[cost.zones]]\nkind = 'lava'\npolygon_m = [[0,0],[1,0],[1,1]]", ["cost.zones[0].kind", "'forbidden'"]),
         ("[[cost.zones]]\nkind = 'road'\npolygon_m = [[0,0],[1,0]]", ["cost.zones[0].polygon_m", "length >= 3"]),
         ("[[cost.zones]]\nkind = 'road'\npolygon_m = [[0,0],[1,0],[nan,1]]", ["polygon_m[2][0]", "found nan"]),
-        ("[[cost.zones]]\nkind = 'road'", ["cost.zones[0]", "missing required field `polygon_m`"]),
+        ("[[cost.zones]]\nkind = 'road'", ["cost.zones[0]", "missing required field `polygon`"]),
         ("[[groups]]\nvehicles = 0", ["groups[0].vehicles", ">= 1", "found 0"]),
         ("[[groups]]\nvehicles = 2.5", ["groups[0].vehicles", "expected `int`, got `float`", "found 2.5"]),
         ("[[groups]]\ntargets = ['u']\n[[targets]]\nname = 't'", ["groups: all chases 'u', which is no target"]),

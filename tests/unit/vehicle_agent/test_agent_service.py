@@ -271,7 +271,7 @@ def test_an_agent_that_is_cut_off_stays_on_the_cells_that_it_holds() -> None:
     ("cell", "words"),
     [
         ((30, 2), r"groups: all: cell is \[30, 2\], outside the terrain: 20 x 20 cells"),
-        ((3, 3), r"groups: all: cell cell:3,3 .* is lethal; choose a passable cell"),
+        ((3, 3), r"groups: all: cell:3,3 .* is lethal; choose a passable cell"),
     ],
 )
 def test_an_impossible_place_is_refused_in_a_sentence(cell: tuple[int, int], words: str) -> None:

@@ -31,8 +31,7 @@ def climb_on(elevation_m: np.ndarray) -> Climb:
 
 
 def steering_on(climb: Climb, pace: np.ndarray = LEVEL) -> Steering:
-    chance = random.Random(1)
-    return Steering(GRID, pace, PlannerConfig(), 4, chance, lambda cell: False, Bodies(GRID), climb)
+    return Steering(GRID, pace, PlannerConfig(), 4, Bodies(GRID), climb)
 
 
 @given(st.integers(0, 1 << 32), st.floats(0.0, 0.3))
