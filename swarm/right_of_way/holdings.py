@@ -233,11 +233,11 @@ class Holdings:
             if cells == seen and vehicle in self._paths:
                 view.seen[vehicle] = cells
                 continue
+            self._said.pop(vehicle, None)
             ours = self._vehicles is None or vehicle in self._vehicles
             if not ours or any(self._plots.of(cell) != granted.plot for cell in cells):
                 continue
             view.seen[vehicle] = cells
-            self._said.pop(vehicle, None)
             if vehicle in self._paths:
                 self._extend(vehicle, cells, seen)
             elif (cell := self._first_cell(vehicle, cells, seen, place)) is not None:
