@@ -26,6 +26,7 @@ from support.planner_strategies import (
 from planner_service.kernels import repair as kernels
 from planner_service.kernels.directed_growth import grow_directed
 from planner_service.kernels.layout import NONE
+from planner_service.tree.corridors import find_corridors
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
@@ -159,6 +160,44 @@ def test_growth_by_buckets_by_decrease_key_and_by_scipy_agree(seed: int) -> None
     best[~np.isfinite(ground.pace)] = np.inf
     np.testing.assert_allclose(tree.inner(tree.cost), best, rtol=3e-6)
     assert np.isinf(best[np.isfinite(ground.pace)]).any() or seed % 3 < 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_costs_are_tightened_and_relabelled_to_what_is_driven(seed: int) -> None:
+    ground = Ground(seed, RULES[seed])
+    tree, costs = ground.tree, ground.costs
+    moved = 0
+    for _ in range(20):
+        here = tree.root
+        there = [cell for _, cell in costs.grid.neighbours(here) if np.isfinite(ground.pace.flat[cell])]
+        cell = int(ground.rng.choice(there or [here]))
+        moved += bool(tree.move(cell, costs.grid.around(cell, 4)))
+    assert moved > 5
+    starts = np.flatnonzero(np.isfinite(tree.cost) & (tree.parent != NONE))
+    driven = costs.walk(tree.parent, costs.pad(tree.root), starts, 0, costs.cell_cost).driven
+    assert (tree.cost[starts] + tree.offset > driven * 1.0001).any()
+    tree.tighten(starts)
+    np.testing.assert_allclose(tree.cost[starts] + tree.offset, driven, rtol=1e-5)
+    tree.relabel()
+    np.testing.assert_allclose(tree.cost[starts], driven, rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_along_corridors_no_cost_is_below_what_is_driven(seed: int) -> None:
+    ground = Ground(seed, RULES[seed], 64, 64)
+    tree, costs = ground.tree, ground.costs
+    corridors = find_corridors(costs)
+    visited = 0
+    for _ in range(6):
+        there = [cell for _, cell in costs.grid.neighbours(tree.root) if np.isfinite(ground.pace.flat[cell])]
+        cell = int(ground.rng.choice(there or [tree.root]))
+        window = costs.grid.around(cell, 4)
+        if tree.move(cell, window):
+            visited += tree.grow_corridors(window, corridors)
+        starts = np.flatnonzero(np.isfinite(tree.cost) & (tree.parent != NONE))
+        driven = costs.walk(tree.parent, costs.pad(tree.root), starts, 0, costs.cell_cost).driven
+        assert (tree.cost[starts] + tree.offset >= driven * (1 - 1e-5)).all()
+    assert visited > 100
 
 
 def one_way() -> Climb:
