@@ -304,6 +304,23 @@ def chaos(
         raise typer.Exit(1)
 
 
+@app.command()
+def compare(
+    run: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs, or their names in --runs.")],
+    runs: Runs = Path("runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Show what differs between runs: settings, versions and machines, and all figures beside each other.
+
+    Where a run listened is left out: free ports differ each time.
+
+    swarm compare 20261122-154115-44bb LAST
+    """
+    from launch_scripts.commands.compare import compare_runs
+
+    compare_runs(run, runs, as_json)
+
+
 app.add_typer(roles.app)
 app.add_typer(query.app)
 app.add_typer(orders.app)

@@ -204,7 +204,7 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
         typer.echo(json.dumps(fields, indent=2))
     else:
         _print_status(members, stats, planners, leads, frame, gaps_to(counts))
-        typer.echo(f"certified gap: {certified_gap(counts)}")
+        typer.echo(f"certified gap of the routes begun (above: mean per target): {certified_gap(counts)}")
         for ordered in book.standing:
             typer.secho(f"ordered: {ordered}", fg="yellow")
         for info in strangers:
@@ -300,7 +300,7 @@ def _print_status(
         console.print(f"author {author} exceeds its quota; its marks are delayed", style="yellow")
     if planners:
         trees = Table(
-            *("target", "following", "strategy", "tree ms", "growths", "windows", "served", "certified gap"),
+            *("target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap"),
             *("pose s", "tracker"),
             pad_edge=False,
         )
