@@ -137,7 +137,11 @@ def _route_on_terrain(
     frame = MapFrame(found.grid)
     typer.echo(f"from {written(frame, int(found.cells[0]))}")
     typer.echo(f"to {written(frame, int(found.cells[-1]))}")
-    above, climbed = max(found.gap - 1, 0), f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down"
+    # A route from a place to itself takes no time, which is the optimum.
+    above, climbed = (
+        max(found.gap - 1, 0) if found.cost_s > 0 else 0.0,
+        f"{facts['up_m']:.0f} m up and {facts['down_m']:.0f} m down",
+    )
     typer.echo(f"{facts['length_m']:.0f} m in {facts['cost_s']:.0f} s, {climbed}, {facts['steps']} cells")
     typer.echo(f"proven to be at most {above:.2%} above the optimum")
     typer.echo(profile_of(found))

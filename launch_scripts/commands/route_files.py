@@ -155,6 +155,12 @@ def _points(xs: NDArray[np.float64], ys: NDArray[np.float64], heights: Any, digi
         yield [round(x, digits), round(y, digits), *([round(float(heights[n]), 2)] if known else [])]
 
 
+def _line(xs: NDArray[np.float64], ys: NDArray[np.float64], heights: Any) -> list[list[float]]:
+    """As `_points`, to 8 digits; at least two, as a line has in GeoJSON and KML: who is there already stays."""
+    points = list(_points(xs, ys, heights, 8))
+    return points * 2 if len(points) == 1 else points
+
+
 def _geojson(route: DescribedRoute, path: Path) -> None:
     """RFC 7946: WGS 84, longitude first. A terrain without a place is written in its own metres, and says so."""
     points = route.metres().T
@@ -165,7 +171,7 @@ def _geojson(route: DescribedRoute, path: Path) -> None:
     feature = {
         "type": "Feature",
         "properties": properties,
-        "geometry": {"type": "LineString", "coordinates": list(_points(xs, ys, route.height_m, 8))},
+        "geometry": {"type": "LineString", "coordinates": _line(xs, ys, route.height_m)},
     }
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8")
 
@@ -198,7 +204,7 @@ def _kml(route: DescribedRoute, path: Path) -> None:
     line = ElementTree.SubElement(mark, "LineString")
     ElementTree.SubElement(line, "tessellate").text = "1"
     ElementTree.SubElement(line, "altitudeMode").text = "clampToGround"
-    points = _points(lon, lat, route.height_m, 8)
+    points = _line(lon, lat, route.height_m)
     ElementTree.SubElement(line, "coordinates").text = " ".join(",".join(map(_plain, point)) for point in points)
     ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 

@@ -212,3 +212,16 @@ def test_a_route_across_180_degrees_is_one_line(tmp_path: Path) -> None:
     site = DescribedRoute("site", GridSpec(9, 9, 1.0), np.arange(9), 1.0, 1.0, np.arange(9.0))
     with pytest.raises(SwarmError, match="has no place on Earth"):
         write_route(site, tmp_path / "way.kml")
+
+
+def test_a_route_to_where_one_is_takes_nothing_and_is_a_line_of_two_points(hill: Path, tmp_path: Path) -> None:
+    words = ["route", "--terrain", str(hill), "--from", "cell:55,5", "--to", "cell:55,5", "--out"]
+    for ending in ("geojson", "kml"):
+        told = CliRunner().invoke(app, [*words, str(tmp_path / f"way.{ending}")]).stdout
+        assert "at most 0.00% above the optimum" in told
+    (feature,) = json.loads((tmp_path / "way.geojson").read_text())["features"]
+    first, last = feature["geometry"]["coordinates"]
+    assert first == last
+    coordinates = ElementTree.parse(tmp_path / "way.kml").find(".//{*}coordinates")
+    assert coordinates is not None
+    assert len((coordinates.text or "").split()) == 2
