@@ -39,8 +39,8 @@ ROAD_GRADE = np.float32(0.5)
 class ByRules(NamedTuple):
     """What a photo shows by rules.
 
-    classes   uint8 (rows, cols), TerrainClass; UNKNOWN also where a photo that is exposed a little differently would
-              show another class
+    classes   uint8 (rows, cols), TerrainClass; UNKNOWN also where a photo that is exposed a little differently
+              would show another class
     readings  uint8 (rows, cols), which classes those are, bits of `layers.READABLE`; 0 where it is known
     """
 
