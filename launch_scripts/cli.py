@@ -207,12 +207,13 @@ def simulate(
     ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Simulated seconds.")] = None,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="With --seeds: seeds that run at the same time.")] = 1,
+    runs: Runs = Path("runs"),
     trace: Annotated[
         Path | None, typer.Option(help="Write the event log here; the same seed writes the same log.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Run the same swarm in one process, on a memory bus and a manual clock, and print the same report.
+    """Run the same swarm in one process, on a memory bus and a manual clock, and leave the same folder.
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
 
@@ -231,7 +232,7 @@ def simulate(
     if seeds is None:
         if scenario is None:
             raise ConfigError("give a SCENARIO, or --seeds A:B to try many seeds of small worlds")
-        simulate_once(scenario, seed, seconds, trace, as_json)
+        simulate_once(scenario, seed, seconds, trace, runs, as_json)
         return
     if seed is not None or trace is not None:
         raise ConfigError("--seeds goes with neither --seed nor --trace")
@@ -301,6 +302,23 @@ def chaos(
     )
     if not command.chaos(options, as_json):
         raise typer.Exit(1)
+
+
+@app.command()
+def compare(
+    run: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs, or their names in --runs.")],
+    runs: Runs = Path("runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Show what differs between runs: settings, versions and machines, and all figures beside each other.
+
+    Where a run listened is left out: free ports differ each time.
+
+    swarm compare 20261122-154115-44bb LAST
+    """
+    from launch_scripts.commands.compare import compare_runs
+
+    compare_runs(run, runs, as_json)
 
 
 app.add_typer(roles.app)

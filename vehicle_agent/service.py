@@ -25,6 +25,7 @@ from swarm.ranks import job_of
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
 from swarm.wire.fields import column
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.guests import Removed, RemoveVehicles
@@ -389,9 +390,14 @@ class AgentService:
     def _publish_followed(self, begun: Sequence[Follow]) -> None:
         for route in begun:
             if 0 < route.lower_bound_s < math.inf:
-                self.counters.observe("followed_gap_excess", max(route.cost_s / route.lower_bound_s - 1.0, 0.0))
+                excess = max(route.cost_s / route.lower_bound_s - 1.0, 0.0)
+                self.counters.observe("followed_gap_excess", excess)
+                self.counters.observe_by(GAPS_TO, route.target, excess)
+                self.counters.observe_by(GAPS_OF, route.vehicle, excess)
             else:
                 self.counters.count("followed_unproven")
+                self.counters.count_by(UNPROVEN_TO, route.target)
+                self.counters.count_by(UNPROVEN_OF, route.vehicle)
             followed = Followed(
                 vehicle=route.vehicle,
                 target=route.target,

@@ -7,12 +7,14 @@ import platform
 from pathlib import Path
 from typing import Any
 
+from launch_scripts.report.machine import processor
+
 
 def machine() -> dict[str, Any]:
     """Cores, processor, Python version and load."""
     return {
         "cores": os.cpu_count(),
-        "machine": _processor(),
+        "machine": processor(),
         "python": platform.python_version(),
         "load": round(os.getloadavg()[0], 1),
     }
@@ -27,13 +29,3 @@ def memory_free() -> int:
     except OSError:
         pass
     return 4_000_000_000
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

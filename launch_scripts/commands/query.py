@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,7 @@ from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, sp
 from swarm.places import extent_of, fields_of, written
 
 if TYPE_CHECKING:
+    from launch_scripts.report.certified_gap import CertifiedGap
     from shared_map.terrain.places import MapFrame
     from swarm.config.scenario import NetworkConfig
     from swarm.wire.messages.planning import PlannerStatus
@@ -147,6 +149,8 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Show who takes part in the running swarm and how the planners are doing."""
     from launch_scripts.commands.run_frame import frame_of_members
     from launch_scripts.launcher.watcher import ask_run
+    from launch_scripts.report.certified_gap import certified_gap, gaps_to
+    from launch_scripts.report.counts import Counts
     from swarm.bus.bus import Heard
     from swarm.bus.zenoh_bus import open_bus
     from swarm.errors import BusError
@@ -159,6 +163,7 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
 
     inbox = Inbox()
     book = OrderBook()
+    counts = Counts()
     stats: dict[tuple[str, str], Stats] = {}
     planners: dict[str, PlannerStatus] = {}
     leads: dict[tuple[str, str], bool] = {}
@@ -173,6 +178,7 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
             match inbox.take(left_s):
                 case Heard(message=Stats() as message):
                     stats[message.role, message.id] = message
+                    counts.count(message)
                 case Heard(message=PlannerStatus() as message):
                     planners[message.target] = message
                 case Heard(message=Beat() as message):
@@ -191,11 +197,14 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     frame = frame_of_members(members)
     if as_json:
         fields = _status_fields(members, stats, planners, leads, frame)
+        fields["certified_gap"] = certified_gap(counts).fields()
+        fields["certified_gap_to"] = {id: gap.fields() for id, gap in gaps_to(counts).items()}
         fields["orders"] = book.standing
         fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
         typer.echo(json.dumps(fields, indent=2))
     else:
-        _print_status(members, stats, planners, leads, frame)
+        _print_status(members, stats, planners, leads, frame, gaps_to(counts))
+        typer.echo(f"certified gap of the routes begun (above: mean per target): {certified_gap(counts)}")
         for ordered in book.standing:
             typer.secho(f"ordered: {ordered}", fg="yellow")
         for info in strangers:
@@ -261,9 +270,12 @@ def _print_status(
     planners: dict[str, PlannerStatus],
     leads: dict[tuple[str, str], bool],
     frame: MapFrame | None,
+    gaps: Mapping[str, CertifiedGap],
 ) -> None:
     from rich.console import Console
     from rich.table import Table
+
+    from launch_scripts.report.certified_gap import percent
 
     first = members[0]
     console = Console()
@@ -293,7 +305,7 @@ def _print_status(
             pad_edge=False,
         )
         for id, planner in sorted(planners.items()):
-            gap = "-" if planner.gap_mean is None else f"{planner.gap_mean:.3f}"
+            gap = percent(gaps[id].mean) if id in gaps else "-"
             trees.add_row(
                 id,
                 str(planner.following),

@@ -32,14 +32,13 @@ def export(
     swarm report export runs/LAST --out run.gpkg
     """
     from launch_scripts.report.geo_layers import check_layer_file, track_layers, write_layers
+    from launch_scripts.report.run_folder import find_run
     from launch_scripts.report.track_file import TRACKS_FILE, read_tracks
     from shared_map.terrain.places import MapFrame
     from swarm.errors import ConfigError
 
     check_layer_file(out)
-    folder = Path(run) if Path(run).is_dir() else runs / run
-    if not folder.is_dir():
-        raise ConfigError(f"there is no run {run!r}: neither a folder nor in {runs}")
+    folder = find_run(run, runs)
     path = folder / TRACKS_FILE
     if not path.exists():
         raise ConfigError(f"{folder} has no {TRACKS_FILE}: the run has not ended yet, or its launcher was killed")

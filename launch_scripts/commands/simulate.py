@@ -15,10 +15,16 @@ if TYPE_CHECKING:
     from launch_scripts.simulation.trial import Verdict
 
 
-def simulate_once(name: str, seed: int | None, seconds: float | None, trace: Path | None, as_json: bool) -> None:
-    """Run a scenario without faults, and print its report."""
-    from launch_scripts.launcher.options import find_scenario
+def simulate_once(
+    name: str, seed: int | None, seconds: float | None, trace: Path | None, runs: Path, as_json: bool
+) -> None:
+    """Run a scenario without faults, print its report and leave a run's folder in `runs`."""
+    import msgspec
+
+    from launch_scripts.launcher.options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.launcher.terminal import Terminal
+    from launch_scripts.report.run_folder import begin_run
+    from launch_scripts.report.write_report import with_series, write_report
     from launch_scripts.simulation.simulate import simulate as run_simulation
     from swarm.errors import StoreError
 
@@ -29,15 +35,27 @@ def simulate_once(name: str, seed: int | None, seconds: float | None, trace: Pat
             log = None if trace is None else stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
         except OSError as error:
             raise StoreError(f"cannot write {trace}: {error.strerror or error}") from error
-        result = run_simulation(scenario, seed=seed, seconds=seconds, trace=log)
+        scenario = msgspec.structs.replace(
+            scenario,
+            seed=scenario.seed if seed is None else seed,
+            seconds=scenario.seconds if seconds is None else seconds,
+        )
+        folder = make_run_dir(runs, f"{new_run_id()}-simulated")
+        for sentence in begin_run(folder, scenario, folder.name):
+            terminal.say(sentence, "yellow")
+        result = run_simulation(scenario, trace=log)
     if as_json:
-        typer.echo(json.dumps(result.report, indent=2))
+        numbers = {name: value for name, value in result.report.items() if name != "by_vehicle"}
+        typer.echo(json.dumps(numbers, indent=2))
     else:
         terminal.report(result.report)
+    report = with_series({**result.report, "run_id": folder.name}, result.recorder, result.terrain)
+    write_report(folder, report, result.recorder, result.terrain, truth=result.truth)
     terminal.say(
         f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
         f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
     )
+    terminal.say(f"report: {folder / 'report.json'}, picture: {folder / 'report.png'}")
     if result.trace_cut is not None:
         raise StoreError(f"the event log {trace} has no end: {result.trace_cut}")
 

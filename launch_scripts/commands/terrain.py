@@ -331,7 +331,8 @@ def reach(
     """Say how long it takes to a place from everywhere: cost-to-go as GeoTIFF, isochrones as GeoJSON.
 
     With --from: the corridor of near-optimal ways between two places. Each of
-    its cells has the time of the best way that passes it; the areas of a
+    its cells has the time of a good way that passes it, which can be driven
+    and may take a little longer than the best that does; the areas of a
     .geojson are seconds lost against the best way of all.
 
     swarm terrain reach dem.tif --to 46.78,9.87 --preset hiker --out seconds.tif

@@ -8,6 +8,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from launch_scripts.report.certified_gap import percent
 from launch_scripts.report.recorder import LiveSummary, TargetLine
 
 SHOWN_TARGETS = 24
@@ -20,7 +21,7 @@ def live_table(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], r
     """
     table = Table(title=title, title_justify="left", expand=False, pad_edge=False)
     table.add_column("target")
-    for heading in ("following", "nearest m", "re-plans", "ms", "gap", "captures"):
+    for heading in ("following", "nearest m", "re-plans", "ms", "certified gap", "captures"):
         table.add_column(heading, justify="right")
     for line in summary.targets[:SHOWN_TARGETS]:
         table.add_row(*_row(line), style=_style(line))
@@ -46,7 +47,8 @@ def plain_line(summary: LiveSummary, processes: Mapping[str, tuple[int, int]], r
         f"{summary.elapsed_s:5.1f} s  {alive}/{every} processes, {restarts} restarts; "
         f"{states or 'no vehicles yet'}; {following} assigned; {_count(summary.captures)} captures, "
         f"{_count(summary.reroute_requests)} re-route requests, {_count(summary.marks)} marks, "
-        f"{_count(summary.messages_per_s)} messages/s{untracked}"
+        f"{_count(summary.messages_per_s)} messages/s, "
+        f"certified gap {percent(summary.certified_gap.mean)}{untracked}"
     )
 
 
@@ -61,7 +63,7 @@ def _row(line: TargetLine) -> tuple[str, ...]:
         "-" if line.nearest_m is None else f"{line.nearest_m:.0f}",
         _count(line.growths),
         "-" if line.growth_ms is None else f"{line.growth_ms:.1f}",
-        "-" if line.gap is None else f"{line.gap:.3f}",
+        "-" if line.gap is None else percent(line.gap.mean),
         str(line.captures),
     )
 
@@ -75,7 +77,7 @@ def _totals(summary: LiveSummary) -> list[str]:
         "messages/s": summary.messages_per_s,
     }
     in_all = "  ".join(f"{name} {_count(count)}" for name, count in counts.items())
-    return [f"vehicles   {states}", f"in all     {in_all}"]
+    return [f"vehicles   {states}", f"in all     {in_all}", f"certified  gap {summary.certified_gap}"]
 
 
 def _count(value: float | None) -> str:

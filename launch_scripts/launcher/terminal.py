@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.live_table import live_table, plain_line
+from launch_scripts.report.certified_gap import gap_text
 from launch_scripts.report.recorder import LiveSummary
 
 log = logging.getLogger(__name__)
@@ -37,7 +38,7 @@ REPORTED = {
     "lethal_entries": "lethal cells entered",
     "driven_into": "bodies driven into",
     "hit_by_bodies": "vehicles hit by bodies",
-    "gap": "gap to the optimum",
+    "certified_gap": "certified gap",
     "growth_ms": "growing a tree, ms",
     "route_query_ms": "asking for a route, ms",
     "mark_to_tree_ms": "from mark to tree, ms",
@@ -99,7 +100,7 @@ class Terminal:
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():
             if name in REPORTED:
-                table.add_row(REPORTED[name], _plain(value))
+                table.add_row(REPORTED[name], gap_text(value) if name == "certified_gap" else _plain(value))
         self.print(table)
 
     def close(self) -> None:

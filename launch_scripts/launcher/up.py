@@ -32,6 +32,7 @@ from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.run_folder import begin_run
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
@@ -175,6 +176,8 @@ class _Run:
         self._swarm = LocalSwarm(_table(options), self._setup_of, run_dir)
         self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
+        for sentence in begin_run(run_dir, options.scenario, run_id):
+            self._terminal.say(sentence, "yellow")
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
@@ -392,7 +395,7 @@ class _Run:
             restarts=self._swarm.restarts,
             startup_s=self._startup_s,
         )
-        numbers = {name: value for name, value in report.items() if name != "series"}
+        numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}
         if self._options.as_json:
             self._terminal.print_json(json.dumps(numbers, indent=2))
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from launch_scripts.report.certified_gap import percent
 from launch_scripts.report.recorder import LiveSummary
 from swarm.runtime.role import RoleSetup
 
@@ -35,15 +36,16 @@ def summary_markdown(setup: RoleSetup, summary: LiveSummary) -> str:
         f"**{scenario.name}**: {scenario.vehicle_count} vehicles, {len(scenario.target_ids)} targets  ",
         f"{found}, **{_count(summary.reroute_requests)}** re-route requests  ",
         f"{states or 'no vehicles yet'}  ",
-        f"{summary.alive} of {summary.expected} processes alive, {traffic}",
+        f"{summary.alive} of {summary.expected} processes alive, {traffic}  ",
+        f"certified gap {summary.certified_gap}",
         "",
-        "| target | following | nearest | tree | gap | captures |",
+        "| target | following | nearest | tree | certified gap | captures |",
         "|---|---|---|---|---|---|",
     ]
     for line in summary.targets[:_SHOWN_TARGETS]:
         nearest = "–" if line.nearest_m is None else f"{line.nearest_m / 1000:.1f} km"
         growth = "–" if line.growth_ms is None else f"{line.growth_ms:.1f} ms"
-        gap = "–" if line.gap is None else f"{max(line.gap - 1, 0) * 100:.2f} %"
+        gap = "–" if line.gap is None else percent(line.gap.mean)
         lines.append(f"| {line.title} | {line.following} | {nearest} | {growth} | {gap} | {line.captures} |")
     if len(summary.targets) > _SHOWN_TARGETS:
         lines.append(f"\n{len(summary.targets) - _SHOWN_TARGETS} more targets")

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.report.counts import Counts
 from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.liveness import Peer
 from swarm.ranks import HIGHEST_RANK, ranked_id, split_rank
-from swarm.runtime.stats import Histogram, merged
 from swarm.wire.fields import column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
@@ -34,14 +34,14 @@ class MarkedCells:
     paces: NDArray[np.float32]
 
 
-class Observed:
+class Observed(Counts):
     """Keeps the newest message per sender, so that its memory does not grow with time."""
 
     def __init__(self, grid: GridSpec) -> None:
+        super().__init__()
         self.grid = grid
         self.status: dict[str, PlannerStatus] = {}
         self.poses: dict[str, TargetPose] = {}
-        self._stats: dict[tuple[str, str, int], Stats] = {}
         self._messages_before: dict[tuple[str, str, int], int] = {}
         self._fleets: dict[tuple[str, int], Fleet] = {}
         self._vehicles: VehicleColumns | None = None
@@ -56,10 +56,7 @@ class Observed:
         """Take in a message; of poses those only that count."""
         match message:
             case Stats():
-                key = (message.role, message.id, message.incarnation)
-                stats = self._stats.get(key)
-                if stats is None or message.stamp_ns >= stats.stamp_ns:
-                    self._stats[key] = message
+                key = self.count(message)
                 self._messages_before.setdefault(key, message.counts.get("messages_out", 0))
                 self._seen(message.role, message.id, message.incarnation)
             case PlannerStatus():
@@ -124,6 +121,10 @@ class Observed:
             self._vehicles = gathered(self._fleets.values())
         return self._vehicles
 
+    def groups(self) -> dict[str, str]:
+        """Vehicle -> its group."""
+        return {id: fleet.group for fleet in self._fleets.values() for id in fleet.ids}
+
     def targets(self) -> dict[str, tuple[float, float]]:
         """(east, south) in metres of every target, in order of id."""
         return {id: self.place_m(pose) for id, pose in sorted(self.poses.items())}
@@ -159,29 +160,9 @@ class Observed:
             np.array([pace for _, _, pace in kept], np.float32),
         )
 
-    # --- counts ---------------------------------------------------------------------------------------------------
-
-    def total(self, name: str) -> int | None:
-        """A count, summed over processes and incarnations; None if no process has published it."""
-        told = [stats.counts[name] for stats in self._stats.values() if name in stats.counts]
-        return sum(told) if told else None
-
     @property
     def messages(self) -> int:
         """Messages sent by all processes since each was first heard: grows evenly, even for a late observer."""
         return sum(
             stats.counts.get("messages_out", 0) - self._messages_before[key] for key, stats in self._stats.items()
         )
-
-    def gauge(self, name: str) -> float | None:
-        """A gauge, summed over the newest incarnation of each process; None if no process has published it."""
-        newest: dict[tuple[str, str], Stats] = {}
-        for (role, id, incarnation), stats in self._stats.items():
-            if (role, id) not in newest or incarnation > newest[role, id].incarnation:
-                newest[role, id] = stats
-        told = [stats.gauges[name] for _, stats in sorted(newest.items()) if name in stats.gauges]
-        return sum(told) if told else None
-
-    def histogram(self, name: str) -> Histogram:
-        """Histogram of a name, over all incarnations of all processes."""
-        return merged(stats.histograms.get(name, {}) for stats in self._stats.values())

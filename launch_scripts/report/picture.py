@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from launch_scripts.report.certified_gap import percent
 from launch_scripts.report.hillshade import hillshade
 from launch_scripts.report.palette import (
     BLACK,
@@ -75,7 +76,7 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
         ("marks", _number(report["marks"]), INK),
         ("re-route requests", _number(report["reroute_requests"]), INK),
         ("routes served", _number(report["routes_served"]), INK),
-        ("mean gap to optimum", _gap(report["gap"]["mean"]), INK),
+        ("certified gap, mean", percent(report["certified_gap"]["mean"]), INK),
         ("growth of a tree, p50", duration(report["growth_ms"]["p50"]), INK),
         ("route query, p99", duration(report["route_query_ms"]["p99"]), INK),
         ("collisions", _number(report["collisions"]), RED if report["collisions"] else GREEN),
@@ -116,10 +117,6 @@ def _several(count: int | None, one: str, many: str) -> str:
 
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:,.0f}"
-
-
-def _gap(value: float | None) -> str:
-    return "–" if value is None else f"{(value - 1) * 100:.2g} %"
 
 
 # --- the map ----------------------------------------------------------------------------------------------------

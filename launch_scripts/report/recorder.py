@@ -6,14 +6,16 @@ Pure: time is an argument, and the owner of a bus passes it what comes on `RECOR
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from launch_scripts.report.certified_gap import CertifiedGap, certified_gap, gaps_to, of_excess
 from launch_scripts.report.latest_state import MarkedCells, Observed
+from launch_scripts.report.results import Driven, results
 from launch_scripts.report.samples import Sample, Samples, messages_per_s
 from launch_scripts.report.tracked_targets import TrackedTargets
 from launch_scripts.report.tracks import TrackKey, Tracks
@@ -24,7 +26,7 @@ from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
 from swarm.ranks import ranked_id
-from swarm.runtime.stats import Histogram
+from swarm.runtime.stats import CAPTURES_OF, Histogram
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
@@ -44,8 +46,6 @@ _SAMPLE_NS = NS_PER_S
 _NOTES_KEPT = 1000
 _CAPTURES_KEPT = 4096
 """Places of captures: those of the first hours of a long run are forgotten, their number is not."""
-_CAPTURES_AT_ONCE = 100
-"""Most captures counted between two poses: a hostile message must not fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +74,8 @@ class TargetLine:
     nearest_m: float | None
     growths: int | None
     growth_ms: float | None
-    gap: float | None
-    captures: int
+    captures: int = 0
+    gap: CertifiedGap | None = None
     pose_age_s: float | None = None
     lost: bool = False
 
@@ -106,6 +106,7 @@ class LiveSummary:
     alive: int
     expected: int
     restarts: int
+    certified_gap: CertifiedGap
 
 
 class Recorder:
@@ -122,8 +123,8 @@ class Recorder:
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
         self.samples = Samples()
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
-        self.captures_of: Counter[str] = Counter()
-        """Target -> its captures."""
+        """Where and when targets were captured; how often, `Observed` counts."""
+        self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
         self.vehicle_tracks = Tracks(_TRACK_NS)
         self.target_tracks = Tracks(_TRACK_NS)
@@ -144,12 +145,13 @@ class Recorder:
                 if counts is None:
                     return
                 message = counts
-                self._capture(counts, now_ns)
             case Fleet():
                 self.tracked.something_moved(now_ns)
             case PlannerStatus(gap_max=float(gap)):
                 self._gap_max = max(gap, self._gap_max or 0.0)
             case Note():
+                if message.kind == "capture":
+                    self._capture(message, now_ns)
                 self.notes.append((self.seconds(now_ns), message))
         self.observed.heard(message)
         self._look(now_ns)
@@ -182,15 +184,14 @@ class Recorder:
             self.first_ns = now_ns
         self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
 
-    def _capture(self, pose: TargetPose, now_ns: int) -> None:
-        known = self.observed.poses.get(pose.target)
-        if known is None or known.incarnation != pose.incarnation or pose.captures <= known.captures:
+    def _capture(self, note: Note, now_ns: int) -> None:
+        """Of targets that nobody tracks, too: the process that moves them tells of each capture."""
+        cell = note.cell
+        if note.target is None or cell is None or cell >= self.grid.cells:
             return
-        # The place before the capture: the target may already stand elsewhere.
-        capture = Capture(self.seconds(now_ns), pose.target, *self.observed.place_m(known))
-        new = min(pose.captures - known.captures, _CAPTURES_AT_ONCE)
-        self.captures.extend([capture] * new)
-        self.captures_of[pose.target] += new
+        x_m, y_m = self.grid.centre_m(cell)
+        east_m, south_m = x_m - self.grid.west_m, self.grid.north_m - y_m
+        self.captures.append(Capture(self.seconds(now_ns), note.target, east_m, south_m))
 
     def _look(self, now_ns: int) -> None:
         tracks_due = self.vehicle_tracks.due(now_ns)
@@ -211,6 +212,7 @@ class Recorder:
             self.routed.update(vehicles.ids[n] for n in np.flatnonzero(moving).tolist())
         if self._track_ids != vehicles.ids:
             self._track_ids, self._track_keys = vehicles.ids, [(id, 0) for id in vehicles.ids]
+        self.driven.add(now_ns, vehicles, self.observed.groups)
         self.vehicle_tracks.add(now_ns, self._track_keys, np.stack([vehicles.east_m, vehicles.south_m], axis=1))
         poses = sorted(self.observed.poses.items())
         pieces: list[TrackKey] = [(id, pose.jumps) for id, pose in poses]
@@ -239,7 +241,12 @@ class Recorder:
         vehicles = observed.vehicles()
         rates = messages_per_s(self.samples.newest)
         lost = self.tracked.lost(now_ns)
-        lines = (self._target_line(id, vehicles, now_ns) for id in self.scenario.target_ids)
+        captures = observed.counts_by(CAPTURES_OF)
+        gaps = gaps_to(observed)
+        lines = (
+            replace(self._target_line(id, vehicles, now_ns), captures=captures.get(id, 0), gap=gaps.get(id))
+            for id in self.scenario.target_ids
+        )
         return LiveSummary(
             elapsed_s=self.seconds(now_ns),
             targets=tuple(replace(line, lost=line.id in lost) for line in lines),
@@ -251,6 +258,7 @@ class Recorder:
             alive=len(self._expected) - len(self.missing()),
             expected=len(self._expected),
             restarts=observed.restarts,
+            certified_gap=certified_gap(observed),
         )
 
     def _target_line(self, id: str, vehicles: VehicleColumns, now_ns: int) -> TargetLine:
@@ -268,8 +276,6 @@ class Recorder:
             nearest_m=nearest_m,
             growths=None if status is None else status.growths + status.window_growths,
             growth_ms=None if status is None else status.growth_ms,
-            gap=None if status is None else status.gap_mean,
-            captures=self.captures_of[id],
             pose_age_s=self.tracked.age_s(id, now_ns),
         )
 
@@ -316,10 +322,7 @@ class Recorder:
             "growths": total("growths"),
             "window_growths": total("window_growths"),
             "gap": self._gap(),
-            "certified_gap": {
-                **_excess(observed.histogram("followed_gap_excess")),
-                "unproven": total("followed_unproven") or 0,
-            },
+            "certified_gap": certified_gap(observed).fields(),
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
             "messages_out": total("messages_out"),
             "messages_in": total("messages_in"),
@@ -329,6 +332,7 @@ class Recorder:
             "payloads_dropped": total("payloads_dropped"),
             "ticks_late": total("ticks_late"),
             "ticks_dropped": total("ticks_dropped"),
+            **results(observed, self.driven, self.scenario),
         }
         return {name: _rounded(value) for name, value in fields.items()}
 
@@ -355,7 +359,7 @@ class Recorder:
         """
         fine, coarse = self.observed.histogram("gap_excess"), self.observed.histogram("gap")
         if fine.count:
-            gap = _excess(fine)
+            gap = of_excess(fine)
         else:
             gap = {"mean": coarse.mean(), "p95": coarse.quantile(0.95), "max": coarse.quantile(1.0)}
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
@@ -378,12 +382,6 @@ def _expected(scenario: Scenario) -> list[tuple[str, str]]:
         *(("planner", ranked_id(id, rank)) for rank in range(scenario.standbys.planner + 1) for id in targets),
         *(("agent", plan.id) for plan in plan_agents(scenario)),
     ]
-
-
-def _excess(histogram: Histogram) -> dict[str, float | None]:
-    """Gaps from a histogram of gap - 1."""
-    values = {"mean": histogram.mean(), "p95": histogram.quantile(0.95), "max": histogram.quantile(1.0)}
-    return {name: None if value is None else 1.0 + value for name, value in values.items()}
 
 
 def _mean(values: Iterable[float]) -> float | None:

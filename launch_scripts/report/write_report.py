@@ -1,20 +1,22 @@
-"""Writes what a run leaves behind: `report.json`, `tracks.npz` and `report.png`."""
+"""Writes what a run leaves behind: `report.json`, tables of its results, `tracks.npz` and `report.png`."""
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import json
 import logging
-import os
-from collections.abc import Iterator
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.report.files import replacing, write_file
 from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.result_tables import TABLES, csv_of
+from launch_scripts.report.run_folder import REPORT_FILE, ended
 from launch_scripts.report.track_file import TRACKS_FILE, packed_tracks
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
@@ -28,8 +30,13 @@ def make_report(recorder: Recorder, terrain: Terrain, **measured: Any) -> dict[s
 
     measured  what the caller knows better than the recorder, as `Recorder.report` takes it
     """
+    return with_series(recorder.report(**measured), recorder, terrain)
+
+
+def with_series(numbers: Mapping[str, Any], recorder: Recorder, terrain: Terrain) -> dict[str, Any]:
+    """The numbers of a run, its terrain and its course."""
     return {
-        **recorder.report(**measured),
+        **numbers,
         "version": importlib.metadata.version("terrain-swarm"),
         "terrain": {
             "digest": terrain.digest,
@@ -54,18 +61,21 @@ def write_report(
     *,
     truth: NDArray[np.float32] | None = None,
 ) -> None:
-    """Writes `report.json`, the tracks and `report.png`. Raises StoreError if the folder cannot be written.
+    """Writes what is named above. Raises StoreError if the folder cannot be written.
 
     truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
     """
-    try:
-        _write(folder / "report.json", json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
-    except OSError as error:
-        raise StoreError(f"cannot write {folder / 'report.json'}: {error.strerror or error}") from error
-    try:
-        _write(folder / TRACKS_FILE, packed_tracks(recorder))
-    except OSError as error:
-        raise StoreError(f"cannot write {folder / TRACKS_FILE}: {error.strerror or error}") from error
+    whole = {**report, **({"made": made} if (made := ended(folder)) else {})}
+    contents: dict[str, Callable[[], bytes]] = {
+        REPORT_FILE: lambda: json.dumps(whole, indent=1, allow_nan=False).encode() + b"\n",
+        **{file: partial(csv_of, section, report) for section, (file, _) in TABLES.items()},
+        TRACKS_FILE: lambda: packed_tracks(recorder),
+    }
+    for name, content in contents.items():
+        try:
+            write_file(folder / name, content())
+        except OSError as error:
+            raise StoreError(f"cannot write {folder / name}: {error.strerror or error}") from error
     _draw(folder / "report.png", recorder, report, terrain, truth)
 
 
@@ -75,26 +85,7 @@ def _draw(
     from launch_scripts.report.picture import save_picture  # matplotlib takes a moment
 
     try:
-        with _replacing(path) as partial:
-            save_picture(partial, recorder, report, terrain, truth)
+        with replacing(path) as half:
+            save_picture(half, recorder, report, terrain, truth)
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
-
-
-def _write(path: Path, content: bytes) -> None:
-    with _replacing(path) as partial, partial.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-@contextlib.contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A file to write which then takes the place of another. Half a one is removed: a full disk needs the space."""
-    partial = path.with_name(path.name + ".part")
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)

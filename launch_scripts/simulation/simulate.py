@@ -19,6 +19,7 @@ from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.simulation.event_log import EventLog
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.node import EPOCH_NS, Node
+from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Event, Heard, Replied
 from swarm.bus.memory_bus import MemoryNetwork
@@ -46,6 +47,8 @@ class SimulationResult:
     """Outcome of a simulation.
 
     report      the numbers of report.json; the same for the same seed
+    scenario    with the seed and the seconds that it ran with
+    truth       pace of every cell as it truly is
     deliveries  number of messages that arrived
     wall_s      seconds that it took on this machine
     trace_cut   why the event log has no end; None if it is whole or was not asked for
@@ -55,6 +58,8 @@ class SimulationResult:
     recorder: Recorder
     terrain: Terrain
     seconds: float
+    scenario: Scenario
+    truth: Floats
     deliveries: int
     wall_s: float
     trace_cut: str | None = None
@@ -284,6 +289,8 @@ def simulate(
         recorder=simulation.recorder,
         terrain=simulation.terrain,
         seconds=seconds,
+        scenario=scenario,
+        truth=simulation.truth,
         deliveries=simulation.log.deliveries,
         wall_s=time.perf_counter() - began_s,
         trace_cut=simulation.log.cut,

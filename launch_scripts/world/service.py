@@ -18,6 +18,7 @@ from swarm.runtime.candidacy import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import CostReply, CostRequest, PlannerStatus
@@ -147,7 +148,9 @@ class TargetsService:
                     self._bus.publish(self._topic(pose.target), pose, target=pose.target)
                 case Captured(target, vehicle, cell):
                     self.counters.count("captures")
-                    self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell)
+                    self.counters.count_by(CAPTURES_OF, target)
+                    self.counters.count_by(CAPTURES_BY, vehicle)
+                    self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell, target=target)
                 case Collision(first, second, cell):
                     self.counters.count("collisions")
                     self._member.note(now_ns, "collision", f"{first} and {second} on one cell", cell)

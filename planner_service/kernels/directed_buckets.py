@@ -29,7 +29,7 @@ from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
-_TWO, _THREE, _FOUR, _FIVE, _SIX, _SEVEN, _EIGHT = (np.uint64(n) for n in range(2, 9))
+_TWO, _THREE, _FOUR, _FIVE, _SIX, _SEVEN = (np.uint64(n) for n in range(2, 8))
 _ZERO32 = np.float32(0.0)
 _AHEAD = 8
 """Cells of a batch between asking for one's memory and using it."""

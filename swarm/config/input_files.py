@@ -42,6 +42,7 @@ class FileKind(Enum):
     PREPARED = ("prepared terrain", 1 << 20, TerrainError)
     EXPORTED_MAP = ("exported map", 512 << 20, StoreError)
     TRACKS = ("tracks", 256 << 20, StoreError)
+    RUN = ("run", 256 << 20, StoreError)
     STORE = ("store", 4 << 30, StoreError)
     PROMISES = ("promises", 256 << 20, StoreError)
 

@@ -41,7 +41,7 @@ def parse_scenario(text: str, source: str = "scenario", base: Path | None = None
         raise ConfigError(f"{source}: {explain(str(error), raw, Scenario)}") from error
     scenario = msgspec.structs.replace(scenario, cost=with_slope_csv(scenario.cost, source, base))
     _check(scenario, source)
-    return scenario if base is None else _anchored(scenario, base)
+    return scenario if base is None else anchored(scenario, base)
 
 
 def _check(scenario: Scenario, source: str) -> None:
@@ -154,7 +154,7 @@ def _loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def _anchored(scenario: Scenario, base: Path) -> Scenario:
+def anchored(scenario: Scenario, base: Path) -> Scenario:
     """The scenario with its relative paths made relative to the folder of its file."""
     terrain = scenario.terrain
     source = terrain.source

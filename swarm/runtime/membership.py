@@ -116,13 +116,22 @@ class Member:
             counts=counts,
             gauges=dict(self.counters.gauges),
             histograms={name: h.buckets for name, h in self.counters.histograms.items()},
+            counts_by=self.counters.counts_by,
+            histograms_by={
+                name: {id: h.buckets for id, h in each.items()}
+                for name, each in self.counters.histograms_by.items()
+            },
         )
         self._bus.publish(STATS, stats, role=self.info.role, id=self.info.id)
 
-    def note(self, now_ns: int, kind: str, text: str, cell: int | None = None) -> None:
+    def note(
+        self, now_ns: int, kind: str, text: str, cell: int | None = None, *, target: str | None = None
+    ) -> None:
         """Publish a sentence for people who watch the run."""
         info = self.info
-        note = Note(role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text[:MOST_TEXT], cell=cell)
+        note = Note(
+            role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text[:MOST_TEXT], cell=cell, target=target
+        )
         self._bus.publish(NOTE, note, role=info.role, id=info.id)
 
     def warn(self, now_ns: int, kind: str, text: str) -> None:

@@ -8,7 +8,20 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.wire.fields import TOP_BUCKET, ZERO_BUCKET
+from swarm.wire.fields import MOST_IDS, TOP_BUCKET, ZERO_BUCKET
+
+CAPTURES_OF = "captures_of"
+"""Per target, by the process that moves the targets."""
+CAPTURES_BY = "captures_by"
+"""Per vehicle, by the same."""
+GAPS_TO = "followed_gap_excess_to"
+"""Per target, by agents: cost of each route that a vehicle begins over its proven lower bound, less 1."""
+GAPS_OF = "followed_gap_excess_of"
+"""The same per vehicle."""
+UNPROVEN_TO = "followed_unproven_to"
+"""Per target, by agents: routes begun without a lower bound."""
+UNPROVEN_OF = "followed_unproven_of"
+"""The same per vehicle."""
 
 _BASE = 1.04
 _LOG_BASE = math.log(_BASE)
@@ -94,6 +107,24 @@ class Counters:
         self.counts: dict[str, int] = {}
         self.gauges: dict[str, float] = {}
         self.histograms: dict[str, Histogram] = {}
+        self.counts_by: dict[str, dict[str, int]] = {}
+        self.histograms_by: dict[str, dict[str, Histogram]] = {}
+
+    def count_by(self, name: str, id: str) -> None:
+        """Count for one target or vehicle; those beyond `MOST_IDS` are counted as `ids_uncounted` only."""
+        counts = self.counts_by.setdefault(name, {})
+        if id in counts or len(counts) < MOST_IDS:
+            counts[id] = counts.get(id, 0) + 1
+        else:
+            self.count("ids_uncounted")
+
+    def observe_by(self, name: str, id: str, value: float) -> None:
+        """Add a value to the histogram of one target or vehicle; bounded as `count_by`."""
+        histograms = self.histograms_by.setdefault(name, {})
+        if id in histograms or len(histograms) < MOST_IDS:
+            histograms.setdefault(id, Histogram()).add(value)
+        else:
+            self.count("ids_uncounted")
 
     def count(self, name: str, by: int = 1) -> None:
         self.counts[name] = self.counts.get(name, 0) + by

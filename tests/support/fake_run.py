@@ -15,7 +15,7 @@ from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario
 from swarm.grid import STEP_COL, STEP_ROW, TILE_CELLS, walk
 from swarm.liveness import Peer
-from swarm.runtime.stats import Counters
+from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF, GAPS_OF, GAPS_TO, Counters
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
@@ -64,9 +64,13 @@ def fake_run(terrain: Terrain, truth: NDArray[np.float32], scenario: Scenario, h
                 chased[id] = min(costs, key=lambda target: float(costs[target].flat[cell]))
                 route = _descend(costs[chased[id]], cell, 400)
                 cost_s = float(costs[chased[id]].flat[cell]) * grid.resolution_m
+                excess = abs(float(rng.normal(0, 0.01)))
+                counters["agent"].observe("followed_gap_excess", excess)
+                counters["agent"].observe_by(GAPS_TO, chased[id], excess)
+                counters["agent"].observe_by(GAPS_OF, id, excess)
                 yield now_ns, Followed(
                     vehicle=id, target=chased[id], start=cell, directions=route,
-                    cost_s=cost_s, lower_bound_s=cost_s / (1 + abs(rng.normal(0, 0.01))),
+                    cost_s=cost_s, lower_bound_s=cost_s / (1 + excess),
                 )  # fmt: skip
             states[id] = VehicleState.WAITING if step < 3 and rng.random() < 0.5 else VehicleState.FOLLOWING
             route = _descend(costs[chased[id]], cell, moves)
@@ -83,9 +87,19 @@ def fake_run(terrain: Terrain, truth: NDArray[np.float32], scenario: Scenario, h
                 if rng.random() < 0.3:
                     captures[target] += 1
                     counters["targets"].count("captures")
+                    counters["targets"].count_by(CAPTURES_OF, target)
+                    counters["targets"].count_by(CAPTURES_BY, id)
                     yield (
                         now_ns,
-                        _note("targets", "d0", now_ns, "capture", f"{id} captured {target}", target_cells[target]),
+                        _note(
+                            "targets",
+                            "d0",
+                            now_ns,
+                            "capture",
+                            f"{id} captured {target}",
+                            target_cells[target],
+                            target,
+                        ),
                     )
                     target_cells[target] = int(rng.choice(passable))
                     costs.pop(target)
@@ -133,6 +147,8 @@ def fake_run(terrain: Terrain, truth: NDArray[np.float32], scenario: Scenario, h
                     following=sum(1 for t in chased.values() if t == id), gap_mean=gap, gap_p95=gap * 1.01,
                     gap_max=gap * 1.03,
                 )  # fmt: skip
+    for role, id in (("planner", "t0"), ("agent", "a0"), ("targets", "d0")):
+        yield now_ns, _stats(role, id, counters[role], now_ns)
 
 
 def _descend(cost: NDArray[np.float64], cell: int, steps: int) -> bytes:
@@ -190,8 +206,8 @@ def _fleet(resolution_m, cols, agent, ids, vehicles, states, chased, seq, now_ns
     )  # fmt: skip
 
 
-def _note(role: str, id: str, now_ns: int, kind: str, text: str, cell: int | None) -> Note:
-    return Note(role=role, id=id, stamp_ns=now_ns, kind=kind, text=text, cell=cell)
+def _note(role: str, id: str, now_ns: int, kind: str, text: str, cell: int | None, target: str) -> Note:
+    return Note(role=role, id=id, stamp_ns=now_ns, kind=kind, text=text, cell=cell, target=target)
 
 
 def _stats(role: str, id: str, counters: Counters, now_ns: int) -> Stats:
@@ -199,4 +215,9 @@ def _stats(role: str, id: str, counters: Counters, now_ns: int) -> Stats:
         role=role, id=id, incarnation=1, stamp_ns=now_ns,
         counts=dict(counters.counts), gauges=dict(counters.gauges),
         histograms={name: dict(histogram.buckets) for name, histogram in counters.histograms.items()},
+        counts_by={name: dict(counts) for name, counts in counters.counts_by.items()},
+        histograms_by={
+            name: {id: dict(histogram.buckets) for id, histogram in each.items()}
+            for name, each in counters.histograms_by.items()
+        },
     )  # fmt: skip

@@ -20,6 +20,10 @@ from vehicle_agent.driving.vehicle import Vehicle
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
 _OFF_ROUTE = 4.0
+_SHORTEST_CUT = 0.5
+"""Where steps cost by what they climb: by how much any cell but the route's next is better than to stay, in cells.
+Planners know better than hosts what steps cost, so it is less than for the next; but more than for the next with a
+vehicle on it."""
 _DIAGONAL = math.sqrt(2.0) - 1.0
 _OCCUPIED = 0.9
 """What it costs to push another vehicle, in cells: less than a step, so that one without another way pushes."""
@@ -128,6 +132,7 @@ class Steering:
                 steps,
                 key=lambda cell: (
                     self._bodies.danger(cell) if flees else 0.0,
+                    self._is_one_way(here, cell),
                     not in_reach(vehicle.target, cell),
                     cell in held,
                     hash((lot, cell)),
@@ -138,14 +143,18 @@ class Steering:
         if not still:
             return Wish(ahead, (), 0, age_ms)
         near = self._places(vehicle.route.near(_NEAR_CELLS))
-        cost = {cell: self._cost(cell, near) + _OCCUPIED * (cell in held) for cell in self.steps(here)}
-        if self.threatened(here):
-            wants = sorted(cost, key=lambda cell: (self._bodies.danger(cell), cost[cell], hash((lot, cell))))
-            return Wish(ahead, wants, len(wants), _OLDEST_MS)
-        wants = sorted(cost, key=lambda cell: (cost[cell], hash((lot, cell))))
         stays = self._cost(here, near)
-        better = len(wants) if pushed_ms else sum(each < stays for each in cost.values())
-        return Wish(ahead, wants, better, age_ms)
+        cost, one_way = self._costs(here, stays, near)
+        for cell in cost:
+            cost[cell] += _OCCUPIED * (cell in held)
+        if self.threatened(here):
+            wants = sorted(
+                cost, key=lambda cell: (self._bodies.danger(cell), cell in one_way, cost[cell], hash((lot, cell)))
+            )
+            return Wish(ahead, wants, len(wants), _OLDEST_MS)
+        wants = sorted(cost, key=lambda cell: (cell in one_way, cost[cell], hash((lot, cell))))
+        better = sum(cost[cell] < stays and cell not in one_way for cell in wants)
+        return Wish(ahead, wants, len(wants) if pushed_ms else better, age_ms)
 
     def threatened(self, cell: int) -> bool:
         """Whether a body is on a cell or comes to it: who stands there makes way before all others."""
@@ -197,19 +206,48 @@ class Steering:
             return steps
         return [each for each in steps if self._climb.allows(cell, each)]
 
-    def _places(self, route: Sequence[int]) -> list[tuple[int, int, float]]:
-        """(row, column, cells of the route from there on) of each cell of a route."""
-        length = len(route)
-        return [(*divmod(cell, self._grid.cols), float(length - index)) for index, cell in enumerate(route)]
+    def _is_one_way(self, tail: int, head: int) -> bool:
+        """Whether a step between neighbours could not be taken back, as it is too steep the other way: it may lead
+        where no way leads out."""
+        return self._climb is not None and not self._climb.allows(head, tail)
 
-    def _cost(self, cell: int, route: Sequence[tuple[int, int, float]]) -> float:
-        """Cost-to-go of a cell by the route near it, in cells: back onto the route in one step, then along it."""
+    def _costs(
+        self, here: int, stays: float, route: Sequence[tuple[int, int, int, float]]
+    ) -> tuple[dict[int, float], Container[int]]:
+        """(cost-to-go of each cell to which one may drive, those that are the last resort).
+
+        Where steps cost by what they climb nothing is better than the next cell of the route, unless somebody is
+        there, and steps beside it that could not be taken back are for those who must make way only.
+        """
+        cost = {cell: self._cost(cell, route) for cell in self.steps(here)}
+        if self._climb is None:
+            return cost, ()
+        cells = [cell for cell, *_ in route]
+        if here in cells:
+            for cell in cost.keys() - {*cells[cells.index(here) + 1 :][:1]}:
+                cost[cell] = max(cost[cell], stays - _SHORTEST_CUT)
+        return cost, {cell for cell in cost.keys() - set(cells) if self._is_one_way(here, cell)}
+
+    def _places(self, route: Sequence[int]) -> list[tuple[int, int, int, float]]:
+        """(cell, row, column, cells of the route from there on) of each cell of a route."""
+        length = len(route)
+        return [(cell, *divmod(cell, self._grid.cols), float(length - index)) for index, cell in enumerate(route)]
+
+    def _cost(self, cell: int, route: Sequence[tuple[int, int, int, float]]) -> float:
+        """Cost-to-go of a cell by the route near it, in cells: back onto the route in one step, then along it.
+
+        Where steps cost by what they climb a route winds, beside cells of its own to which a step is too steep or
+        too dear. Then a cell of it costs what is left of it, so that the next one is always better than to stay.
+        """
         row, col = divmod(cell, self._grid.cols)
         best = math.inf
-        for there_row, there_col, rest in route:
+        for there, there_row, there_col, rest in route:
+            if self._climb is not None and there == cell:
+                return rest
             south, east = abs(row - there_row), abs(col - there_col)
             apart = south + _DIAGONAL * east if south > east else east + _DIAGONAL * south
-            cost = rest + apart if apart < 2.0 else rest + _OFF_ROUTE + 2.0 * apart
+            beside = apart < 2.0 and (self._climb is None or self._climb.allows(cell, there))
+            cost = rest + apart if beside else rest + _OFF_ROUTE + 2.0 * apart
             if cost < best:
                 best = cost
         return best

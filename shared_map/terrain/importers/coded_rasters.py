@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from shared_map.terrain.importers.encoded_heights import TITLES, heights_decoded
-from shared_map.terrain.importers.georeference import crs_of, plan_grid
+from shared_map.terrain.importers.georeference import crs_of, overruled, plan_grid
 from shared_map.terrain.importers.land_cover import read_cover
 from shared_map.terrain.importers.raster_contents import Contents, contents_of
 from shared_map.terrain.importers.rasters import elevation_of
@@ -36,14 +36,15 @@ def of_other_contents(dataset: Any, path: Path, config: TerrainConfig, progress:
 
 def _cover(dataset: Any, path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A land-cover map alone: its classes on level ground."""
-    crs, transform, _ = _place(dataset, path, config)
+    crs, transform, placed = _place(dataset, path, config)
     grid, _, notes = plan_grid(
         transform, dataset.height, dataset.width, crs, config.resolution_m, f"terrain {path}"
     )
     cover = read_cover(path, grid, config, progress)
     level = np.zeros((grid.rows, grid.cols), np.float32)
     alone = "there are no heights: the land cover lies on level ground, and slopes cost nothing"
-    return Source(grid, level, cover.classes, factor=cover.factor, notes=(str(path), *notes, *cover.notes, alone))
+    told = (str(path), *placed, *notes, *cover.notes, alone)
+    return Source(grid, level, cover.classes, factor=cover.factor, notes=told)
 
 
 def _colours(dataset: Any, holds: Contents, path: Path, config: TerrainConfig, progress: Progress) -> Source:
@@ -68,7 +69,8 @@ def _place(dataset: Any, path: Path, config: TerrainConfig) -> tuple[Any, Any, t
     from rasterio.transform import from_origin
 
     if dataset.crs or not dataset.transform.is_identity:
-        return crs_of(dataset.crs, config.crs, f"terrain {path}"), dataset.transform, ()
+        crs = crs_of(dataset.crs, config.crs, f"terrain {path}")
+        return crs, dataset.transform, overruled(dataset.crs, config.crs)
     tile = re.search(r"(?:^|/)(\d{1,2})/(\d{1,8})/(\d{1,8})(?:@2x)?\.\w+$", path.as_posix())
     if tile is not None and dataset.height == dataset.width and config.crs is None:
         zoom, col, row = (int(number) for number in tile.groups())

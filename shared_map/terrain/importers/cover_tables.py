@@ -245,7 +245,7 @@ def read_cover_table(path: Path) -> CoverTable:
     Parameters
     ----------
     path : Path
-        CSV. A first line whose first cell has no digit is a header.
+        CSV with commas, semicolons or tabs. A first line whose first cell has no digit is a header.
 
     Raises
     ------
@@ -254,7 +254,8 @@ def read_cover_table(path: Path) -> CoverTable:
     """
     grounds: dict[int, Ground] = {}
     for number, line in enumerate(read_text(path, FileKind.COVER_TABLE, "utf-8-sig").splitlines(), 1):
-        cells = [cell.strip().strip('"') for cell in line.replace(";", ",").replace("\t", ",").split(",", 2)]
+        mark = next((char for char in line if char in ",;\t"), ",")
+        cells = [cell.strip().strip('"') for cell in line.split(mark, 2)]
         if not any(cells) or cells[0].startswith("#"):
             continue
         what = f"cover codes {path}, line {number}"
@@ -264,7 +265,8 @@ def read_cover_table(path: Path) -> CoverTable:
             raise TerrainError(f"{what}: {cells[0][:40]!r} is no code; expected a whole number")
         code = int(cells[0][:12])
         try:
-            value = _parsed(cells[1].lower())
+            # A comma that parts no cells is that of a number: 7;1,7 is a pace of 1.7.
+            value = _parsed(cells[1].lower().replace(",", "."))
         except (ValueError, IndexError) as error:
             found = cells[1][:40] if len(cells) > 1 else ""
             kinds = ", ".join(kind.name.lower() for kind in TerrainClass)

@@ -57,6 +57,18 @@ def crs_of(found: Any, given: str | None, what: str) -> Any:
     return found
 
 
+def overruled(found: Any, given: str | None) -> tuple[str, ...]:
+    """A note where `terrain.crs` (`given`) contradicts what the file itself says (`found`)."""
+    if given is None or not found or not (found.is_geographic or found.is_projected):
+        return ()
+    import rasterio
+
+    counts = rasterio.CRS.from_user_input(given)
+    if counts == found:
+        return ()
+    return (f"terrain.crs = {given!r} counts, though the file says {crs_name(found)}: every place follows from it",)
+
+
 def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) -> Any:
     """The same system if its metres are true within `MOST_STRETCH`, else a local one: equidistant cylindrical while
     its scale is right within 1 % (no voids at the corners), transverse Mercator beyond.

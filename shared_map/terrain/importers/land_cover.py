@@ -120,7 +120,7 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
                 ]
             if share < 0.999:
                 notes.append(f"the land cover's frame covers {share:.1%} of the terrain")
-        return _read(dataset, meaning, grid, crs, target, notes, progress)
+        return _read(dataset, what, meaning, grid, crs, target, notes, progress)
 
 
 def _taken(dataset: Any, crs: Any, grid: GridSpec, target: Any) -> str:
@@ -139,7 +139,14 @@ def _method(dataset: Any, crs: Any, grid: GridSpec, target: Any) -> Any:
 
 
 def _read(
-    dataset: Any, meaning: Meaning, grid: GridSpec, crs: Any, target: Any, notes: list[str], progress: Progress
+    dataset: Any,
+    what: str,
+    meaning: Meaning,
+    grid: GridSpec,
+    crs: Any,
+    target: Any,
+    notes: list[str],
+    progress: Progress,
 ) -> Cover:
     from rasterio.windows import Window
 
@@ -161,7 +168,7 @@ def _read(
         classes[row0:row1], factor[row0:row1], known[row0:row1] = kinds[at], factors[at], states[at] == 0
         cells += np.bincount(at.reshape(-1), minlength=len(cells))
         progress("reading land cover", row1 / grid.rows)
-    return Cover(classes, factor, known, (*notes, *_told(meaning, cells, states)))
+    return Cover(classes, factor, known, (*notes, *_told(what, meaning, cells, states)))
 
 
 _STRANGE, _EMPTY = HIGHEST_CODE + 1, HIGHEST_CODE + 2
@@ -241,10 +248,19 @@ def _warped(
     return codes
 
 
-def _told(meaning: Meaning, cells: NDArray[np.int64], states: Bytes) -> Iterable[str]:
-    """What people should know: the table, the codes that it has and those that it lacks, cells without any."""
+def _told(what: str, meaning: Meaning, cells: NDArray[np.int64], states: Bytes) -> Iterable[str]:
+    """What people should know: the table, the codes that it has and those that it lacks, cells without any.
+
+    Raises TerrainError if the table has none of the codes: then it is that of another map.
+    """
     total, table = int(cells.sum()), meaning.table
     there = np.flatnonzero(cells)
+    strange = [code for code in there.tolist() if states[code] == 1]
+    if strange and not cells[states == 0].any():
+        raise TerrainError(
+            f"{what}: none of its codes on the terrain ({some(strange)}) is in the table, {table.title};"
+            " terrain.cover_codes names another"
+        )
     most = sorted((code for code in there.tolist() if states[code] == 0), key=lambda code: -cells[code])
     listed = [
         f"{code} {table.grounds[code].name} {cells[code] / total:.1%} ({table.grounds[code].shown})".replace(
@@ -254,7 +270,6 @@ def _told(meaning: Meaning, cells: NDArray[np.int64], states: Bytes) -> Iterable
     ]
     more = f" and {len(most) - _TOLD_CODES} more" if len(most) > _TOLD_CODES else ""
     yield f"land cover: {table.title}, {meaning.how}: {', '.join(listed) or 'none of its codes'}{more}"
-    strange = [code for code in there.tolist() if states[code] == 1]
     if strange:
         share = cells[strange].sum() / total
         codes = [code for code in strange if code <= HIGHEST_CODE]

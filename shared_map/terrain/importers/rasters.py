@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Floats
-from shared_map.terrain.importers.georeference import crs_of, plan_grid, resampling
+from shared_map.terrain.importers.georeference import crs_of, overruled, plan_grid, resampling
 from shared_map.terrain.importers.level_ground import MOST_SAMPLED, looked_at
 from shared_map.terrain.importers.raster_kinds import kind_of
 from shared_map.terrain.importers.voids import without
@@ -190,6 +190,7 @@ def elevation_of(dataset: Any, path: Path, config: TerrainConfig, progress: Prog
     grid, target, notes = plan_grid(
         dataset.transform, dataset.height, dataset.width, crs, config.resolution_m, f"terrain {path}"
     )
+    notes += overruled(dataset.crs, config.crs)
     factor, offset = float(dataset.scales[0] or 1.0), float(dataset.offsets[0] or 0.0)
     if (factor, offset) != (1.0, 0.0):
         notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")

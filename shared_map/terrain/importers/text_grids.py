@@ -250,12 +250,12 @@ def _points(path: Path, layout: _Layout) -> PlainGrid:
         if total > _MOST_KEPT:
             kept = None
     across, down = _axis(xs, "x", path), _axis(ys, "y", path)
-    check_cells(down.count, across.count, path)
     cells = down.count * across.count
     if total < _LEAST_FILLED * cells:
         raise _irregular(
             path, f"{total} points are {total / cells:.1%} of a grid of {across.step:g} x {down.step:g}"
         )
+    check_cells(down.count, across.count, path)
     heights = np.full(cells, np.nan, np.float32)
     for part in _numbers(path, layout) if kept is None else kept:
         col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)

@@ -7,6 +7,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from swarm.wire.fields import (
+    IDS,
     SMALL,
     Bucket,
     Cell,
@@ -51,7 +52,10 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
-    """What a process has counted since its incarnation began. Histograms are as in `swarm.runtime.stats`."""
+    """What a process has counted since its incarnation began. Histograms are as in `swarm.runtime.stats`.
+
+    counts_by, histograms_by    name -> id of a target or vehicle -> the same, of that one alone
+    """
 
     role: Id
     id: Id
@@ -60,6 +64,11 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
     counts: Annotated[dict[Word, Count], SMALL]
     gauges: Annotated[dict[Word, Gauge], SMALL]
     histograms: Annotated[dict[Word, Annotated[dict[Bucket, Count], Meta(max_length=40_000)]], SMALL]
+    counts_by: Annotated[dict[Word, Annotated[dict[Id, Count], IDS]], Meta(max_length=16)] = {}
+    histograms_by: Annotated[
+        dict[Word, Annotated[dict[Id, Annotated[dict[Bucket, Count], Meta(max_length=40_000)]], IDS]],
+        Meta(max_length=16),
+    ] = {}
 
 
 class Beat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
@@ -74,7 +83,8 @@ class Beat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
 
 
 class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):
-    """An event for people: a capture, a restart, a closed road found. `cell` is its place, if it has one."""
+    """An event for people: a capture, a restart, a closed road found. `cell` is its place, if it has one, `target`
+    the target that it is about."""
 
     role: Id
     id: Id
@@ -82,3 +92,4 @@ class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):
     kind: Word
     text: Text
     cell: Cell | None = None
+    target: Id | None = None

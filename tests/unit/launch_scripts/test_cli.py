@@ -13,6 +13,7 @@ import pytest
 
 from launch_scripts.cli import main
 from launch_scripts.launcher import options
+from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario, TlsConfig
 from swarm.errors import BusError, ConfigError, StoreError
 
@@ -187,8 +188,16 @@ def test_a_run_has_one_folder_whenever_it_is_started_again(tmp_path: Path) -> No
         options.make_run_dir(Path("/proc/nowhere"), "x")
 
 
-def test_simulate_prints_the_same_report_as_a_run(run) -> None:  # type: ignore[no-untyped-def]
-    pytest.importorskip("launch_scripts.simulation.simulate")
-    code, out, _ = run("simulate", "synthetic", "--seconds", "2", "--json")
+def test_simulate_prints_the_report_of_a_run_and_leaves_its_folder(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    code, out, _ = run("simulate", "synthetic", "--seconds", "2", "--seed", "9", "--runs", str(tmp_path), "--json")
     assert code == 0
-    assert json.loads(out)["scenario"] == "synthetic"
+    printed = json.loads(out)
+    assert printed["scenario"] == "synthetic"
+    last = tmp_path / "LAST"
+    report = json.loads((last / "report.json").read_text())
+    assert {name: report[name] for name in printed if name != "run_id"} == {
+        name: value for name, value in printed.items() if name != "run_id"
+    }
+    assert report["run_id"] == last.resolve().name
+    again = load_scenario(last / "scenario.toml")
+    assert (again.name, again.seed, again.seconds) == ("synthetic", 9, 2.0)

@@ -36,9 +36,9 @@ def test_an_event_log_that_fits_is_whole(tmp_path: Path) -> None:
     assert (tmp_path / "events.log").read_text() == "0.000000001 crash a\n"
 
 
-def test_a_simulation_whose_trace_finds_no_space_prints_its_figures_and_says_so() -> None:
+def test_a_simulation_whose_trace_finds_no_space_prints_its_figures_and_says_so(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
-    command += ["simulate", "jacksboro", "--seconds", "1", "--trace", "/dev/full"]
+    command += ["simulate", "jacksboro", "--seconds", "1", "--trace", "/dev/full", "--runs", str(tmp_path)]
     told = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert told.returncode == 6, told.stderr
     assert "vehicles that had a route" in told.stdout

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from launch_scripts.launcher.live_table import plain_line
+from launch_scripts.report.certified_gap import CertifiedGap
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.samples import Sample, Samples
 from launch_scripts.report.tracks import Tracks
@@ -18,12 +19,12 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.runtime.stats import Histogram
-from swarm.wire.fields import pack_column
+from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Histogram
+from swarm.wire.fields import ZERO_BUCKET, pack_column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Beat, Stats
+from swarm.wire.messages.processes import Beat, Note, Stats
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 from swarm.wire.statements import MarkKind
@@ -242,11 +243,24 @@ def test_a_vehicle_that_crosses_into_another_region_is_counted_once_where_it_is_
     }  # fmt: skip
 
 
-def test_a_capture_is_placed_where_the_target_was_before_it_jumped(recorder: Recorder) -> None:
+def capture(target: str, cell: int) -> Note:
+    return Note(
+        role="targets",
+        id="d0",
+        stamp_ns=1,
+        kind="capture",
+        text="a captured it",
+        cell=cell,
+        target=target,
+    )
+
+
+def test_a_capture_is_placed_where_the_target_was_though_nobody_tracks_it(recorder: Recorder) -> None:
     hear(recorder, pose("t0", 100.0, 200.0, 1), at_s=1.0)
-    hear(recorder, pose("t0", 700.0, 50.0, 2, captures=1), at_s=3.0)
-    (capture,) = recorder.captures
-    assert (capture.time_s, capture.east_m, capture.south_m) == (2.0, 100.0, 200.0)
+    hear(recorder, capture("t1", 3 * GRID.cols + 5), capture("t1", GRID.cells), at_s=3.0)
+    (placed,) = recorder.captures
+    metres = GRID.resolution_m
+    assert (placed.time_s, placed.target, placed.east_m, placed.south_m) == (2.0, "t1", 5.5 * metres, 3.5 * metres)
 
 
 def test_a_jump_begins_a_new_piece_of_a_targets_track(recorder: Recorder) -> None:
@@ -305,11 +319,14 @@ def test_the_live_table_has_a_line_per_target(recorder: Recorder) -> None:
         pose("t0", 100.0, 100.0, 1),
         fleet("a0.1", {"a0-00": (130.0, 140.0), "a0-01": (500.0, 100.0)}),
         status("t0", 1.02),
+        msgspec.structs.replace(stats("agent", "a0"), histograms_by={GAPS_TO: {"t0": {ZERO_BUCKET: 3}}}),
+        msgspec.structs.replace(stats("targets", "d0"), counts_by={CAPTURES_OF: {"t1": 2}}),
     )
     first, second = recorder.summary(0).targets
     assert (first.id, first.planner_up, first.following, first.nearest_m) == ("t0", True, 2, 50.0)
-    assert (first.growths, first.growth_ms, first.gap) == (5, 1.5, 1.02)
+    assert (first.growths, first.growth_ms, first.gap) == (5, 1.5, CertifiedGap(1.0, 1.0, 1.0, 3))
     assert (second.id, second.planner_up, second.following, second.nearest_m) == ("t1", False, 0, None)
+    assert (first.captures, second.captures) == (0, 2)
 
 
 def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_it_is_back(
@@ -412,7 +429,7 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recor
     def record(from_s: int, until_s: int, step_s: int) -> int:
         for at_s in range(from_s, until_s, step_s):
             places = {f"a0-{n:02d}": (float(at_s % 900), 5.0) for n in range(4)}
-            hear(recorder, fleet("a0.1", places, at_s), pose("t0", 1.0, 2.0, at_s, captures=at_s), at_s=at_s)
+            hear(recorder, fleet("a0.1", places, at_s), pose("t0", 1.0, 2.0, at_s), capture("t0", 7), at_s=at_s)
         recorder.vehicle_tracks._limit = recorder.target_tracks._limit = 2000
         return len(
             pickle.dumps([recorder.samples, recorder.captures, recorder.vehicle_tracks, recorder.target_tracks])
@@ -421,4 +438,4 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recor
     hour = record(0, 12_000, 2)
     day = record(12_000, 40_000, 2)
     assert day < 1.5 * hour
-    assert recorder.captures_of["t0"] == 39_998
+    assert len(recorder.captures) == recorder.captures.maxlen

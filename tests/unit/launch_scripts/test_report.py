@@ -93,7 +93,9 @@ def test_the_report_has_every_number_that_was_asked_for(
     image = imread(tmp_path / "report.png")
     assert image.shape[:2] == (round(picture.HEIGHT_IN * picture.DPI), round(picture.WIDTH_IN * picture.DPI))
     assert image[..., :3].std() > 0.1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "report.png", "tracks.npz"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "groups.csv", "report.json", "report.png", "targets.csv", "tracks.npz", "vehicles.csv"
+    ]  # fmt: skip
 
 
 def test_vehicles_are_green_targets_red_and_marks_violet_on_the_map(

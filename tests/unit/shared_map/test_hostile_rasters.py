@@ -185,3 +185,16 @@ def test_a_sea_floor_is_doubted(tmp_path: Path) -> None:
     for water_below_m, told in ((None, 1), (0.0, 0)):
         terrain = build_terrain(Scenario(terrain=TerrainConfig(source=path, water_below_m=water_below_m)))
         assert sum("a sea floor" in doubt for doubt in doubts_about(facts_of(terrain))) == told
+
+
+def test_a_setting_that_contradicts_the_file_is_said_aloud(tmp_path: Path) -> None:
+    path = written(tmp_path / "dem.tif")
+    said = "terrain.crs = 'EPSG:32633' counts, though the file says EPSG:32632: every place follows from it"
+    notes = {
+        crs: read_elevation(path, TerrainConfig(source=str(path), crs=crs)).notes
+        for crs in (None, "EPSG:32632", "EPSG:32633")
+    }
+    assert {crs for crs, told in notes.items() if said in told} == {"EPSG:32633"}
+    bare = written(tmp_path / "bare.tif", crs=None)
+    told = read_elevation(bare, TerrainConfig(source=str(bare), crs="EPSG:32633")).notes
+    assert not any("counts" in note for note in told)

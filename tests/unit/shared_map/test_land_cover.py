@@ -204,6 +204,27 @@ def test_codes_of_ones_own_come_from_the_scenario_or_a_csv_file(tmp_path: Path, 
 
 
 @pytest.mark.parametrize(
+    "line", ["7;1,7;Moor", "7;1.7;Moor", "7,1.7,Moor", "7\t1,7\tMoor", '7;"1,7";"Moor"', "7,1.7,Moor; wet"]
+)
+def test_a_pace_is_read_as_it_is_written_whatever_parts_the_cells(tmp_path: Path, line: str) -> None:
+    table = tmp_path / "codes.csv"
+    table.write_text(f"{line}\n", encoding="utf-8")
+    ground = read_cover_table(table).grounds[7]
+    assert ground.factor == 1.7
+    assert ground.name == ("Moor; wet" if line.endswith("wet") else "Moor")
+
+
+def test_a_table_that_has_none_of_the_codes_is_no_table_of_this_map(tmp_path: Path, dem: Path) -> None:
+    cover = str(written(tmp_path / "cover.tif", patches([3, 7, 9]), "uint8"))
+    with pytest.raises(
+        TerrainError, match=r"cover.tif: none of its codes on the terrain \(3, 7, 9\) is in the table"
+    ):
+        load(dem, cover=cover, cover_codes="worldcover")
+    one = load(dem, cover=cover, cover_codes="worldcover", cover_classes={"9": "rock"})
+    assert said(one.notes, "codes 3, 7 on")
+
+
+@pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("1,forest\n1,rock", "line 2: code 1 comes twice"),

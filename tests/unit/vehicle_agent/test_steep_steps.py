@@ -10,9 +10,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.scenario import CostConfig, PlannerConfig
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, walk
+from swarm.wire.routes import RouteStatus
 from vehicle_agent.bodies import Bodies
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.vehicle import Vehicle
@@ -97,3 +99,46 @@ def test_a_vehicle_stands_before_a_step_that_is_too_steep_and_gets_back_from_one
         drive(1.0)
     assert vehicle.motion.at_rest
     assert vehicle.cell == above
+
+
+@given(st.integers(0, 1 << 32), st.sampled_from([0.5, 1.5, 3.0]))
+@settings(max_examples=60, deadline=None)
+def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, relief_m: float) -> None:
+    """Up a steep slope a route winds beside cells of its own that are too steep, or too dear, to go to at once."""
+    rng = np.random.default_rng(seed)
+    climb = climb_on(rng.normal(0, relief_m, (8, 8)))
+    pace = np.where(rng.random((8, 8)) < 0.1, np.inf, LEVEL).astype(np.float32)
+    target, start = rng.choice(np.flatnonzero(np.isfinite(pace)), 2).tolist()
+    tree, steering, vehicle = (
+        TargetTree(GRID, PlannerConfig(), climb),
+        steering_on(climb, pace),
+        Vehicle("v", GRID, start),
+    )
+    tree.update(pace, target, [], 0)
+    route = tree.routes([start])[0]
+    if route.status is not RouteStatus.OK:
+        return
+    vehicle.target = "t"
+    cells = walk(GRID, start, route.directions)
+    vehicle.route.begin(cells, [start])
+    for here, after in pairwise(cells):
+        wish = steering.wish(vehicle, [here], 0, 1, (), lambda *_: False, seed)
+        assert wish.better > 0
+        assert wish.wants[0] == after == wish.ahead[0]
+        # Somebody in the way is pushed on, or passed; to stay is no answer.
+        assert after in steering.wish(vehicle, [here], 0, 1, {after}, lambda *_: False, seed).wants[: wish.better]
+        vehicle.route.moved(after)
+
+
+@given(st.integers(0, 1 << 32), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_who_must_make_way_goes_last_where_it_could_not_come_back_from(seed: int, near: bool) -> None:
+    rng = np.random.default_rng(seed)
+    climb = climb_on(rng.normal(0, 2.0, (8, 8)))
+    steering, here = steering_on(climb), int(rng.integers(GRID.cells))
+    vehicle = Vehicle("v", GRID, here)
+    vehicle.target, vehicle.in_reach = "t", near
+    wants = steering.wish(vehicle, [here], 1, 1, (), lambda *_: near, seed).wants
+    back = [climb.allows(each, here) for each in wants]
+    assert sorted(wants) == sorted(steering.steps(here))
+    assert back == sorted(back, reverse=True)

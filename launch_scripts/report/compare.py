@@ -1,0 +1,118 @@
+"""What differs between runs, and their figures beside each other. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from launch_scripts.report.certified_gap import percent
+
+_WHERE_ONLY = ("network.listen", "network.connect", "monitor.grpc_port", "monitor.web_port")
+"""Keys that say where a run was met, not what ran: free ports differ each time."""
+_SUMMED = {
+    "distance_m": "driven by all, m",
+    "waiting_s": "waited for routes, s",
+    "standing_s": "stood with a route, s",
+}
+"""Columns of `by_group` that are summed over groups."""
+
+
+@dataclass(frozen=True)
+class LeftRun:
+    """What a run has left.
+
+    settings  its scenario, as TOML was read; None where there is no file of it
+    """
+
+    name: str
+    report: Mapping[str, Any]
+    settings: Mapping[str, Any] | None
+
+
+Row = tuple[str, list[Any]]
+"""A key or figure, and its value in each run; None where a run has none."""
+
+
+def settings_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
+    """Keys of the scenarios whose values are not the same in all runs that have a scenario."""
+    known = [None if run.settings is None else _flat(run.settings, "") for run in runs]
+    told = [each for each in known if each is not None]
+    return [
+        (key, [None if each is None else each.get(key) for each in known])
+        for key in dict.fromkeys(key for each in told for key in each)
+        if not key.startswith(_WHERE_ONLY) and _differ(each.get(key) for each in told)
+    ]
+
+
+def circumstances_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
+    """Versions and machines that are not the same."""
+    made = [run.report.get("made") for run in runs]
+    flat = [_flat(each, "") if isinstance(each, Mapping) else {} for each in made]
+    keys = dict.fromkeys(key for each in flat for key in each if key.startswith(("versions.", "machine.")))
+    return [(key, [each.get(key) for each in flat]) for key in keys if _differ(each.get(key) for each in flat)]
+
+
+def figures(runs: Sequence[LeftRun], labels: Mapping[str, str]) -> list[Row]:
+    """The figures of all runs.
+
+    labels  name in the report -> what people call it
+    """
+    rows: list[Row] = []
+    for name, label in labels.items():
+        values = [run.report.get(name) for run in runs]
+        parts = dict.fromkeys(part for value in values if isinstance(value, Mapping) for part in value)
+        if not parts:
+            rows.append((label, values))
+        for part in parts:
+            of_part = [value.get(part) if isinstance(value, Mapping) else None for value in values]
+            rows.append((f"{label}, {part}", of_part))
+    for name, label in _SUMMED.items():
+        rows.append((label, [_sum(run.report.get("by_group"), name) for run in runs]))
+    targets = dict.fromkeys(id for run in runs for id in _table(run.report.get("by_target")))
+    for id in targets:
+        told = [_table(_table(run.report.get("by_target")).get(id)) for run in runs]
+        rows.append((f"captures of {id}", [each.get("captures") for each in told]))
+    return [row for row in rows if any(value is not None for value in row[1])]
+
+
+def text_of(label: str, value: Any) -> str:
+    """A value for people."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    if label.startswith("certified gap, ") and not label.endswith("unproven"):
+        return percent(value)
+    return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
+
+
+def _flat(settings: Any, path: str) -> dict[str, Any]:
+    """`terrain.hidden.closed_roads`, `targets[0].count`; a list of values is one value."""
+    if isinstance(settings, Mapping) and settings:
+        inside: Iterable[tuple[str, Any]] = (
+            (f"{path}.{key}" if path else str(key), value) for key, value in settings.items()
+        )
+    elif isinstance(settings, list) and settings and all(isinstance(each, Mapping) for each in settings):
+        inside = ((f"{path}[{n}]", value) for n, value in enumerate(settings))
+    else:
+        return {path: settings}
+    flat: dict[str, Any] = {}
+    for deeper, value in inside:
+        flat |= _flat(value, deeper)
+    return flat
+
+
+def _differ(values: Iterable[Any]) -> bool:
+    first, *others = values
+    return any(value != first for value in others)
+
+
+def _table(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _sum(by_group: Any, name: str) -> float | None:
+    values = [row.get(name) for row in _table(by_group).values() if isinstance(row, Mapping)]
+    numbers = [value for value in values if isinstance(value, int | float)]
+    return sum(numbers) if numbers else None

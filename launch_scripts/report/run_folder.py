@@ -1,0 +1,127 @@
+"""What a run folder holds from its first second on: scenario as run, versions, machine. And which run was last."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+from launch_scripts.report.files import write_file
+from launch_scripts.report.machine import processor
+from swarm.config.input_files import FileKind, read_text
+from swarm.config.scenario import Scenario
+from swarm.config.write import scenario_text
+from swarm.errors import ConfigError, StoreError
+
+SCENARIO_FILE, RUN_FILE, REPORT_FILE = "scenario.toml", "run.json", "report.json"
+LAST = "LAST"
+"""In the folder of all runs: a link to the newest; where links are impossible a file that holds its name."""
+_PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
+
+
+def begin_run(folder: Path, scenario: Scenario, run_id: str) -> list[str]:
+    """Write `scenario.toml` and `run.json`, and make `LAST` point here. Returns what a person should know: a run
+    goes on without them, as on a full disk."""
+    began = _now()
+    head = f"# Run {run_id}, {began}: every setting that it ran with. `swarm up` runs it again.\n"
+    facts = {"run_id": run_id, "scenario": scenario.name, "seed": scenario.seed, "began": began, **made_with()}
+    said = []
+    for name, text in (
+        (SCENARIO_FILE, head + scenario_text(scenario, Path.cwd())),
+        (RUN_FILE, json.dumps(facts, indent=1) + "\n"),
+    ):
+        try:
+            write_file(folder / name, text.encode())
+        except OSError as error:
+            said.append(f"cannot write {folder / name}: {error.strerror or error}")
+    sentence = point_last(folder)
+    return said if sentence is None else [*said, sentence]
+
+
+def made_with() -> dict[str, Any]:
+    """Versions and machine."""
+    return {
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(package) for name, package in _PACKAGES.items()},
+        },
+        "machine": {
+            "system": f"{platform.system()} {platform.release()}",
+            "processor": processor(),
+            "cores": os.cpu_count(),
+        },
+    }
+
+
+def ended(folder: Path) -> dict[str, Any]:
+    """The facts of `run.json` with the time of now as the run's end, for the report. Empty if there are none."""
+    try:
+        facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    kept = {name: facts[name] for name in ("began", "versions", "machine") if name in facts}
+    return {"began": kept.pop("began", None), "ended": _now(), **kept}
+
+
+def point_last(folder: Path) -> str | None:
+    """Let `LAST` beside a run's folder mean that run, at one instant. Returns a sentence the first time that it
+    cannot be a link, and whenever it cannot be at all."""
+    last = folder.parent / LAST
+    partial = folder.parent / f".{LAST}.{os.getpid()}"
+    try:
+        try:
+            partial.unlink(missing_ok=True)
+            partial.symlink_to(folder.name, target_is_directory=True)
+        except (OSError, NotImplementedError):
+            was_file = last.is_file()
+            partial.write_text(f"{folder.name}\n", encoding="utf-8")
+            partial.replace(last)
+            if was_file:
+                return None
+            return f"no links can be made in {folder.parent}: {LAST} is a file there that holds the run's name"
+        partial.replace(last)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        return f"{last} still means another run: {error.strerror or error}"
+    return None
+
+
+def find_run(name: str, runs: Path) -> Path:
+    """The folder of a run: a path, or its name in `runs`; `LAST` where it is a file, too. Raises ConfigError."""
+    for path in (Path(name), runs / name):
+        if path.is_dir():
+            return path
+        if path.name == LAST and path.is_file():
+            named = path.parent / read_text(path, FileKind.RUN).strip()
+            if named.is_dir():
+                return named
+    raise ConfigError(f"there is no run {name!r}: neither a folder nor in {runs}")
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    """`report.json` of a run. Raises ConfigError or StoreError in one sentence."""
+    path = folder / REPORT_FILE
+    if not path.exists():
+        raise ConfigError(f"{folder} has no {REPORT_FILE}: the run has not ended yet, or its launcher was killed")
+    try:
+        report = json.loads(read_text(path, FileKind.RUN))
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path} is damaged: {error}") from error
+    if not isinstance(report, dict):
+        raise StoreError(f"{path} is damaged: found no object, expected the figures of a run")
+    return report
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")

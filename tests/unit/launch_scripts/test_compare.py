@@ -1,0 +1,131 @@
+"""What differs between runs."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch_scripts.cli import main
+from launch_scripts.launcher.terminal import REPORTED
+from launch_scripts.report.compare import LeftRun, circumstances_that_differ, figures, settings_that_differ
+from swarm.config.load import parse_scenario
+from swarm.config.write import scenario_text
+
+GAP = {"mean": 1.05, "p95": 1.16, "max": 8.1, "unproven": 3}
+
+
+def left(name: str, settings: dict[str, Any] | None, **report: Any) -> LeftRun:
+    return LeftRun(name, report, settings)
+
+
+def test_only_keys_that_differ_are_named_and_ports_are_not() -> None:
+    first = {"seed": 1, "targets": [{"name": "t", "count": 2}], "network": {"listen": ["tcp/127.0.0.1:1"]}}
+    second = {
+        "seed": 1,
+        "targets": [{"name": "t", "count": 3}, {"name": "u"}],
+        "cost": {"zones": [], "preset": "hiker"},
+    }
+    assert settings_that_differ([left("a", first), left("b", second), left("old", None)]) == [
+        ("targets[0].count", [2, 3, None]),
+        ("targets[1].name", [None, "u", None]),
+        ("cost.zones", [None, [], None]),
+        ("cost.preset", [None, "hiker", None]),
+    ]
+    assert settings_that_differ([left("a", first), left("b", first)]) == []
+
+
+def test_figures_stand_beside_each_other_also_of_a_run_that_has_fewer() -> None:
+    groups = {"g": {"distance_m": 5.0}, "h": {"distance_m": 2.5}}
+    new = left("a", {}, captures=4, certified_gap=GAP, by_group=groups, by_target={"t": {"captures": 4}})
+    rows = dict(figures([new, left("b", {}, captures=2, certified_gap=None, by_group=[1])], REPORTED))
+    assert rows["captures"] == [4, 2]
+    assert rows["certified gap, p95"] == [1.16, None]
+    assert rows["driven by all, m"] == [7.5, None]
+    assert rows["captures of t"] == [4, None]
+    assert "messages/s" not in rows
+
+
+def test_versions_that_differ_are_named() -> None:
+    made = [{"versions": {"numpy": version}, "began": version, "machine": {"cores": 2}} for version in ("1", "2")]
+    runs = [left("a", {}, made=made[0]), left("b", {}, made=made[1])]
+    assert circumstances_that_differ(runs) == [("versions.numpy", ["1", "2"])]
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for name, seed in (("r1", 1), ("r2", 2)):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "scenario.toml").write_text(scenario_text(parse_scenario(f"seed = {seed}"), tmp_path))
+        (folder / "report.json").write_text(json.dumps({"captures": seed, "certified_gap": GAP}))
+    return tmp_path
+
+
+def compare(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr("sys.argv", ["swarm", "compare", *words])
+    try:
+        return main()
+    except SystemExit as ended:
+        return int(str(ended.code or 0))
+
+
+def test_the_command_shows_settings_and_figures(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert compare(monkeypatch, "r1", str(runs / "r2"), "--runs", str(runs)) == 0
+    told = [line.replace("│", "").split() for line in capsys.readouterr().out.splitlines()]
+    assert ["seed", "1", "2"] in told
+    assert ["certified", "gap,", "mean", "5.00%", "5.00%"] in told
+    assert ["captures", "1", "2"] in told
+    assert compare(monkeypatch, "r1", "r2", "--runs", str(runs), "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["scenario"] == {"seed": [1, 2]}
+    assert found["figures"]["certified gap, mean"] == [1.05, 1.05]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "sentence"),
+    [
+        ("report.json", b"[1]", "found no object, expected the figures of a run"),
+        ("report.json", b'{"captures": ', r"report\.json is damaged: "),
+        ("report.json", b"\xff\xfe", r"report\.json"),
+        ("report.json", b"[" * 100_000, r"report\.json is damaged"),
+        ("report.json", None, "has no report.json: the run has not ended yet"),
+        ("scenario.toml", b"seed = ", r"scenario\.toml"),
+    ],
+)
+def test_damaged_files_are_one_sentence(
+    runs: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    file: str,
+    content: bytes | None,
+    sentence: str,
+) -> None:
+    damaged = runs / "r2" / file
+    if content is None:
+        damaged.unlink()
+    else:
+        damaged.write_bytes(content)
+    assert compare(monkeypatch, "r1", "r2", "--runs", str(runs)) != 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(sentence, line), line
+
+
+def test_figures_that_are_none_of_ours_end_no_comparison(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    strange = {
+        "captures": {"a": [1]},
+        "certified_gap": {"mean": "[red]x", "max": True},
+        "by_group": {"g": 3, "h": {"distance_m": "x"}},
+        "by_target": {"t": 3},
+        "made": {"versions": [1]},
+    }
+    (runs / "r2" / "report.json").write_text(json.dumps(strange))
+    assert compare(monkeypatch, "r1", "r2", "--runs", str(runs)) == 0
+    assert "[red]x" in capsys.readouterr().out
