@@ -72,6 +72,18 @@ CLASS_FACTOR: Mapping[TerrainClass, float] = {
 """Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`. Shrub is the heavy
 brush of Soule and Goldman (1972), for people on foot; wetland is a judgement: vehicles get stuck there."""
 
+READABLE = (
+    TerrainClass.GRASS,
+    TerrainClass.SOIL,
+    TerrainClass.ROCK,
+    TerrainClass.BUILT,
+    TerrainClass.FOREST,
+    TerrainClass.SNOW,
+    TerrainClass.UNKNOWN,
+)
+"""What a cell of a photo may be read as, from general to particular: each is a bit of its readings, the first the
+lowest."""
+
 
 def gradient(elevation_m: Floats, resolution_m: float) -> tuple[Floats, Floats]:
     """Horn's derivative, metres per metre: (to the east, to the north).
@@ -185,14 +197,40 @@ def class_factors(cost: CostConfig) -> Floats:
     return factors
 
 
-def terrain_pace(grade_: Floats, classes: Bytes, cost: CostConfig, rough_m: Floats | None = None) -> Floats:
-    """Steps 1 and 2 of the merge rule. A NaN grade is a void."""
+def doubt_factors(cost: CostConfig) -> Floats:
+    """Factor of an unknown cell by its readings, bits of `READABLE`: the dearest of them.
+
+    A lethal reading counts only where all are lethal, or doubt would wall off what may be driven on. Without
+    readings, and where the scenario prices the unknown itself, `class_factors` has the factor."""
+    factors = class_factors(cost)
+    doubts = np.full(256, factors[TerrainClass.UNKNOWN], np.float32)
+    if "unknown" in cost.class_factor:
+        return doubts
+    for readings in range(1, 1 << len(READABLE)):
+        each = factors[[kind for n, kind in enumerate(READABLE) if readings >> n & 1]]
+        passable = each[np.isfinite(each)]
+        doubts[readings] = passable.max() if passable.size else LETHAL
+    return doubts
+
+
+def terrain_pace(
+    grade_: Floats,
+    classes: Bytes,
+    cost: CostConfig,
+    rough_m: Floats | None = None,
+    readings: Bytes | None = None,
+) -> Floats:
+    """Steps 1 and 2 of the merge rule. A NaN grade is a void; of unknown cells the readings count."""
     pace = slope_factor(grade_, cost)
     if cost.directional:
         pace[np.isfinite(pace)] = 1
     pace *= np.float32(1 / cost.flat_speed_m_per_s)
     if cost.classes:
-        pace *= class_factors(cost)[classes]
+        factors = np.take(class_factors(cost), classes)
+        if readings is not None:
+            doubtful = (classes == TerrainClass.UNKNOWN) & (readings > 0)
+            factors[doubtful] = doubt_factors(cost)[readings[doubtful]]
+        pace *= factors
     if rough_m is not None:
         pace *= np.float32(1) + np.float32(cost.rough_per_m) * rough_m
     road = classes == TerrainClass.ROAD

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.arrays import Bools, Floats
+from shared_map.arrays import Bools, Floats, reuse_memory
 
 BAND_ROWS = 128
 Progress = Callable[[str, float], None]
@@ -34,6 +34,7 @@ def in_bands(
     band_rows: int = BAND_ROWS,
 ) -> None:
     """`work(row0, row1)` for all bands, on as many threads as there are cores (four at most)."""
+    reuse_memory()
     todo = bands(rows, band_rows)
     workers = min(os.cpu_count() or 1, 4, len(todo))
     if workers < 2:

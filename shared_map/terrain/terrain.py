@@ -48,7 +48,7 @@ from swarm.wire.statements import PACE_MOST
 if TYPE_CHECKING:
     from shared_map.terrain.importers.sources import Source
 
-FORMAT = 3
+FORMAT = 4
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
 _META = "terrain.json"
 _ALL_LETHAL = "every cell of the terrain is lethal, no vehicle could stand anywhere:"
@@ -143,7 +143,8 @@ def _ground(source: Source, classes: Bytes, cost: CostConfig, progress: Progress
         steepness = grade_of_padded(padded_m, resolution_m)
         np.copyto(steepness, np.float32(np.nan), where=np.isnan(source.elevation_m[row0:row1]))
         rough_m = roughness_of_padded(padded_m, resolution_m) if cost.rough_per_m else None
-        pace = terrain_pace(steepness, classes[row0:row1], cost, rough_m)
+        readings = None if source.readings is None else source.readings[row0:row1]
+        pace = terrain_pace(steepness, classes[row0:row1], cost, rough_m, readings)
         if source.factor is not None:
             pace *= source.factor[row0:row1]
         ground[row0:row1] = pace

@@ -60,7 +60,7 @@ def with_photo(source: Source, path: Path, config: TerrainConfig, progress: Prog
 
 
 def classified(source: Source, config: TerrainConfig, seed: int, progress: Progress) -> Source:
-    from shared_map.terrain.importers.classify import by_rules, learnt
+    from shared_map.terrain.importers.classify import class_readings, learnt
     from shared_map.terrain.importers.true_colour import why_not_true_colour
 
     assert source.photo is not None
@@ -73,12 +73,14 @@ def classified(source: Source, config: TerrainConfig, seed: int, progress: Progr
             " codes as terrain.cover"
         )
         return replace(source, notes=(*source.notes, note))
+    readings = None
     if config.labels is None:
-        classes = by_rules(*inputs, source.seen, progress)
+        classes, readings = class_readings(*inputs, source.seen, progress)
         doubtful = float((classes[seen] == TerrainClass.UNKNOWN).mean()) if seen.any() else 0.0
         note = (
             f"classes from the photo, by rules; {doubtful:.0%} of what it shows would be another class in a photo"
-            " exposed a little differently, and is unknown: see terrain.labels and cost.class_factor.unknown"
+            " exposed a little differently, is unknown and costs what the dearest of these classes does: see"
+            " terrain.labels and cost.class_factor.unknown"
         )
     else:
         from shared_map.terrain.importers.labels import read_labels
@@ -86,4 +88,4 @@ def classified(source: Source, config: TerrainConfig, seed: int, progress: Progr
         labels = read_labels(Path(config.labels), source.grid)
         classes = learnt(*inputs, labels.classes, source.seen, seed, progress)
         note = f"classes from the photo, learnt from {labels.count} labels"
-    return replace(source, classes=classes, notes=(*source.notes, note))
+    return replace(source, classes=classes, readings=readings, notes=(*source.notes, note))

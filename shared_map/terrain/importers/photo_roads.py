@@ -56,34 +56,48 @@ def line_strength(rgb: Bytes) -> Bytes:
     grey = np.minimum(rgb[..., 0], rgb[..., 2]).astype(np.float32)
     smooth = (ndimage.gaussian_filter(grey, 0.7, truncate=3) * _FIXED).astype(np.int16)
     padded = np.pad(smooth, _MARGIN, mode="edge")
-    best = np.zeros(grey.shape, np.int16)
-    crest = np.zeros(grey.shape, np.bool_)
+    here = np.ascontiguousarray(_moved(padded, 2, 0, 0))
+    crests = {}
+    best = np.zeros(smooth.shape, np.int16)
+    crest = np.zeros(smooth.shape, np.bool_)
     for number in range(_DIRECTIONS):
         angle = math.pi * number / _DIRECTIONS
         down, right = math.sin(angle), math.cos(angle)
-        contrast = _contrast(padded, down, right)
-        total = np.zeros(grey.shape, np.int16)
-        for tap in _TAPS:
-            total += _moved(contrast, 4, tap * down, tap * right)
+        contrast = _contrast(padded, here, down, right)
+        first, second, *others = (_moved(contrast, 4, tap * down, tap * right) for tap in _TAPS)
+        total = first + second
+        for other in others:
+            total += other
+        # Masks and maxima: NumPy's copy "where" costs as much as thirty of them.
         better = total > best
-        np.copyto(best, total, where=better)
-        one, other = (_moved(padded, _MARGIN, sign * right, -sign * down) for sign in (1, -1))
-        np.copyto(crest, smooth >= np.maximum(one, other), where=better)
-    best[~crest] = 0
-    return np.clip(best // (_FIXED * len(_TAPS) // 10), 0, 255).astype(np.uint8)
+        np.maximum(best, total, out=best)
+        beside = round(right), round(-down)
+        if beside not in crests:
+            sides = np.maximum(*(_moved(padded, _MARGIN, sign * right, -sign * down) for sign in (1, -1)))
+            crests[beside] = smooth >= sides
+        crest |= better
+        crest &= np.logical_not(better) | crests[beside]
+    best *= crest
+    best //= _FIXED * len(_TAPS) // 10
+    return np.minimum(best, 255).astype(np.uint8)
 
 
-def _contrast(padded: Shorts, down: float, right: float) -> Shorts:
+def _contrast(padded: Shorts, here: Shorts, down: float, right: float) -> Shorts:
     """Brighter than both sides, less a quarter of the bend along the line; `_MARGIN` - 4 narrower on each side."""
-    here = _moved(padded, 2, 0, 0)
-    sides = np.maximum(
-        _moved(padded, 2, _SIDE * right, -_SIDE * down), _moved(padded, 2, -_SIDE * right, _SIDE * down)
+    ahead, behind, one, other = (
+        _moved(padded, 2, _SIDE * by_row, _SIDE * by_col)
+        for by_row, by_col in ((down, right), (-down, -right), (right, -down), (-right, down))
     )
-    bend = _moved(padded, 2, _SIDE * down, _SIDE * right) + _moved(padded, 2, -_SIDE * down, -_SIDE * right)
-    bend -= 2 * here
+    bend = ahead + behind
+    bend -= here
+    bend -= here
+    np.abs(bend, out=bend)
+    bend >>= 2
+    contrast = np.maximum(one, other)
+    np.subtract(here, contrast, out=contrast)
+    contrast -= bend
     most = _BRIGHTEST * _FIXED
-    contrast: Shorts = np.clip(here - sides - np.abs(bend) // 4, -most, most)
-    return contrast
+    return np.clip(contrast, -most, most, out=contrast)
 
 
 def _moved(array: Shorts, trim: int, down: float, right: float) -> Shorts:

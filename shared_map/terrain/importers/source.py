@@ -14,6 +14,8 @@ class Source:
 
     elevation_m  float32 (rows, cols), m; NaN is a void
     classes      uint8 (rows, cols), TerrainClass
+    readings     uint8 (rows, cols), which classes an unknown cell may be, bits of `layers.READABLE`; 0 where none
+                 is known; None if nobody looked
     photo, seen  the colour photo, uint8 (rows, cols, 3), and where it shows anything, bool (rows, cols)
     drawn        that the photo's own pixels are those of a drawn map, for people; None if they may be a photo's
     factor       float32 (rows, cols), pace relative to open ground that the file itself states; inf is lethal
@@ -24,6 +26,7 @@ class Source:
     grid: GridSpec
     elevation_m: Floats
     classes: Bytes
+    readings: Bytes | None = None
     photo: Bytes | None = None
     seen: Bools | None = None
     drawn: str | None = None

@@ -13,8 +13,9 @@ from scipy import ndimage
 from skimage.draw import line
 
 from shared_map.arrays import Bytes
-from shared_map.terrain.importers.classify import box_sum, by_rules, confusion, held_out, learnt
+from shared_map.terrain.importers.classify import by_rules, confusion, held_out, learnt
 from shared_map.terrain.importers.labels import Labels, read_labels
+from shared_map.terrain.importers.photo_features import box_sum
 from shared_map.terrain.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import counted, looked_up
@@ -246,7 +247,8 @@ def test_bad_labels_are_refused_with_a_sentence(tmp_path: Path, text: str, words
 def test_means_of_bytes_are_those_of_scipy(reach: int) -> None:
     photo = np.random.default_rng(1).integers(0, 256, (40, 33, 3)).astype(np.uint8)
     side = 2 * reach + 1
-    found = box_sum(photo.astype(np.uint16), reach) / side**2
+    padded = np.pad(photo.astype(np.uint16), ((reach, reach), (reach, reach), (0, 0)), mode="symmetric")
+    found = box_sum(padded, reach) / side**2
     expected = ndimage.uniform_filter(photo.astype(np.float64), (side, side, 1))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
