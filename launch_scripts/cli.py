@@ -14,7 +14,8 @@ from typing import Annotated, Any
 
 import typer
 
-from launch_scripts.commands import orders, query, roles
+from launch_scripts.commands import query, roles
+from launch_scripts.commands.orders import orders
 from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Runs, Tls, spread
 from swarm.errors import StoreError, SwarmError
 from swarm.ranks import HIGHEST_RANK
@@ -349,12 +350,16 @@ def _mount(name: str, module: str, help: str) -> None:
 _mount(
     "bench", "launch_scripts.bench.cli", "Measure: the paper's tables, scale, the wire. See `swarm bench --help`."
 )
-_mount("terrain", "launch_scripts.commands.terrain", "Look at terrains. See `swarm terrain --help`.")
+_mount("terrain", "launch_scripts.commands.terrain.terrain", "Look at terrains. See `swarm terrain --help`.")
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
 _mount("report", "launch_scripts.commands.report", "What runs have left. See `swarm report --help`.")
-_mount("zone", "launch_scripts.commands.zone", "Close areas while the swarm runs. See `swarm zone --help`.")
-_mount("target", "launch_scripts.commands.target", "Add, move and remove targets. See `swarm target --help`.")
-_mount("vehicle", "launch_scripts.commands.guests", "Add, remove and stop vehicles. See `swarm vehicle --help`.")
+_mount("zone", "launch_scripts.commands.orders.zone", "Close areas while the swarm runs. See `swarm zone --help`.")
+_mount(
+    "target", "launch_scripts.commands.orders.target", "Add, move and remove targets. See `swarm target --help`."
+)
+_mount(
+    "vehicle", "launch_scripts.commands.orders.guests", "Add, remove and stop vehicles. See `swarm vehicle --help`."
+)
 _mount(
     "plugins", "launch_scripts.commands.plugins", "Your own sensors, walks, and so on. See `swarm plugins --help`."
 )

@@ -29,7 +29,7 @@ _AROUND = np.ones((3, 3), np.bool_)
 
 def run() -> dict[str, Any]:
     """Counts for each made model."""
-    from shared_map.terrain.importers.level_ground import level_ground
+    from shared_map.terrain.importers.water.level_ground import level_ground
 
     rows = []
     for name, make in MODELS.items():
@@ -42,7 +42,7 @@ def run() -> dict[str, Any]:
 
 def run_on(dem: Path, truth: Path) -> dict[str, Any]:
     """Counts for a height model of one's own. Raises TerrainError if one cannot be read, or their sizes differ."""
-    from shared_map.terrain.importers.rasters import opened
+    from shared_map.terrain.importers.rasters.rasters import opened
     from shared_map.terrain.importers.sources import load_source
     from shared_map.terrain.layers import TerrainClass
     from swarm.config.scenario import TerrainConfig

@@ -89,7 +89,7 @@ def route(
 
     swarm route --terrain dem.tif --from 46.81,9.84 --to 46.78,9.87 --preset hiker --out way.gpx
     """
-    from launch_scripts.commands.route_files import check_route_file
+    from launch_scripts.commands.routes.route_files import check_route_file
     from swarm.errors import ConfigError
     from swarm.places import read_place
 
@@ -108,7 +108,7 @@ def route(
         )
     check_route_file(out)
     place = read_place(f"cell:{row},{col}" if start is None else start, "--from")
-    from launch_scripts.commands import swarm_route
+    from launch_scripts.commands.routes import swarm_route
 
     answer = swarm_route.ask_planner(where.network(tls), where, target, place, cost=cost, steps=steps)
     if out is not None:
@@ -122,8 +122,8 @@ def route(
 def _route_on_terrain(
     terrain: str, start: str, end: str, preset: str | None, out: Path | None, as_json: bool
 ) -> None:
-    from launch_scripts.commands.route_files import profile_of, write_route
-    from launch_scripts.commands.route_on_terrain import find_route
+    from launch_scripts.commands.routes.route_files import profile_of, write_route
+    from launch_scripts.commands.terrain.route_on_terrain import find_route
     from shared_map.terrain.places import MapFrame
     from swarm.places import written
 

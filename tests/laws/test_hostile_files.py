@@ -19,8 +19,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from shared_map.keeper.export import from_json
-from shared_map.terrain.importers.array_files import read_npy
-from shared_map.terrain.importers.labels import read_labels
+from shared_map.terrain.importers.grids.array_files import read_npy
+from shared_map.terrain.importers.photos.labels import read_labels
 from shared_map.terrain.importers.sources import load_source
 from swarm.config.input_files import FileKind, parse_toml, read_bytes
 from swarm.config.load import load_scenario

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, zoom
 
 from launch_scripts.world.walks import TrueTerrain
-from shared_map.terrain.importers.array_files import read_npy
+from shared_map.terrain.importers.grids.array_files import read_npy
 from swarm.config.input_files import FileKind
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
@@ -97,7 +97,7 @@ def from_file(path: Path) -> Pace:
         case ".npy":
             pace = _read_npy(path)
         case ".map":
-            from shared_map.terrain.importers.plain_files import read_map
+            from shared_map.terrain.importers.grids.plain_files import read_map
 
             factor = read_map(path).factor
             assert factor is not None, "a .map has no heights"

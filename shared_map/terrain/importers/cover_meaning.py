@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools
-from shared_map.terrain.importers.cover_recognition import (
+from shared_map.terrain.importers.cover.cover_recognition import (
     MOST_COLOURS,
     Evidence,
     evidence_of,
@@ -20,8 +20,8 @@ from shared_map.terrain.importers.cover_recognition import (
     recognise,
     some,
 )
-from shared_map.terrain.importers.cover_tables import TABLES, CoverTable, own_grounds, table_named
-from shared_map.terrain.importers.rasters import opened, thinned
+from shared_map.terrain.importers.cover.cover_tables import TABLES, CoverTable, own_grounds, table_named
+from shared_map.terrain.importers.rasters.rasters import opened, thinned
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 

@@ -16,7 +16,7 @@ from swarm.errors import TerrainError
 
 def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
-    from shared_map.terrain.importers.voids import fill_voids, voids_of
+    from shared_map.terrain.importers.water.voids import fill_voids, voids_of
 
     elevation_m = source.elevation_m
     if not elevation_m.flags.writeable:
@@ -52,7 +52,7 @@ def with_water(source: Source, config: TerrainConfig) -> Source:
 
 
 def with_photo(source: Source, path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.terrain.importers.photos import read_photo
+    from shared_map.terrain.importers.photos.photos import read_photo
 
     photo = read_photo(path, source.grid, config.crs, progress)
     notes = (*source.notes, str(path), *photo.notes)
@@ -60,8 +60,8 @@ def with_photo(source: Source, path: Path, config: TerrainConfig, progress: Prog
 
 
 def classified(source: Source, config: TerrainConfig, seed: int, progress: Progress) -> Source:
-    from shared_map.terrain.importers.classify import class_readings, learnt
-    from shared_map.terrain.importers.true_colour import why_not_true_colour
+    from shared_map.terrain.importers.photos.classify import class_readings, learnt
+    from shared_map.terrain.importers.photos.true_colour import why_not_true_colour
 
     assert source.photo is not None
     inputs = (source.photo, source.elevation_m, source.grid.resolution_m)
@@ -83,7 +83,7 @@ def classified(source: Source, config: TerrainConfig, seed: int, progress: Progr
             " terrain.labels and cost.class_factor.unknown"
         )
     else:
-        from shared_map.terrain.importers.labels import read_labels
+        from shared_map.terrain.importers.photos.labels import read_labels
 
         labels = read_labels(Path(config.labels), source.grid)
         classes = learnt(*inputs, labels.classes, source.seen, seed, progress)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.degrees import equidistant, metres_per_degree
 from shared_map.terrain.importers.ground_cover import classified, with_photo, with_water, without_voids
-from shared_map.terrain.importers.raster_kinds import is_raster
+from shared_map.terrain.importers.rasters.raster_kinds import is_raster
 from shared_map.terrain.importers.source import Source as Source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
@@ -72,7 +72,7 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
     source = with_water(source, config)
     if config.cover is not None:
-        from shared_map.terrain.importers.land_cover import with_cover
+        from shared_map.terrain.importers.cover.land_cover import with_cover
 
         source = with_cover(source, config, progress)
     return source
@@ -101,7 +101,7 @@ def _synthetic(config: TerrainConfig, seed: int) -> Source:
 
 def _jacksboro(config: TerrainConfig, seed: int) -> Source:
     """The elevation model of the Jacksboro fault that comes with matplotlib (USGS, 3 arc seconds)."""
-    from shared_map.terrain.importers.plain_files import read_npz
+    from shared_map.terrain.importers.grids.plain_files import read_npz
     from shared_map.terrain.synthetic.landscape import cover
 
     plain = read_npz(_jacksboro_path())
@@ -143,8 +143,8 @@ def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 
 def _raster(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.terrain.importers.coded_rasters import of_other_contents
-    from shared_map.terrain.importers.rasters import elevation_of, opened
+    from shared_map.terrain.importers.rasters.coded_rasters import of_other_contents
+    from shared_map.terrain.importers.rasters.rasters import elevation_of, opened
 
     _check_hgt(path)
     with opened(path, "terrain") as dataset:
@@ -169,9 +169,9 @@ def _check_hgt(path: Path) -> None:
 
 def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A grey image of heights: needs to be told how many metres a grey level and a cell are."""
-    from shared_map.terrain.importers.coded_rasters import of_other_contents
-    from shared_map.terrain.importers.georeference import check_size
-    from shared_map.terrain.importers.rasters import opened
+    from shared_map.terrain.importers.rasters.coded_rasters import of_other_contents
+    from shared_map.terrain.importers.rasters.georeference import check_size
+    from shared_map.terrain.importers.rasters.rasters import opened
 
     with opened(path, "terrain") as dataset:
         source = of_other_contents(dataset, path, config, progress)
@@ -194,16 +194,16 @@ def _png(path: Path, config: TerrainConfig, progress: Progress) -> Source:
 
 def _looked_at(stored: Floats, scale: float, config: TerrainConfig) -> tuple[Floats, Bools, list[str]]:
     """Heights in metres without undeclared voids, what of them is level, and what people should know of both."""
-    from shared_map.terrain.importers.level_ground import looked_at
-    from shared_map.terrain.importers.voids import without
+    from shared_map.terrain.importers.water.level_ground import looked_at
+    from shared_map.terrain.importers.water.voids import without
 
     voids, level, told = looked_at(stored.astype(np.float32), config, scale)
     return without(stored.astype(np.float32), voids) * np.float32(scale), level, told
 
 
 def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    from shared_map.terrain.importers.plain_files import read_asc, read_npz
-    from shared_map.terrain.importers.text_grids import read_text_grid
+    from shared_map.terrain.importers.grids.plain_files import read_asc, read_npz
+    from shared_map.terrain.importers.grids.text_grids import read_text_grid
 
     suffix = path.suffix.lower()
     read = {".asc": read_asc, ".npz": read_npz}.get(suffix, read_text_grid)
@@ -244,14 +244,14 @@ def _nearest(rows: int, cols: int, grid: GridSpec) -> tuple[Any, ...]:
 def _geographic(crs: str | None) -> bool:
     if crs is None:
         return False
-    from shared_map.terrain.importers.georeference import crs_of
+    from shared_map.terrain.importers.rasters.georeference import crs_of
 
     return bool(crs_of(None, crs, "terrain").is_geographic)
 
 
 def _map(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     """A map without heights: level, with the pace that the file states."""
-    from shared_map.terrain.importers.plain_files import read_map, read_ros
+    from shared_map.terrain.importers.grids.plain_files import read_map, read_ros
 
     plain = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
     assert plain.factor is not None
@@ -330,7 +330,7 @@ def _from_metres(
     what: str,
     crs: str | None = None,
 ) -> tuple[Floats, GridSpec, str]:
-    from shared_map.terrain.importers.resample import resample
+    from shared_map.terrain.importers.rasters.resample import resample
 
     resolution_m = config.resolution_m or float(f"{math.sqrt(step[0] * step[1]):.4g}")
     col_step, row_step = resolution_m / step[0], resolution_m / step[1]

@@ -18,10 +18,10 @@ from scipy.sparse.csgraph import dijkstra
 from typer.testing import CliRunner
 
 from launch_scripts.commands.query import app
-from launch_scripts.commands.reach import corridor
-from launch_scripts.commands.route_files import DescribedRoute, metres_along, profile_of, write_route
-from launch_scripts.commands.route_on_terrain import find_route
-from launch_scripts.commands.terrain import app as terrain_app
+from launch_scripts.commands.routes.route_files import DescribedRoute, metres_along, profile_of, write_route
+from launch_scripts.commands.terrain.reach import corridor
+from launch_scripts.commands.terrain.route_on_terrain import find_route
+from launch_scripts.commands.terrain.terrain import app as terrain_app
 from launch_scripts.launcher.options import find_scenario
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import SwarmError

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from launch_scripts.commands.routes.swarm_route import Answer, as_json, show, write
 from launch_scripts.commands.run_frame import frame_of_members
-from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from shared_map.terrain.places import MapFrame
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec

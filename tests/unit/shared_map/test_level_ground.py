@@ -13,11 +13,11 @@ from support.height_models import SIDE, hills, is_water, load, written
 
 from launch_scripts.bench.water import counted, run_on
 from launch_scripts.bench.water_models import MODELS, UNKNOWABLE
-from shared_map.terrain.importers import level_ground as module
-from shared_map.terrain.importers.level_ground import level_ground
-from shared_map.terrain.importers.plain_files import read_npz
+from shared_map.terrain.importers.grids.plain_files import read_npz
 from shared_map.terrain.importers.sources import _jacksboro_path
-from shared_map.terrain.importers.voids import undeclared_voids
+from shared_map.terrain.importers.water import level_ground as module
+from shared_map.terrain.importers.water.level_ground import level_ground
+from shared_map.terrain.importers.water.voids import undeclared_voids
 from swarm.errors import TerrainError
 
 # --- level ground -------------------------------------------------------------------------------------------

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from shared_map.terrain.importers import level_patches as module
-from shared_map.terrain.importers.level_patches import level_patches
+from shared_map.terrain.importers.water import level_patches as module
+from shared_map.terrain.importers.water.level_patches import level_patches
 
 EIGHT = np.ones((3, 3), np.int8)
 

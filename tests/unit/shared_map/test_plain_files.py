@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared_map.terrain.importers.plain_files import read_pgm
+from shared_map.terrain.importers.grids.plain_files import read_pgm
 from shared_map.terrain.importers.sources import Source, load_source
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.scenario import CostConfig, Scenario, TerrainConfig

@@ -12,7 +12,7 @@ import pytest
 import rasterio
 from rasterio.transform import Affine, from_origin
 
-from launch_scripts.commands.terrain import info
+from launch_scripts.commands.terrain.terrain import info
 from shared_map.terrain.importers.degrees import metres_per_degree
 from shared_map.terrain.importers.sources import FILE_KINDS, Source, load_source
 from shared_map.terrain.layers import TerrainClass

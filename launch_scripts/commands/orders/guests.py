@@ -1,0 +1,167 @@
+"""Vehicles that join and leave while the swarm runs: `swarm vehicle add`, `remove` and `gone`."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch_scripts.commands.orders.vehicle import app as app
+from launch_scripts.commands.query import Where
+from launch_scripts.commands.roles import Joins, Part, run_role
+from launch_scripts.commands.shared_options import AsJson, Tls, spread
+
+if TYPE_CHECKING:
+    from swarm.bus.bus import Bus
+    from swarm.bus.zenoh_bus import ZenohBus
+    from swarm.config.scenario import NetworkConfig
+    from swarm.wire.messages.guests import Removed
+    from swarm.wire.messages.processes import RunInfo
+
+_WITHIN_S = 5.0
+_AGAIN_S = 0.2
+
+
+@app.command()
+@spread
+def add(
+    group: Annotated[str, typer.Option(help="The group of the scenario to which they belong.")],
+    part: Part,
+    tls: Tls,
+    count: Annotated[int, typer.Option(min=1, help="How many vehicles.")] = 1,
+    id: Annotated[
+        str,
+        typer.Option("--id", help="Name of the agent that hosts them; if not given, added0 or the next free one."),
+    ] = "",
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="PLACE", help="LAT,LON, xy:X,Y or cell:ROW,COL near which they enter; else anywhere."),
+    ] = None,
+) -> None:
+    """Drive more vehicles in a running swarm, until all have left or this is stopped.
+
+    They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If this is
+    killed they stay where they are; the same command finds them again.
+
+    swarm vehicle add my.toml --group all --count 5 --at 36.41,-84.29
+    """
+    from swarm.places import read_place
+
+    if at is not None:
+        read_place(at, "--at")
+    run_role("agent", id, part, tls, joins=Joins(group, count, at))
+
+
+@app.command()
+@spread
+def remove(
+    names: Annotated[list[str], typer.Argument(help="Agents, such as extra, or vehicles, such as a0-03.")],
+    where: Where,
+    tls: Tls,
+    as_json: AsJson = False,
+) -> None:
+    """Let vehicles leave the map. Returns once their cells are free for others.
+
+    An agent that was added ends when its last vehicle has left; one of the scenario goes on without them.
+
+    swarm vehicle remove extra a0-03
+    """
+    from swarm.config.agents import agent_of
+    from swarm.errors import ConfigError
+
+    network = where.network(tls)
+    found, run = _members(network, where)
+    agents = {info.id for info in found if info.role == "agent"}
+    asked: dict[str, list[str]] = {}
+    for name in names:
+        agent = name if name in agents else agent_of(name)
+        if agent not in agents:
+            raise ConfigError(f"no agent {agent} takes part {where}; it has {', '.join(sorted(agents)) or 'none'}")
+        asked.setdefault(agent, []).extend([] if name == agent else [name])
+    whole = {name for name in names if name in agents}
+    with _open(network, run.run_id) as bus:
+        said = {agent: _remove(bus, agent, [] if agent in whole else asked[agent]) for agent in asked}
+    if as_json:
+        typer.echo(json.dumps({agent: {"left": one.left, "held": one.held} for agent, one in said.items()}))
+    for one in said.values():
+        if one.unknown:
+            raise ConfigError(f"agent {one.agent} hosts no {', '.join(one.unknown)}")
+        if not as_json:
+            typer.echo(f"{', '.join(one.left)}: left" + (f"; {one.held} still hold cells" if one.held else ""))
+    if any(one.held for one in said.values()):
+        raise typer.Exit(1)
+
+
+@app.command()
+@spread
+def gone(
+    name: Annotated[str, typer.Argument(help="The guest, such as extra or rover7.")],
+    where: Where,
+    tls: Tls,
+) -> None:
+    """Say that vehicles of a dead process are not on the map any more, so that others may drive there.
+
+    Only a person can know: a robot whose program has died stands where it stands. Never say it of one that does.
+    Between machines it takes the guest's own certificate.
+    """
+    from swarm.errors import BusError
+    from swarm.grid import GridSpec
+    from swarm.right_of_way.removal import say_gone
+
+    network = where.network(tls)
+    _, run = _members(network, where)
+    with _open(network, run.run_id) as bus:
+        if not say_gone(bus, name, GridSpec(run.rows, run.cols, run.resolution_m), _WITHIN_S):
+            raise BusError(f"the cells of {name} are not known to be free after {_WITHIN_S:g} s: say it again")
+    typer.echo(f"{name} is gone, and its cells are free")
+
+
+def _members(network: NetworkConfig, where: Where) -> tuple[list[RunInfo], RunInfo]:
+    """The processes of the run, and one of them."""
+    from launch_scripts.launcher.watcher import ask_run
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.errors import BusError
+
+    with open_bus(network) as bus:
+        found = ask_run(bus)
+    if not found:
+        raise BusError(f"no process of a run answers {where}")
+    return found, found[0]
+
+
+def _open(network: NetworkConfig, run_id: str) -> ZenohBus:
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.runtime.run_secret import authenticator_of
+
+    return open_bus(network, authenticator=authenticator_of(network, run_id))
+
+
+def _remove(bus: Bus, agent: str, vehicles: list[str]) -> Removed:
+    """Ask until the cells of all that left are free, but not for ever."""
+    from msgspec.structs import replace
+
+    from swarm.bus.bus import AskEnded, Replied
+    from swarm.errors import BusError
+    from swarm.runtime.inbox import Inbox
+    from swarm.wire.messages.guests import Removed, RemoveVehicles
+    from swarm.wire.topics import LEAVE
+
+    inbox = Inbox()
+    until_s = time.monotonic() + _WITHIN_S
+    said: Removed | None = None
+    while time.monotonic() < until_s:
+        bus.ask(LEAVE, RemoveVehicles(vehicles=vehicles), inbox.post, tag="leave", timeout_s=1.0, agent=agent)
+        answered = False
+        while not isinstance(event := inbox.take(1.5), AskEnded | None):
+            if isinstance(event, Replied) and isinstance(event.message, Removed):
+                said, answered = event.message, True
+        if said is not None and not answered:
+            return replace(said, held=0)  # an added agent ends once wardens know that its last vehicle has left
+        if said is not None and not said.held:
+            return said
+        time.sleep(_AGAIN_S)
+    if said is None:
+        raise BusError(f"agent {agent} does not answer")
+    return said

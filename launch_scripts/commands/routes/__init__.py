@@ -1,0 +1,1 @@
+"""Routes asked for, and written for other programs."""

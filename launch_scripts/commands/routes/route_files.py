@@ -1,0 +1,307 @@
+"""A route and the ground along it, written for other programs: GeoJSON, GPX, KML, CSV, a picture."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.report.geo_shapes import in_degrees
+from shared_map.arrays import Floats
+from shared_map.terrain.places import MapFrame, middles_of
+from shared_map.terrain.terrain import Terrain
+from swarm.errors import ConfigError, TerrainError
+from swarm.grid import GridSpec
+from swarm.places import fields_of
+
+_BARS = "▁▂▃▄▅▆▇█"
+_PROFILE_BARS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class DescribedRoute:
+    """A route and the ground along it; arrays have an entry per cell, the start's first.
+
+    cells        int64 (n,)       flat indices
+    at_m         float64 (n,)     metres driven until there
+    at_s         float64 (n,)     seconds driven until there; None if not known
+    height_m     float64 (n,)     m, NaN over a void; None if not known
+    terrain      what it lies on, for a picture; None if not at hand
+    """
+
+    name: str
+    grid: GridSpec
+    cells: NDArray[np.int64]
+    cost_s: float
+    lower_bound_s: float
+    at_m: NDArray[np.float64]
+    at_s: NDArray[np.float64] | None = None
+    height_m: NDArray[np.float64] | None = None
+    terrain: Terrain | None = None
+
+    @property
+    def length_m(self) -> float:
+        return float(self.at_m[-1])
+
+    @property
+    def gap(self) -> float:
+        """Cost over proven lower bound."""
+        return max(self.cost_s / self.lower_bound_s, 1.0) if self.lower_bound_s > 0 else np.inf
+
+    @property
+    def placed(self) -> bool:
+        """Whether the terrain has a place on Earth."""
+        return self.grid.crs != "local"
+
+    @property
+    def climb_m(self) -> tuple[float, float] | None:
+        """(metres up, metres down) in all."""
+        if self.height_m is None:
+            return None
+        rise = np.diff(self.height_m[np.isfinite(self.height_m)])
+        return float(rise[rise > 0].sum()), float(np.abs(rise[rise < 0]).sum())
+
+    def metres(self) -> NDArray[np.float64]:
+        """float64 (2, n): x and y in metres of the map."""
+        return middles_of(self.grid, self.cells)
+
+    def degrees(self) -> NDArray[np.float64]:
+        """float64 (2, n): latitudes and longitudes; the terrain has a place."""
+        return MapFrame(self.grid).to_degrees(*self.metres())
+
+    def facts(self) -> dict[str, Any]:
+        """Numbers of the route, by name."""
+        climb, frame = self.climb_m, MapFrame(self.grid)
+        ups = {} if climb is None else {"up_m": round(climb[0], 1), "down_m": round(climb[1], 1)}
+        return {
+            "cost_s": round(self.cost_s, 3),
+            "lower_bound_s": round(self.lower_bound_s, 3),
+            "length_m": round(self.length_m, 2),
+            "steps": len(self.cells) - 1,
+            **ups,
+            "crs": self.grid.crs,
+            "from": fields_of(frame, int(self.cells[0])),
+            "to": fields_of(frame, int(self.cells[-1])),
+        }
+
+
+def metres_along(grid: GridSpec, cells: NDArray[np.int64], diagonal: float = np.sqrt(2.0)) -> NDArray[np.float64]:
+    """float64 (n,): metres from the first cell to each; `diagonal` is the length of a diagonal step, in cells."""
+    rows, cols = np.divmod(cells, grid.cols)
+    apart = np.abs(np.diff(rows)) + np.abs(np.diff(cols))
+    steps = np.where(apart == 2, diagonal, 1.0) * grid.resolution_m
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+def profile_of(route: DescribedRoute) -> str:
+    """Heights along the route as one line of bars."""
+    heights = np.full(len(route.cells), np.nan) if route.height_m is None else route.height_m
+    known = np.isfinite(heights)
+    if not known.any():
+        return ""
+    heights = np.interp(np.linspace(0, route.at_m[-1], _PROFILE_BARS), route.at_m[known], heights[known])
+    low, high = heights.min(), heights.max()
+    levels = np.round((heights - low) / max(high - low, 1e-9) * (len(_BARS) - 1)).astype(int)
+    return f"{''.join(_BARS[n] for n in levels)}  {low:.0f} to {high:.0f} m"
+
+
+def check_route_file(path: Path | None) -> None:
+    """Raise ConfigError before the work, if the ending says no format or the folder is not there."""
+    if path is None:
+        return
+    if path.suffix.lower() not in WRITERS:
+        raise ConfigError(f"--out {path}: write {', '.join(WRITERS)}")
+    if path.is_dir() or not path.parent.is_dir():
+        raise ConfigError(f"--out {path}: cannot write there, it is a folder or lies in none")
+
+
+def write_route(route: DescribedRoute, path: Path) -> None:
+    """Write a route in the format of the file's ending.
+
+    Raises
+    ------
+    ConfigError
+        On another ending, or without a place on Earth or a terrain where the format needs one.
+    TerrainError
+        If the file cannot be written.
+    """
+    check_route_file(path)
+    try:
+        WRITERS[path.suffix.lower()](route, path)
+    except OSError as error:
+        raise TerrainError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+# --- the formats ----------------------------------------------------------------------------------------------
+
+
+def _degrees(route: DescribedRoute, path: Path) -> NDArray[np.float64]:
+    if not route.placed:
+        raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .png")
+    return route.degrees()
+
+
+def _points(xs: NDArray[np.float64], ys: NDArray[np.float64], heights: Any, digits: int) -> Iterator[list[float]]:
+    """[x, y, height] per point; without the height where it is not known."""
+    for n, (x, y) in enumerate(zip(xs.tolist(), ys.tolist(), strict=True)):
+        known = heights is not None and np.isfinite(heights[n])
+        yield [round(x, digits), round(y, digits), *([round(float(heights[n]), 2)] if known else [])]
+
+
+def _line(xs: NDArray[np.float64], ys: NDArray[np.float64], heights: Any) -> list[list[float]]:
+    """As `_points`, to 8 digits; at least two, as a line has in GeoJSON and KML: who is there already stays."""
+    points = list(_points(xs, ys, heights, 8))
+    return points * 2 if len(points) == 1 else points
+
+
+def _geojson(route: DescribedRoute, path: Path) -> None:
+    """RFC 7946: WGS 84, longitude first. A terrain without a place is written in its own metres, and says so."""
+    points = route.metres().T
+    xs, ys = (in_degrees(points, MapFrame(route.grid)) if route.placed else points).T
+    properties = {"name": route.name, **route.facts(), "at_m": route.at_m.round(2).tolist()}
+    if route.at_s is not None:
+        properties["at_s"] = route.at_s.round(2).tolist()
+    feature = {
+        "type": "Feature",
+        "properties": properties,
+        "geometry": {"type": "LineString", "coordinates": _line(xs, ys, route.height_m)},
+    }
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8")
+
+
+def _gpx(route: DescribedRoute, path: Path) -> None:
+    lat, lon = _degrees(route, path)
+    root = ElementTree.Element(
+        "gpx", version="1.1", creator="terrain-swarm", xmlns="http://www.topografix.com/GPX/1/1"
+    )
+    track = ElementTree.SubElement(root, "trk")
+    ElementTree.SubElement(track, "name").text = route.name
+    segment = ElementTree.SubElement(track, "trkseg")
+    for n in range(len(lat)):
+        point = ElementTree.SubElement(segment, "trkpt", lat=f"{lat[n]:.8f}", lon=f"{_within_180(lon[n]):.8f}")
+        if route.height_m is not None and np.isfinite(route.height_m[n]):
+            ElementTree.SubElement(point, "ele").text = f"{route.height_m[n]:.2f}"
+    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _within_180(lon_deg: float) -> float:
+    """GPX allows -180 to just below 180."""
+    return float((lon_deg + 180.0) % 360.0 - 180.0) if not -180.0 <= lon_deg < 179.999999995 else float(lon_deg)
+
+
+def _kml(route: DescribedRoute, path: Path) -> None:
+    lat, lon = _degrees(route, path)
+    root = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
+    mark = ElementTree.SubElement(ElementTree.SubElement(root, "Document"), "Placemark")
+    ElementTree.SubElement(mark, "name").text = route.name
+    line = ElementTree.SubElement(mark, "LineString")
+    ElementTree.SubElement(line, "tessellate").text = "1"
+    ElementTree.SubElement(line, "altitudeMode").text = "clampToGround"
+    points = _line(lon, lat, route.height_m)
+    ElementTree.SubElement(line, "coordinates").text = " ".join(",".join(map(_plain, point)) for point in points)
+    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _plain(value: float) -> str:
+    return f"{value:.8f}".rstrip("0").rstrip(".")
+
+
+def _csv(route: DescribedRoute, path: Path) -> None:
+    rows_cols = np.divmod(route.cells, route.grid.cols)
+    x_m, y_m = route.metres()
+    columns: dict[str, NDArray[Any]] = {
+        "row": rows_cols[0], "col": rows_cols[1], "x_m": x_m.round(3), "y_m": y_m.round(3),
+    }  # fmt: skip
+    if route.placed:
+        columns["lat"], columns["lon"] = route.degrees().round(8)
+    if route.height_m is not None:
+        columns["height_m"] = route.height_m.round(2)
+    columns["at_m"] = route.at_m.round(2)
+    if route.at_s is not None:
+        columns["at_s"] = route.at_s.round(2)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(columns)
+        rows.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+
+def _png(route: DescribedRoute, path: Path) -> None:
+    """The route on the relief, and its heights below."""
+    if route.terrain is None or route.height_m is None:
+        raise ConfigError(
+            f"--out {path}: a picture needs the terrain; find the route with --terrain, or write .geojson"
+        )
+    import matplotlib as mpl
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from launch_scripts.report.palette import BLUE, INK, RED
+    from launch_scripts.report.plot_style import STYLE
+
+    grid = route.grid
+    x_m, y_m = route.metres()
+    long_way = max(grid.rows, grid.cols) * grid.resolution_m >= 4000
+    unit, name = (1000.0, "km") if long_way else (1.0, "m")
+    with mpl.rc_context(STYLE):
+        high = 8.0 * min(max(grid.rows / grid.cols, 0.3), 1.4)
+        figure = Figure(figsize=(8.6, high + 3.0), layout="constrained")
+        FigureCanvasAgg(figure)
+        above, below = figure.subplots(2, 1, height_ratios=[high, 2.2])
+        light, (east, south) = _relief(route.terrain)
+        extent = (0.0, east / unit, south / unit, 0.0)
+        above.imshow(light, extent=extent, interpolation="nearest", aspect="equal")
+        above.grid(visible=False)
+        along, down = (x_m - grid.west_m) / unit, (grid.north_m - y_m) / unit
+        above.plot(along, down, color="white", linewidth=3.6)
+        above.plot(along, down, color=RED, linewidth=1.8)
+        for n, label in ((0, "from"), (-1, "to")):
+            above.plot(along[n], down[n], "o", color=RED, markeredgecolor="white", markersize=7)
+            above.annotate(
+                label, (along[n], down[n]), xytext=(7, 7), textcoords="offset points", weight="bold",
+                bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
+            )  # fmt: skip
+        above.set(xlabel=f"east, {name}", ylabel=f"south, {name}")
+        up_m, down_m = route.climb_m or (0.0, 0.0)
+        climbed = f"{up_m:.0f} m up, {down_m:.0f} m down"
+        above.set_title(f"{route.name}: {route.length_m / unit:.4g} {name} in {route.cost_s:.0f} s, {climbed}")
+        below.plot(route.at_m / unit, route.height_m, color=BLUE, linewidth=1.4)
+        if np.isfinite(route.height_m).any():
+            below.fill_between(route.at_m / unit, np.nanmin(route.height_m), route.height_m, color=BLUE, alpha=0.15)
+        below.set(xlabel=f"along the route, {name}", ylabel="height, m", xlim=(0, max(route.length_m / unit, 1e-9)))
+        below.tick_params(labelcolor=INK)
+        figure.savefig(path, dpi=120)
+
+
+def _relief(terrain: Terrain) -> tuple[Floats, tuple[float, float]]:
+    """Colours of the relief, lethal ground dark; and (metres from west to east, metres from north to south)."""
+    from launch_scripts.commands.terrain.terrain_picture import MOST_CELLS
+    from launch_scripts.report.hillshade import hillshade
+    from shared_map.terrain.pyramid import level_of
+
+    level = level_of(terrain, MOST_CELLS)
+    light = np.float32(0.35) + np.float32(0.65) * hillshade(level.elevation_m, level.grid.resolution_m)
+    ground = np.array([0.93, 0.90, 0.82], np.float32) * light[..., None]
+    lethal = np.array([0.36, 0.27, 0.46], np.float32) * light[..., None]
+    share = level.lethal_share[..., None]
+    side_m = level.grid.resolution_m
+    return np.clip(ground * (1 - share) + lethal * share, 0, 1), (
+        level.grid.cols * side_m,
+        level.grid.rows * side_m,
+    )
+
+
+WRITERS: Mapping[str, Callable[[DescribedRoute, Path], None]] = {
+    ".geojson": _geojson,
+    ".gpx": _gpx,
+    ".kml": _kml,
+    ".csv": _csv,
+    ".png": _png,
+}
+"""Ending -> what writes it."""

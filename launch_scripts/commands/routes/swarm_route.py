@@ -1,0 +1,194 @@
+"""A route from a planner of a running swarm: asked for, printed, and written for other programs."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import typer
+
+from launch_scripts.commands.routes.route_files import DescribedRoute, metres_along, write_route
+from launch_scripts.commands.run_frame import frame_of_run
+from shared_map.terrain.places import MapFrame
+from swarm.bus.bus import AskEnded, Replied
+from swarm.bus.zenoh_bus import open_bus
+from swarm.errors import BusError, ConfigError, TerrainError
+from swarm.grid import walk
+from swarm.places import Place, cell_of, fields_of, written
+from swarm.runtime.inbox import Inbox
+from swarm.wire.fields import column
+from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest
+from swarm.wire.readable import COMPASS, encode_readable
+from swarm.wire.routes import RouteStatus
+from swarm.wire.topics import COST, ROUTE
+
+if TYPE_CHECKING:
+    from swarm.bus.bus import Bus
+    from swarm.config.scenario import NetworkConfig
+
+_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A planner's answer, and where the terrain lies."""
+
+    reply: RouteReply | CostReply
+    frame: MapFrame
+    start: int
+    took_ms: float
+
+    @property
+    def target_cell(self) -> int | None:
+        """Where the answer leads to."""
+        cell = self.reply.target_cell
+        return cell if cell is not None and 0 <= cell < self.frame.grid.cells else None
+
+    def path(self) -> list[int]:
+        """The cells of the route; none without one."""
+        if isinstance(self.reply, CostReply) or self.reply.routes[0].status is not RouteStatus.OK:
+            return []
+        (route,) = self.reply.routes
+        return walk(self.frame.grid, route.start, route.directions)
+
+
+def ask_planner(
+    network: NetworkConfig, where: object, target: str, start: Place, *, cost: bool, steps: int
+) -> Answer:
+    """Ask for the route, or with `cost` for its cost only. Raises BusError or ConfigError in one sentence."""
+    with open_bus(network) as bus:
+        frame = frame_of_run(bus, where)
+        cell = cell_of(start, frame, "--from")
+        row, col = frame.grid.row_col(cell)
+        request = CostRequest(row=row, col=col) if cost else RouteRequest(row=row, col=col, max_cells=steps)
+        began_s = time.monotonic()
+        reply = _ask(bus, request, target, where)
+        return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)
+
+
+def _ask(bus: Bus, request: CostRequest | RouteRequest, target: str, where: object) -> RouteReply | CostReply:
+    inbox = Inbox()
+    reply: RouteReply | CostReply | None = None
+    failure: str | None = None
+    topic = COST if isinstance(request, CostRequest) else ROUTE
+    until_s = time.monotonic() + _TIMEOUT_S + 2.0
+    bus.ask(topic, request, inbox.post, tag="route", timeout_s=_TIMEOUT_S, target=target)
+    while time.monotonic() < until_s:
+        match inbox.take(0.5):
+            case Replied(message=(RouteReply() | CostReply()) as found):
+                reply = found
+            case AskEnded(failure=failure):
+                break
+    if reply is None:
+        if failure is not None and failure != "timeout":
+            raise ConfigError(failure)
+        raise BusError(f"no planner of target {target!r} answers {where}")
+    return reply
+
+
+def as_json(answer: Answer) -> str:
+    """The planner's answer, with its places in all coordinates that the terrain has."""
+    frame, target, cells = answer.frame, answer.target_cell, answer.path()
+    fields = json.loads(encode_readable(answer.reply))
+    fields["crs"] = frame.grid.crs
+    fields["from"] = fields_of(frame, answer.start)
+    fields["to"] = None if target is None else fields_of(frame, target)
+    if cells:
+        route = _route(answer, cells)
+        fields["path"] = {name: line.round(6).tolist() for name, line in zip("xy", route.metres(), strict=True)}
+        if route.placed:
+            lat, lon = route.degrees().round(9).tolist()
+            fields["path"] |= {"lat": lat, "lon": lon}
+    return json.dumps(fields)
+
+
+def write(answer: Answer, path: Path) -> None:
+    """Write the route as `write_route`. Raises TerrainError if there is none."""
+    cells = answer.path()
+    if not cells:
+        raise TerrainError(f"nothing is written to {path}: there is no route")
+    write_route(_route(answer, cells), path)
+
+
+def _route(answer: Answer, cells: list[int]) -> DescribedRoute:
+    grid = answer.frame.grid
+    path = np.array(cells, np.int64)
+    (route,) = answer.reply.routes  # type: ignore[union-attr]
+    return DescribedRoute(
+        name=f"to {answer.reply.target}",
+        grid=grid,
+        cells=path,
+        cost_s=route.cost_s,
+        lower_bound_s=route.lower_bound_s,
+        at_m=metres_along(grid, path),
+    )
+
+
+def show(answer: Answer) -> None:
+    """Print an answer for people."""
+    if isinstance(answer.reply, CostReply):
+        _show_cost(answer, answer.reply)
+    else:
+        _show_route(answer, answer.reply)
+
+
+def _show_cost(answer: Answer, reply: CostReply) -> None:
+    cost_s = float(column(reply.cost_to_go_s, "<f4")[0])
+    start = written(answer.frame, answer.start)
+    if reply.target_cell is None:
+        typer.echo("no_target: the planner does not know where its target is")
+    elif math.isfinite(cost_s):
+        typer.echo(f"from {start} to {_target(answer)} in {cost_s:.1f} s")
+        _show_pose(reply)
+    else:
+        typer.echo(f"unreachable: {start} has no way to {reply.target}, or is lethal")
+
+
+def _show_route(answer: Answer, reply: RouteReply) -> None:
+    (found,) = reply.routes
+    if found.status is not RouteStatus.OK:
+        meaning = {
+            RouteStatus.UNREACHABLE: "there is no way from there",
+            RouteStatus.OUTSIDE: f"the cell is outside the terrain of {reply.rows} x {reply.cols} cells",
+            RouteStatus.LETHAL_START: "the cell is lethal, no vehicle can stand on it",
+            RouteStatus.NO_TARGET: "the planner does not know where its target is",
+        }[found.status]
+        typer.echo(f"{found.status.value}: {meaning}")
+        return
+    gap = f"proven within {100 * (found.gap - 1):.2f} % of the best" if math.isfinite(found.gap) else "gap unknown"
+    typer.echo(f"from {written(answer.frame, answer.start)}")
+    typer.echo(f"to {_target(answer)} in {found.cost_s:.1f} s, {gap}")
+    rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
+    many = len(found.directions)
+    typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
+    age = f"tree {reply.tree_age_ms:.0f} ms old, map version {reply.map_version}"
+    typer.echo(f"{age}, answered in {answer.took_ms:.1f} ms")
+    _show_pose(reply)
+
+
+def _target(answer: Answer) -> str:
+    cell = answer.target_cell
+    return answer.reply.target if cell is None else f"{answer.reply.target} at {written(answer.frame, cell)}"
+
+
+def _show_pose(reply: RouteReply | CostReply) -> None:
+    """Say how old the pose is that the answer goes by."""
+    if reply.pose_age_s is None:
+        return
+    if reply.tracker_lost:
+        where = f"{reply.target} is lost: nobody tracks it, and this is where it was {reply.pose_age_s:.1f} s ago"
+        typer.secho(where, fg="yellow")
+    else:
+        typer.echo(f"pose {reply.pose_age_s:.1f} s old")
+
+
+def _strides(directions: bytes) -> str:
+    """Runs of equal steps: 12 N, 3 NE, ..."""
+    runs: Any = groupby(directions)
+    return ", ".join(f"{len(list(steps))} {COMPASS[code]}" for code, steps in runs) or "already there"

@@ -1,0 +1,1 @@
+"""Land cover: codes and what they mean."""

@@ -1,0 +1,1 @@
+"""Heights in plain text, tables and arrays."""

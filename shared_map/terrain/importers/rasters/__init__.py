@@ -1,0 +1,1 @@
+"""Rasters: opened, understood, and put on one square metric grid."""

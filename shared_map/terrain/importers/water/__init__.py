@@ -1,0 +1,1 @@
+"""Level ground, water and voids, found before any resampling."""

@@ -1,0 +1,1 @@
+"""Zones from vector files and from rasters of pace."""
