@@ -75,7 +75,8 @@ def test_the_rover_of_the_page_joins_drives_to_its_target_marks_and_leaves(live:
         run = Run(script("vehicle.md"), live.endpoint)
         eventually(lambda: "rover" in watching.vehicles, 20, "the rover's first word")
         first = watching.vehicles["rover"]
-        assert run.end(within_s=60) == ""
+        # On a busy machine an answer may be late: that is said, and asked again.
+        assert all("gets no route to t0" in line for line in run.end(within_s=60).splitlines())
         assert run.process.returncode == 0
         eventually(lambda: "rover" not in watching.vehicles, 3, "the rover's leaving")
         eventually(lambda: any(m.pace_s_per_m == 0.5 for m in watching.marks.values()), 10, "its marks")
