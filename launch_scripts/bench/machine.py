@@ -7,7 +7,7 @@ import platform
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.report.machine import processor
+from launch_scripts.report.results.machine import processor
 
 
 def machine() -> dict[str, Any]:

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.terminal import REPORTED
-from launch_scripts.report.compare import (
+from launch_scripts.report.results.compare import (
     LeftRun,
     Row,
     circumstances_that_differ,
@@ -19,7 +19,7 @@ from launch_scripts.report.compare import (
     settings_that_differ,
     text_of,
 )
-from launch_scripts.report.run_folder import SCENARIO_FILE, find_run, read_report
+from launch_scripts.report.results.run_folder import SCENARIO_FILE, find_run, read_report
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.errors import ConfigError
 

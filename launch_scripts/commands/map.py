@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from launch_scripts.commands.shared_options import AsJson
-from launch_scripts.report.geo_layers import Layer, mark_layer, write_layers
+from launch_scripts.report.geo.geo_layers import Layer, mark_layer, write_layers
 from shared_map.keeper import export as stored_marks
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.places import MapFrame

@@ -16,7 +16,7 @@ from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, sp
 from swarm.places import extent_of, fields_of, written
 
 if TYPE_CHECKING:
-    from launch_scripts.report.certified_gap import CertifiedGap
+    from launch_scripts.report.results.certified_gap import CertifiedGap
     from shared_map.terrain.places import MapFrame
     from swarm.config.scenario import NetworkConfig
     from swarm.wire.messages.planning import PlannerStatus
@@ -153,8 +153,8 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Show who takes part in the running swarm and how the planners are doing."""
     from launch_scripts.commands.run_frame import frame_of_members
     from launch_scripts.launcher.watcher import ask_run
-    from launch_scripts.report.certified_gap import certified_gap, gaps_to
-    from launch_scripts.report.counts import Counts
+    from launch_scripts.report.results.certified_gap import certified_gap, gaps_to
+    from launch_scripts.report.results.counts import Counts
     from swarm.bus.bus import Heard
     from swarm.bus.zenoh_bus import open_bus
     from swarm.errors import BusError
@@ -279,7 +279,7 @@ def _print_status(
     from rich.console import Console
     from rich.table import Table
 
-    from launch_scripts.report.certified_gap import percent
+    from launch_scripts.report.results.certified_gap import percent
 
     first = members[0]
     console = Console()

@@ -31,9 +31,9 @@ def export(
 
     swarm report export runs/LAST --out run.gpkg
     """
-    from launch_scripts.report.geo_layers import check_layer_file, track_layers, write_layers
-    from launch_scripts.report.run_folder import find_run
-    from launch_scripts.report.track_file import TRACKS_FILE, read_tracks
+    from launch_scripts.report.geo.geo_layers import check_layer_file, track_layers, write_layers
+    from launch_scripts.report.geo.track_file import TRACKS_FILE, read_tracks
+    from launch_scripts.report.results.run_folder import find_run
     from shared_map.terrain.places import MapFrame
     from swarm.errors import ConfigError
 

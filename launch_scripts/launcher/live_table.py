@@ -8,8 +8,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.report.certified_gap import percent
 from launch_scripts.report.recorder import LiveSummary, TargetLine
+from launch_scripts.report.results.certified_gap import percent
 
 SHOWN_TARGETS = 24
 

@@ -14,8 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.live_table import live_table, plain_line
-from launch_scripts.report.certified_gap import gap_text
 from launch_scripts.report.recorder import LiveSummary
+from launch_scripts.report.results.certified_gap import gap_text
 
 log = logging.getLogger(__name__)
 

@@ -32,7 +32,7 @@ from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.run_folder import begin_run
+from launch_scripts.report.results.run_folder import begin_run
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare

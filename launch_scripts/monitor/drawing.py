@@ -14,7 +14,7 @@ import rerun as rr
 
 from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, MeshTile, Points, TerrainMesh
 from launch_scripts.monitor.sinks import Streams
-from launch_scripts.report import palette
+from launch_scripts.report.pictures import palette
 from launch_scripts.report.samples import Sample
 from swarm.wire.messages.vehicles import VehicleState
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from launch_scripts.report.certified_gap import percent
 from launch_scripts.report.recorder import LiveSummary
+from launch_scripts.report.results.certified_gap import percent
 from swarm.runtime.role import RoleSetup
 
 _WARNINGS = (

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.hillshade import hillshade
+from launch_scripts.report.pictures.hillshade import hillshade
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain

@@ -26,8 +26,8 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from launch_scripts.reference.printed import lattice_route, printed_costs, printed_range
-from launch_scripts.report.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED
-from launch_scripts.report.plot_style import STYLE
+from launch_scripts.report.pictures.palette import BLACK, BLUE, GREEN, INK, ORANGE, RED
+from launch_scripts.report.pictures.plot_style import STYLE
 from planner_service.target_tree import TargetTree
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.counts import Counts
+from launch_scripts.report.results.counts import Counts
 from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.liveness import Peer

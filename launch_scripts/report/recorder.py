@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from launch_scripts.report.certified_gap import CertifiedGap, certified_gap, gaps_to, of_excess
 from launch_scripts.report.latest_state import MarkedCells, Observed
-from launch_scripts.report.results import Driven, results
+from launch_scripts.report.results.certified_gap import CertifiedGap, certified_gap, gaps_to, of_excess
+from launch_scripts.report.results.results import Driven, results
 from launch_scripts.report.samples import Sample, Samples, messages_per_s
 from launch_scripts.report.tracked_targets import TrackedTargets
 from launch_scripts.report.tracks import TrackKey, Tracks

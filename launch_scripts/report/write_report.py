@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.report.files import replacing, write_file
+from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks
 from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.result_tables import TABLES, csv_of
-from launch_scripts.report.run_folder import REPORT_FILE, ended
-from launch_scripts.report.track_file import TRACKS_FILE, packed_tracks
+from launch_scripts.report.results.result_tables import TABLES, csv_of
+from launch_scripts.report.results.run_folder import REPORT_FILE, ended
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
 from swarm.errors import StoreError
@@ -82,7 +82,7 @@ def write_report(
 def _draw(
     path: Path, recorder: Recorder, report: dict[str, Any], terrain: Terrain, truth: NDArray[np.float32] | None
 ) -> None:
-    from launch_scripts.report.picture import save_picture  # matplotlib takes a moment
+    from launch_scripts.report.pictures.picture import save_picture  # matplotlib takes a moment
 
     try:
         with replacing(path) as half:

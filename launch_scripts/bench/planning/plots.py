@@ -16,9 +16,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 
 from launch_scripts.bench.planning.chase import Tally
 from launch_scripts.bench.tables import label_of, on_machine
-from launch_scripts.report.palette import BLUE, FAINT, GREEN, INK, ORANGE, PINK, SKY, VIOLET
-from launch_scripts.report.plot_style import STYLE
-from launch_scripts.report.plots import halo
+from launch_scripts.report.pictures.palette import BLUE, FAINT, GREEN, INK, ORANGE, PINK, SKY, VIOLET
+from launch_scripts.report.pictures.plot_style import STYLE
+from launch_scripts.report.pictures.plots import halo
 from swarm.config.scenario import Strategy
 
 _COLOURS: dict[Strategy, str] = {

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.geo_shapes import in_degrees
+from launch_scripts.report.geo.geo_shapes import in_degrees
 from shared_map.arrays import Floats
 from shared_map.terrain.places import MapFrame, middles_of
 from shared_map.terrain.terrain import Terrain
@@ -242,8 +242,8 @@ def _png(route: DescribedRoute, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from launch_scripts.report.palette import BLUE, INK, RED
-    from launch_scripts.report.plot_style import STYLE
+    from launch_scripts.report.pictures.palette import BLUE, INK, RED
+    from launch_scripts.report.pictures.plot_style import STYLE
 
     grid = route.grid
     x_m, y_m = route.metres()
@@ -282,7 +282,7 @@ def _png(route: DescribedRoute, path: Path) -> None:
 def _relief(terrain: Terrain) -> tuple[Floats, tuple[float, float]]:
     """Colours of the relief, lethal ground dark; and (metres from west to east, metres from north to south)."""
     from launch_scripts.commands.terrain.terrain_picture import MOST_CELLS
-    from launch_scripts.report.hillshade import hillshade
+    from launch_scripts.report.pictures.hillshade import hillshade
     from shared_map.terrain.pyramid import level_of
 
     level = level_of(terrain, MOST_CELLS)

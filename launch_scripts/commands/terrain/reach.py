@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.commands.terrain.route_on_terrain import finder_for
 from launch_scripts.launcher.options import find_scenario
-from launch_scripts.report.geo_shapes import areas_of, polygon
+from launch_scripts.report.geo.geo_shapes import areas_of, polygon
 from shared_map.arrays import Floats
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain, build_terrain

@@ -12,8 +12,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from shared_map.arrays import Bools, Floats
-from shared_map.terrain.importers.degrees import equidistant, metres_per_degree
 from shared_map.terrain.importers.ground_cover import classified, with_photo, with_water, without_voids
+from shared_map.terrain.importers.rasters.degrees import equidistant, metres_per_degree
 from shared_map.terrain.importers.rasters.raster_kinds import is_raster
 from shared_map.terrain.importers.source import Source as Source
 from shared_map.terrain.layers import TerrainClass
@@ -80,7 +80,7 @@ def _loaded(config: TerrainConfig, seed: int, progress: Progress) -> Source:
 
 def _photo_or_cover(config: TerrainConfig) -> TerrainConfig:
     """The settings with a photo that is a drawn map of land cover named as such."""
-    from shared_map.terrain.importers.cover_meaning import is_drawn
+    from shared_map.terrain.importers.cover.cover_meaning import is_drawn
 
     if config.photo is None or config.cover is not None or config.labels is not None:
         return config

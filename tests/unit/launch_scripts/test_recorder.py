@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from launch_scripts.launcher.live_table import plain_line
-from launch_scripts.report.certified_gap import CertifiedGap
 from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.results.certified_gap import CertifiedGap
 from launch_scripts.report.samples import Sample, Samples
 from launch_scripts.report.tracks import Tracks
 from swarm.clock import NS_PER_S

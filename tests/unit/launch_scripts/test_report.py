@@ -15,9 +15,9 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 from support.fake_run import fake_run
 
-from launch_scripts.report import picture
-from launch_scripts.report.hillshade import hillshade
-from launch_scripts.report.plot_style import STYLE
+from launch_scripts.report.pictures import picture
+from launch_scripts.report.pictures.hillshade import hillshade
+from launch_scripts.report.pictures.plot_style import STYLE
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import Terrain, terrain_of_pace

@@ -18,10 +18,10 @@ from support.fake_run import fake_run
 from support.map_strategies import set_of
 
 from launch_scripts.cli import main
-from launch_scripts.report.geo_layers import mark_layer
-from launch_scripts.report.geo_shapes import in_degrees
+from launch_scripts.report.geo.geo_layers import mark_layer
+from launch_scripts.report.geo.geo_shapes import in_degrees
+from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks, read_tracks
 from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.track_file import TRACKS_FILE, packed_tracks, read_tracks
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import terrain_of_pace

@@ -10,12 +10,12 @@ import pytest
 from scipy import ndimage
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.terrain.importers import photo_features
 from shared_map.terrain.importers.ground_cover import classified
-from shared_map.terrain.importers.photo_features import Features
-from shared_map.terrain.importers.photo_rules import CLASS_OF_READINGS, EXPOSURES, ground_readings
+from shared_map.terrain.importers.photos import photo_features
 from shared_map.terrain.importers.photos.classify import class_readings
+from shared_map.terrain.importers.photos.photo_features import Features
 from shared_map.terrain.importers.photos.photo_roads import line_strength
+from shared_map.terrain.importers.photos.photo_rules import CLASS_OF_READINGS, EXPOSURES, ground_readings
 from shared_map.terrain.importers.source import Source
 from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
+from shared_map.terrain.importers.cover.cover_meaning import Meaning, joined, meaning_of, why_unknown
 from shared_map.terrain.importers.cover.cover_recognition import NO_COLOUR, NOTHING, some
 from shared_map.terrain.importers.cover.cover_tables import HIGHEST_CODE, CoverTable
-from shared_map.terrain.importers.cover_meaning import Meaning, joined, meaning_of, why_unknown
 from shared_map.terrain.importers.photos.photos import overlap, transform_of
 from shared_map.terrain.importers.rasters.georeference import crs_of, resampling
 from shared_map.terrain.importers.rasters.rasters import opened

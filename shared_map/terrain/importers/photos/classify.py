@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.terrain.importers.photo_features import tiles
-from shared_map.terrain.importers.photo_rules import (
+from shared_map.terrain.importers.photos.photo_features import tiles
+from shared_map.terrain.importers.photos.photo_roads import COARSEST_M, REACH, line_strength, long_lines
+from shared_map.terrain.importers.photos.photo_rules import (
     CERTAIN,
     CLASS_OF_READINGS,
     LIKELY,
@@ -22,7 +23,6 @@ from shared_map.terrain.importers.photo_rules import (
     ground_readings,
     water_signs,
 )
-from shared_map.terrain.importers.photos.photo_roads import COARSEST_M, REACH, line_strength, long_lines
 from shared_map.terrain.layers import TerrainClass, spread
 from shared_map.terrain.row_bands import Progress, counted, in_bands, looked_up, no_progress
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.terrain.importers.degrees import equidistant
+from shared_map.terrain.importers.rasters.degrees import equidistant
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from shared_map.terrain.importers.cover.cover_meaning import meaning_of, sampled_codes, sampled_colours
 from shared_map.terrain.importers.cover.cover_recognition import evidence_of, legend_of, recognise, some
 from shared_map.terrain.importers.cover.cover_tables import TABLES
-from shared_map.terrain.importers.cover_meaning import meaning_of, sampled_codes, sampled_colours
 from shared_map.terrain.importers.rasters.encoded_heights import TITLES, Encoding, encodings_of
 from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from launch_scripts.report.files import write_file
-from launch_scripts.report.machine import processor
+from launch_scripts.report.results.machine import processor
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text

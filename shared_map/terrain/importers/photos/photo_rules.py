@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import Bools, Bytes, Floats
-from shared_map.terrain.importers.photo_features import Features, saturation
+from shared_map.terrain.importers.photos.photo_features import Features, saturation
 from shared_map.terrain.layers import READABLE, TerrainClass
 
 LEVEL_GRADE, SHORE_GRADE = np.float32(0.05), np.float32(0.15)

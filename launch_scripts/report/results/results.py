@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.certified_gap import gap_of, gaps_of, gaps_to
 from launch_scripts.report.latest_state import Observed
+from launch_scripts.report.results.certified_gap import gap_of, gaps_of, gaps_to
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
 from swarm.config.agents import agent_of, plan_agents

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from launch_scripts.report.palette import FAINT, INK
+from launch_scripts.report.pictures.palette import FAINT, INK
 
 STYLE: Any = {
     "font.family": "DejaVu Sans",

@@ -15,7 +15,17 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from launch_scripts.report.palette import BLUE, DARK_GREEN, FAINT, GREEN, INK, ORANGE, SKY, STATE_COLOURS, VIOLET
+from launch_scripts.report.pictures.palette import (
+    BLUE,
+    DARK_GREEN,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    SKY,
+    STATE_COLOURS,
+    VIOLET,
+)
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.samples import Sample, messages_per_s
 from swarm.runtime.stats import Histogram

@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.geo_shapes import Ring, areas_of, line, point, polygon
-from launch_scripts.report.track_file import RunTracks, Track
+from launch_scripts.report.geo.geo_shapes import Ring, areas_of, line, point, polygon
+from launch_scripts.report.geo.track_file import RunTracks, Track
 from shared_map.terrain.places import MapFrame
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import GridSpec

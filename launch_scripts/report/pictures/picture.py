@@ -17,9 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from launch_scripts.report.certified_gap import percent
-from launch_scripts.report.hillshade import hillshade
-from launch_scripts.report.palette import (
+from launch_scripts.report.pictures.hillshade import hillshade
+from launch_scripts.report.pictures.palette import (
     BLACK,
     DARK_GREEN,
     FAINT,
@@ -31,9 +30,10 @@ from launch_scripts.report.palette import (
     RULE,
     YELLOW,
 )
-from launch_scripts.report.plot_style import STYLE
-from launch_scripts.report.plots import draw_plots, duration, halo
+from launch_scripts.report.pictures.plot_style import STYLE
+from launch_scripts.report.pictures.plots import draw_plots, duration, halo
 from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.results.certified_gap import percent
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
 from swarm.wire.statements import MarkKind

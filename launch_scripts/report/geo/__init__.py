@@ -1,0 +1,1 @@
+"""Tracks, captures and marks of a run for a GIS."""
