@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from shared_map.arrays import Bools, Bytes, Floats
@@ -86,7 +87,7 @@ def strength_one_by_one(rgb: Bytes) -> Bytes:
     smooth = (ndimage.gaussian_filter(grey, 0.7, truncate=3) * 8).astype(np.int16)
     padded = np.pad(smooth, 6, mode="edge")
 
-    def moved(array: np.ndarray, trim: int, down: float, right: float) -> np.ndarray:  # type: ignore[type-arg]
+    def moved(array: NDArray[np.int16], trim: int, down: float, right: float) -> NDArray[np.int16]:
         dr, dc = round(down), round(right)
         return array[trim + dr : array.shape[0] - trim + dr, trim + dc : array.shape[1] - trim + dc]
 
@@ -97,7 +98,7 @@ def strength_one_by_one(rgb: Bytes) -> Bytes:
         sides = np.maximum(moved(padded, 2, 2 * right, -2 * down), moved(padded, 2, -2 * right, 2 * down))
         bend = moved(padded, 2, 2 * down, 2 * right) + moved(padded, 2, -2 * down, -2 * right) - 2 * here
         contrast = np.clip(here - sides - np.abs(bend) // 4, -320, 320)
-        total = sum(moved(contrast, 4, tap * down, tap * right) for tap in (-4, -2, 0, 2, 4))
+        total = np.sum([moved(contrast, 4, tap * down, tap * right) for tap in (-4, -2, 0, 2, 4)], axis=0)
         better = total > best
         best[better] = total[better]
         top = smooth >= np.maximum(moved(padded, 6, right, -down), moved(padded, 6, -right, down))
