@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from support.live_swarm import SWARM, swarm, write_scenario
+from support.live_swarm import SWARM, folders_of_runs, swarm, write_scenario
 from support.processes import eventually
 
 from launch_scripts.launcher.run_processes import processes
@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 def running(runs: Path) -> dict[str, int]:
     """Processes of all runs in a folder."""
-    return {name: pid for run_dir in runs.resolve().iterdir() for name, pid in processes(run_dir).items()}
+    return {name: pid for run_dir in folders_of_runs(runs) for name, pid in processes(run_dir).items()}
 
 
 def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(tmp_path: Path) -> None:
@@ -32,7 +32,7 @@ def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(
     assert kinds[:2] == ["calm", "kill"]
     assert report["outcomes"][1]["back_s"] > 0
     assert "messages" not in kinds[2:] or sum(report["messages"].values()) > 0
-    [run_dir] = runs.iterdir()
+    [run_dir] = folders_of_runs(runs)
     assert (run_dir / "chaos.png").stat().st_size > 1000
     whole = json.loads((run_dir / "chaos.json").read_text())
     assert whole["samples"][0]["rss_mb"] > 100

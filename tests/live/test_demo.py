@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from support.live_swarm import SWARM, LiveSwarm
+from support.live_swarm import SWARM, LiveSwarm, folders_of_runs
 from support.processes import eventually, session_of
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -23,7 +23,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
         out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
     eventually(lambda: not session_of(process.pid), 5, "the end of all")
-    (run_dir,) = tmp_path.iterdir()
+    (run_dir,) = folders_of_runs(tmp_path)
     printed, report = json.loads(out), json.loads((run_dir / "report.json").read_text())
     assert {name: report[name] for name in printed} == printed
     assert (report["scenario"], report["vehicles"], report["targets"]) == ("jacksboro", 100, 10)

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from support.live_swarm import swarm, write_scenario
+from support.live_swarm import folders_of_runs, swarm, write_scenario
 from support.plugin_pages import write_all_examples
 
 from launch_scripts.launcher.options import free_ports
@@ -84,8 +84,8 @@ def test_a_swarm_all_whose_plugins_fail_names_each_and_goes_on(tmp_path: Path) -
         "strategy plug-in 'failing:Silent' of planner.strategy: row returned NoneType, expected a StrategyRow",
     ):
         assert sentence in " ".join(said.split()), said
-    (report,) = (tmp_path / "runs").glob("*/report.json")
-    numbers = json.loads(report.read_text())
+    (run_dir,) = folders_of_runs(tmp_path / "runs")
+    numbers = json.loads((run_dir / "report.json").read_text())
     assert (numbers["vehicles_routed"], numbers["collisions"], numbers["lethal_entries"]) == (12, 0, 0)
     assert numbers["restarts"] == 0
 
@@ -116,8 +116,8 @@ def test_the_examples_of_all_pages_run_together(tmp_path: Path) -> None:
     said = told.stdout + told.stderr
     assert told.returncode == 0, said
     assert "plug-in" not in said
-    (report,) = (tmp_path / "runs").glob("*/report.json")
-    numbers = json.loads(report.read_text())
+    (run_dir,) = folders_of_runs(tmp_path / "runs")
+    numbers = json.loads((run_dir / "report.json").read_text())
     assert (numbers["vehicles_routed"], numbers["collisions"], numbers["lethal_entries"]) == (12, 0, 0)
     assert numbers["marks"] > 0
-    assert all("plugin_failed" not in log.read_text() for log in (tmp_path / "runs").glob("*/*.log"))
+    assert all("plugin_failed" not in log.read_text() for log in run_dir.glob("*.log"))

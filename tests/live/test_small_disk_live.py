@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support.live_swarm import SWARM, write_scenario
+from support.live_swarm import SWARM, folders_of_runs, write_scenario
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -52,7 +52,7 @@ def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: 
         swarm = subprocess.Popen([*command, "--seconds", "200"], stdout=file, stderr=subprocess.STDOUT)
     try:
         until(out, "routes are served", 240)
-        (run_dir,) = (disk / "runs").iterdir()
+        (run_dir,) = folders_of_runs(disk / "runs")
         filler = disk / "filler"
         with pytest.raises(OSError, match="No space"):
             fill(filler)

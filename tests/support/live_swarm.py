@@ -68,6 +68,11 @@ def write_scenario(folder: Path, also: str = "") -> Path:
     return path
 
 
+def folders_of_runs(runs: Path) -> list[Path]:
+    """The folders of all runs, of which `LAST` is a link to the newest."""
+    return [each for each in runs.resolve().iterdir() if not each.is_symlink()] if runs.exists() else []
+
+
 def swarm(*arguments: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
     """Run the command `swarm` to its end."""
     command = [*SWARM, *map(str, arguments)]
@@ -98,7 +103,7 @@ class LiveSwarm:
 
     @property
     def run_dir(self) -> Path:
-        (run_dir,) = self.runs.iterdir()
+        (run_dir,) = folders_of_runs(self.runs)
         return run_dir
 
     def said(self, text: str) -> bool:
