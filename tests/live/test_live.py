@@ -80,7 +80,8 @@ def test_a_person_asks_for_a_route_and_for_the_status(live: LiveSwarm, bus: Zeno
     assert told.stdout.startswith(f"from cell:{row},{col} (xy:")
     assert told.stdout.count("\n") == 2  # the age of the pose, too
     told = swarm("route", "--target", "t0", "--row", 4000, "--col", 1, "--connect", live.endpoint)
-    assert told.stdout.startswith("outside: ")
+    assert (told.returncode, told.stdout) == (2, "")
+    assert "--from is 'cell:4000,1', outside the terrain: 96 x 128 cells" in told.stderr
     told = swarm("route", "--target", "t7", "--row", row, "--col", col, "--connect", live.endpoint)
     assert (told.returncode, told.stdout) == (4, "")
     assert told.stderr.startswith("swarm: no planner of target 't7' answers")

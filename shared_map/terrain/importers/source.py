@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 from shared_map.arrays import Bools, Bytes, Floats
 from swarm.grid import GridSpec
@@ -26,6 +26,7 @@ class Source:
     grid: GridSpec
     elevation_m: Floats
     classes: Bytes
+    _: KW_ONLY
     readings: Bytes | None = None
     photo: Bytes | None = None
     seen: Bools | None = None

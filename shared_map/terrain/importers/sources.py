@@ -231,7 +231,7 @@ def _heights(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     notes = [str(path), *plain.notes, note, *told]
     if read is read_text_grid and plain.step != (0.0, 0.0) and grid.crs == "local":
         notes.append("x and y are taken for metres of a system without a name; terrain.crs names it")
-    return Source(grid, heights, classes, photo, level=level, notes=tuple(notes))
+    return Source(grid, heights, classes, photo=photo, level=level, notes=tuple(notes))
 
 
 def _nearest(rows: int, cols: int, grid: GridSpec) -> tuple[Any, ...]:
