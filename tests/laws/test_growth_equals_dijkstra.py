@@ -26,8 +26,9 @@ def test_a_thousand_random_grids_equal_dijkstra() -> None:
 
 
 @pytest.mark.slow
-def test_ten_thousand_random_grids_equal_dijkstra() -> None:
-    random_grids(10_000, 2, 40)
+@pytest.mark.parametrize("grids", [2_000, pytest.param(10_000, marks=pytest.mark.thorough)])
+def test_random_grids_equal_dijkstra(grids: int) -> None:
+    random_grids(grids, 2, 40)
 
 
 def test_scipy_equals_twelve_lines_that_can_be_read() -> None:

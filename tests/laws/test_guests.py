@@ -70,7 +70,7 @@ def test_guests_come_and_go_where_nothing_fails() -> None:
     assert world.removed > 3
 
 
-@pytest.mark.seeds(12)
+@pytest.mark.seeds(6)
 def test_no_two_meet_and_all_move_again_when_it_is_quiet(seed: int) -> None:
     world = world_of(seed, twins=False)
     world.run(QUIET_S + 10.0)
@@ -83,7 +83,7 @@ def test_no_two_meet_and_all_move_again_when_it_is_quiet(seed: int) -> None:
     assert world.entered
 
 
-@pytest.mark.seeds(8)
+@pytest.mark.seeds(4)
 def test_no_two_meet_where_two_robots_have_one_name(seed: int) -> None:
     """The one that is replaced stands still, and others may wait for it for ever."""
     for world in (world_of(seed), borders_of(seed)):

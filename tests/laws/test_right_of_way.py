@@ -68,12 +68,12 @@ def check(world: TrafficWorld, settle_s: float = 8.0, move_s: float = 10.0) -> N
     assert [vehicle for vehicle in vehicles if world.moves.get(vehicle, 0) == before.get(vehicle, 0)] == []
 
 
-@pytest.mark.seeds(24)
+@pytest.mark.seeds(12)
 def test_no_two_meet_and_all_move_again_when_it_is_quiet(seed: int) -> None:
     check(world_of(seed))
 
 
-@pytest.mark.seeds(6)
+@pytest.mark.seeds(3)
 def test_no_two_meet_when_wardens_replace_each_other_all_the_time(seed: int) -> None:
     world = duel_of(seed)
     check(world, move_s=20.0)
@@ -99,6 +99,7 @@ def test_no_two_meet_under_any_mixture_of_faults(
     check(TrafficWorld(seed, agents, each, size, side, faults), settle_s=12.0, move_s=14.0)
 
 
+@pytest.mark.thorough
 def test_forty_agents_in_a_crowd() -> None:
     faults = Faults(
         loss=0.05, repeat=0.02, late=0.02, delay_ms=50, crashes=3, hangs=1, cuts=0.5, leaps=1, twins=0.5, quiet_s=8

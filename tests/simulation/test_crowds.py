@@ -17,7 +17,7 @@ SECONDS = 24.0
 
 
 @pytest.mark.parametrize(
-    "kind", [kind if kind == "doors" else pytest.param(kind, marks=pytest.mark.thorough) for kind in CROWDS]
+    "kind", [kind if kind == "maze" else pytest.param(kind, marks=pytest.mark.thorough) for kind in CROWDS]
 )
 def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
     scenario, terrain = crowd(kind, 1, vehicles=100, per_agent=13, side=30)

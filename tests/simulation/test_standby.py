@@ -61,7 +61,7 @@ def leaders(simulation: Simulation, target: str) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.seeds(2)
 def test_the_leader_of_each_target_dies_for_good_and_every_query_is_answered_again_within_a_second(
     seed: int,
 ) -> None:
@@ -136,7 +136,7 @@ def leads(node: Node) -> bool:
     return service is not None and bool(service._world.leads)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.seeds(2)
 def test_the_targets_go_on_from_where_they_are_and_captures_count_on(seed: int) -> None:
     plan = FaultPlan(drop=0.02, jitter_ms=10, crashes=(Crash(10, "targets-0", for_good=True),))
     simulation = Simulation(seeded(seed, STANDING_BY), faults=plan)

@@ -55,7 +55,7 @@ def test_a_run_in_which_nothing_goes_wrong_keeps_every_law_and_does_its_work():
     assert report["gap"]["mean"] >= 1.0
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.seeds(4)
 def test_the_laws_hold_under_seeded_faults(seed):
     simulation = Simulation(seeded(seed), faults=random_plan(seed, nodes_of(SMALL), SECONDS))
     check_all(simulation)

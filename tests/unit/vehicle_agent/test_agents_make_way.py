@@ -48,7 +48,7 @@ def test_a_corridor_with_one_passing_place_lets_two_pass_each_other(seed: int) -
     world.assert_lawful()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.seeds(1)
 def test_two_columns_pass_each_other_through_a_gap(seed: int) -> None:
     field = ["." * 9 + ("..." if row == 4 else "###") + "." * 9 for row in range(9)]
     west = [[row, col] for col in (1, 3) for row in (2, 4, 6)]
