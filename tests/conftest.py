@@ -4,11 +4,21 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import settings
+
+COMMIT_EXAMPLES = 40
+"""Examples of a property for each commit, where it names no number of its own; with `--thorough` there are 100."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--seeds", metavar="A:B", help="these histories instead of the ones that tests name")
     parser.addoption("--thorough", action="store_true", help="also the tests marked thorough")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    settings.register_profile("commit", max_examples=COMMIT_EXAMPLES)
+    if not config.getoption("--thorough"):
+        settings.load_profile("commit")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:

@@ -127,7 +127,10 @@ print("fine")
 """
 
 
-@pytest.mark.parametrize(("setting", "count"), [("NUMBA_DISABLE_JIT", 60), ("NUMBA_BOUNDSCHECK", 200)])
+@pytest.mark.parametrize(
+    ("setting", "count"),
+    [("NUMBA_DISABLE_JIT", 60), pytest.param("NUMBA_BOUNDSCHECK", 200, marks=pytest.mark.thorough)],
+)
 def test_kernels_do_the_same_uncompiled_and_never_leave_their_arrays(
     setting: str, count: int, tmp_path: Path
 ) -> None:

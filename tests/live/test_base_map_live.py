@@ -90,6 +90,7 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
     assert "Traceback" not in told.stderr
 
 
+@pytest.mark.thorough
 def test_several_keepers_by_name_agree_and_the_second_outlives_the_first(hands: Hands) -> None:
     scenario = str(hands.path)
     endpoint = hands.network.connect[0]

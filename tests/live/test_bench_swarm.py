@@ -19,7 +19,11 @@ from swarm.errors import SwarmError
 
 pytestmark = pytest.mark.network
 
-SIGNALS = [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough), signal.SIGKILL]
+SIGNALS = [
+    pytest.param(signal.SIGINT, marks=pytest.mark.thorough),
+    pytest.param(signal.SIGTERM, marks=pytest.mark.thorough),
+    signal.SIGKILL,
+]
 SMALL = ("bench", "swarm", "--vehicles", "20", "--targets", "2")
 
 

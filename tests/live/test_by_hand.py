@@ -48,6 +48,7 @@ def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) ->
         assert process.wait(30) == 0, hands.logs()
 
 
+@pytest.mark.thorough
 def test_who_is_started_before_the_router_waits_says_so_once_and_goes_on(hands: Hands) -> None:
     text = hands.path.read_text().replace("[network]", "[network]\nconnect_timeout_s = 1")
     hands.path.write_text(text)

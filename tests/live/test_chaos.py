@@ -21,6 +21,7 @@ def running(runs: Path) -> dict[str, int]:
     return {name: pid for run_dir in folders_of_runs(runs) for name, pid in processes(run_dir).items()}
 
 
+@pytest.mark.thorough
 def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     options = ("--seconds", 16, "--every", 4, "--within", 30, "--seed", 57, "--runs", runs, "--json")

@@ -15,6 +15,7 @@ LONGEST = 300_000
 """Bytes of a file: the terrain's are shorter, the recording and the report's picture are not."""
 
 
+@pytest.mark.thorough
 def test_where_nothing_more_can_be_written_the_swarm_goes_on_and_says_so(tmp_path: Path) -> None:
     def limit() -> None:
         _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -109,6 +109,7 @@ web_port = 0
 """
 
 
+@pytest.mark.thorough
 def test_the_examples_of_all_pages_run_together(tmp_path: Path) -> None:
     path = write_all_examples(tmp_path, ALL.format(port=free_ports(1)[0]))
     assert sum(line.count(":") for line in path.read_text().splitlines() if '"tcp' not in line) == 6

@@ -99,6 +99,7 @@ def two_machines(folder: Path) -> Iterator[tuple[TwoMachines, Routed]]:
                     process.kill()
 
 
+@pytest.mark.thorough
 def test_after_a_silent_cut_and_after_the_death_of_a_whole_machine_all_vehicles_are_routed_again(
     tmp_path: Path,
 ) -> None:

@@ -24,7 +24,9 @@ def sets_in(store: Path) -> int:
     return int(json.loads(done.stdout)["sets"])
 
 
-@pytest.mark.parametrize("kill", [os.kill, os.killpg], ids=["launcher", "all"])
+@pytest.mark.parametrize(
+    "kill", [pytest.param(os.kill, marks=pytest.mark.thorough), os.killpg], ids=["launcher", "all"]
+)
 def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_with_the_keepers_store(
     tmp_path: Path, kill: Callable[[int, int], None]
 ) -> None:

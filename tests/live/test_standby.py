@@ -95,6 +95,7 @@ def machine(live: LiveSwarm, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
         launcher.wait(10)
 
 
+@pytest.mark.thorough
 def test_vehicles_and_clients_are_answered_again_soon_after_the_planners_machine_is_gone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -78,6 +78,7 @@ def route_to_x(live: LiveSwarm, *options: str) -> str:
     ).stdout
 
 
+@pytest.mark.thorough
 def test_a_tracker_from_outside_owns_its_target_until_it_is_dead_or_hands_it_over(
     live: LiveSwarm, tmp_path: Path
 ) -> None:

@@ -298,6 +298,7 @@ time.sleep(60)
     assert rows_by_entity(path)["/a"] == 100
 
 
+@pytest.mark.thorough
 def test_a_recording_that_finds_no_space_is_told_and_goes_on_in_a_new_file(tmp_path: Path) -> None:
     """A limit of the size of files stands for the full disk: Rerun's sink ends at the first error all the same."""
     script = f"""

@@ -26,6 +26,7 @@ def site(tmp_path_factory):
     return folder
 
 
+@pytest.mark.thorough
 def test_every_page_is_built_and_in_the_navigation(site):
     """Every page links to those of its section, and the home page to the first of each; so follow the menus."""
     found, waiting = set(), [site / "index.html"]

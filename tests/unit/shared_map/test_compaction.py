@@ -189,7 +189,7 @@ class Disk:
         return []
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(st.lists(mark_sets(), min_size=2, max_size=14), st.integers(0, 10_000))
 def test_two_keepers_that_compact_with_different_knowledge_lose_no_winner(sets: list[MarkSet], seed: int) -> None:
     """Each set reaches both keepers in the end, in any order, between compactions of whom each takes for dead."""
