@@ -6,7 +6,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn
 
-from launch_scripts.monitor.scene import TerrainMesh
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 
 BACKGROUND = (17, 22, 28)
 TRAIL_S = 25.0

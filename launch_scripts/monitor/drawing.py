@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.scene import STATE_COLOURS, Bytes, Floats, MeshTile, Points, TerrainMesh
-from launch_scripts.monitor.sinks import Streams
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
+from launch_scripts.monitor.movers.points import STATE_COLOURS, Points
+from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.report.pictures import palette
 from launch_scripts.report.samples import Sample
 from swarm.wire.messages.vehicles import VehicleState

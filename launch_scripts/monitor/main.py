@@ -7,10 +7,10 @@ import os
 from collections.abc import Callable
 
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.recording_watch import RecordingWatch
-from launch_scripts.monitor.scene import TerrainMesh
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import FRAME_HZ, MonitorService
-from launch_scripts.monitor.sinks import Sinks, new_recording_path
+from launch_scripts.monitor.serving.recording_watch import RecordingWatch
+from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock

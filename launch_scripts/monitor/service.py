@@ -12,10 +12,10 @@ import rerun as rr
 
 from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
-from launch_scripts.monitor.recording_watch import RecordingWatch
-from launch_scripts.monitor.scene import (
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.ground.windows import window_outlines
+from launch_scripts.monitor.movers.points import (
     RouteNow,
-    TerrainMesh,
     body_points,
     cell_at,
     cells_along,
@@ -24,8 +24,9 @@ from launch_scripts.monitor.scene import (
     target_points,
     vehicle_points,
 )
-from launch_scripts.monitor.sinks import Streams
-from launch_scripts.monitor.strips import Trails, poles, route_strips, window_outlines
+from launch_scripts.monitor.movers.strips import Trails, poles, route_strips
+from launch_scripts.monitor.serving.recording_watch import RecordingWatch
+from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.report.samples import messages_per_s
 from launch_scripts.report.vehicle_columns import VehicleColumns

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.scene import TerrainMesh
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
-from launch_scripts.monitor.sinks import Sinks
+from launch_scripts.monitor.serving.sinks import Sinks
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
 from swarm.clock import NS_PER_S

@@ -25,9 +25,9 @@ from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little
 
 from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.recording_watch import RecordingWatch
-from launch_scripts.monitor.scene import TerrainMesh
-from launch_scripts.monitor.sinks import Sinks, new_recording_path
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.serving.recording_watch import RecordingWatch
+from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
@@ -277,8 +277,8 @@ def test_a_killed_monitor_leaves_a_readable_file(tmp_path: Path) -> None:
     script = f"""
 import time, numpy, pathlib
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.sinks import Sinks
-from launch_scripts.monitor.scene import TerrainMesh
+from launch_scripts.monitor.serving.sinks import Sinks
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 import rerun as rr
@@ -306,9 +306,9 @@ import resource, pathlib, time, numpy
 import rerun as rr
 from launch_scripts.monitor import recording_watch
 from launch_scripts.monitor.blueprint import make_blueprint
-from launch_scripts.monitor.recording_watch import RecordingWatch
-from launch_scripts.monitor.scene import TerrainMesh
-from launch_scripts.monitor.sinks import Sinks, new_recording_path
+from launch_scripts.monitor.serving.recording_watch import RecordingWatch
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MonitorConfig
 
@@ -378,7 +378,7 @@ time.sleep(60)
 
 @pytest.mark.network
 def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("launch_scripts.monitor.sinks._PORT_PATIENCE_S", 0.2)
+    monkeypatch.setattr("launch_scripts.monitor.serving.sinks._PORT_PATIENCE_S", 0.2)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

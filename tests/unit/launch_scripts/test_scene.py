@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
-from launch_scripts.monitor.scene import (
-    LETHAL_MARK,
+from launch_scripts.monitor.ground.terrain_mesh import LETHAL_MARK, TerrainMesh
+from launch_scripts.monitor.ground.windows import window_outlines
+from launch_scripts.monitor.movers.points import (
     LOST_TARGET_COLOUR,
     STATE_COLOURS,
     RouteNow,
-    TerrainMesh,
     cell_at,
     cells_along,
     label_places,
     target_points,
     vehicle_points,
 )
-from launch_scripts.monitor.strips import Trails, poles, route_strips, window_outlines
+from launch_scripts.monitor.movers.strips import Trails, poles, route_strips
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
 from shared_map.terrain.terrain import Terrain, terrain_of_pace

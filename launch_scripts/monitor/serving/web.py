@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from launch_scripts.monitor import die_with_parent
-from launch_scripts.monitor.loopback_guard import LOOPBACK, BoundedServer, refusal
+from launch_scripts.monitor.serving.loopback_guard import LOOPBACK, BoundedServer, refusal
 from swarm.errors import StoreError
 
 log = logging.getLogger(__name__)

@@ -1,6 +1,6 @@
 """Screenshot of a recorded run, such as the README's. Needs a Vulkan driver and no display.
 
-python -m launch_scripts.monitor.screenshot runs/LAST/run.rrd docs/images/live-view.png --at 60
+python -m launch_scripts.monitor.serving.screenshot runs/LAST/run.rrd docs/images/live-view.png --at 60
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from launch_scripts.monitor.loopback_guard import LOOPBACK
-from launch_scripts.monitor.web import viewer_program
+from launch_scripts.monitor.serving.loopback_guard import LOOPBACK
+from launch_scripts.monitor.serving.web import viewer_program
 
 T = TypeVar("T")
 _START_WITHIN_S = 30.0

@@ -10,11 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.monitor.scene import Floats, Points, TerrainMesh
-from swarm.grid import Window
+from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
+from launch_scripts.monitor.movers.points import Points
 
-_SIDE_POINTS = 33
-"""Points along each side of a window: its outline follows the terrain."""
 _ROUTE_POINTS = 64
 """Points of a route at most, so that a hundred routes stay cheap to draw."""
 
@@ -23,19 +21,6 @@ def poles(mesh: TerrainMesh, targets: Points) -> Floats:
     """A line from each target down to the terrain."""
     feet = mesh.place(targets.positions[:, 0], -targets.positions[:, 1])
     return np.stack([feet, targets.positions], axis=1)
-
-
-def window_outlines(mesh: TerrainMesh, windows: Sequence[Window]) -> Floats:
-    """The border of each window, laid over the terrain."""
-    sides = np.array([(w.row0, w.row1 - 1, w.col0, w.col1 - 1) for w in windows], np.int64).reshape(-1, 4).T
-    north, south = np.clip(sides[:2], 0, mesh.grid.rows - 1)[..., None]
-    west, east = np.clip(sides[2:], 0, mesh.grid.cols - 1)[..., None]
-    along = np.linspace(0, 1, _SIDE_POINTS)
-    down, across = (north + (south - north) * along).astype(int), (west + (east - west) * along).astype(int)
-    flat = np.zeros(_SIDE_POINTS, int)
-    rows = np.concatenate([north + flat, down, south + flat, down[:, ::-1]], axis=1)
-    cols = np.concatenate([across, east + flat, across[:, ::-1], west + flat], axis=1)
-    return mesh.place_cells(rows * mesh.grid.cols + cols, 0.25 * mesh.scale_m)
 
 
 def route_strips(mesh: TerrainMesh, routes: Sequence[NDArray[np.integer]]) -> Floats:

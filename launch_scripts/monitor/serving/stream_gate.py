@@ -11,7 +11,7 @@ import select
 import socket
 import socketserver
 
-from launch_scripts.monitor.loopback_guard import BoundedServer, refusal
+from launch_scripts.monitor.serving.loopback_guard import BoundedServer, refusal
 
 _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 """So begins HTTP/2 in the clear, which native viewers speak and no browser does."""

@@ -1,0 +1,1 @@
+"""What lies still in the view: the terrain, its colours, windows."""

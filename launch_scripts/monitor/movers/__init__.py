@@ -1,0 +1,1 @@
+"""What moves in the view: vehicles, targets, bodies, their routes and trails."""

@@ -1,0 +1,1 @@
+"""Where the view goes: a file, a port, a page."""
