@@ -91,5 +91,11 @@ class RunOptions:
     no_live: Annotated[
         bool, typer.Option("--no-live", help="Serve no live view. The run is recorded all the same.")
     ] = False
+    record_inputs: Annotated[
+        bool,
+        typer.Option(
+            "--record-inputs", help="Record what every process hears, so that `swarm replay` can repeat it."
+        ),
+    ] = False
     plain: Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live table.")] = False
     as_json: AsJson = False

@@ -68,6 +68,7 @@ class UpOptions:
     run_id     the run to take part in; if None it is made or found
     began_s    time.monotonic() at which the command was given
     table      other processes than the scenario's
+    record_inputs  of every process, for `swarm replay`
     """
 
     scenario: Scenario
@@ -80,6 +81,7 @@ class UpOptions:
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
     table: tuple[ProcessSpec, ...] | None = None
+    record_inputs: bool = False
 
 
 class _RefusedError(SwarmError):
@@ -258,6 +260,7 @@ class _Run:
             incarnation=next_life(self._run_dir, spec.role, spec.id),
             started_ns=self._started_ns,
             run_dir=self._run_dir,
+            record_inputs=self._options.record_inputs,
         )
 
     def _wait(

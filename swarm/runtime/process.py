@@ -21,6 +21,10 @@ from swarm.runtime.stats import Counters
 
 log = logging.getLogger(__name__)
 
+LOOP_COUNTS = ("ticks_dropped", "ticks_late", "events_dropped", "asks_expired")
+LOOP_GAUGES = ("inbox",)
+LOOP_HISTOGRAMS = ("tick_ms",)
+"""What the loop writes into its service's counters."""
 _WORKER_NICE = 5
 """By how much less urgent jobs of a worker are than their process."""
 

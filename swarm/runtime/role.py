@@ -19,6 +19,7 @@ class RoleSetup:
     started_ns   start of the run
     run_dir      where this machine keeps the run: prepared terrain, the keeper's store, logs; None if nowhere
     added        of an agent that the scenario does not name: what it hosts
+    record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
     """
 
     scenario: Scenario
@@ -29,6 +30,7 @@ class RoleSetup:
     started_ns: int
     run_dir: Path | None = None
     added: AddedAgent | None = None
+    record_inputs: bool = False
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
         """What this process answers when others ask which run it belongs to."""
