@@ -176,6 +176,7 @@ class _Run:
         self._swarm = LocalSwarm(_table(options), self._setup_of, run_dir)
         self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
+        self._recorder: Recorder | None = None
         for sentence in begin_run(run_dir, options.scenario, run_id):
             self._terminal.say(sentence, "yellow")
 
@@ -212,7 +213,9 @@ class _Run:
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
                 self._say_begin()
-                watcher = Watcher(bus, Recorder(self._scenario, self._terrain.grid), MonotonicClock())
+                recorder = Recorder(self._scenario, self._terrain.grid, self._started_ns)
+                self._recorder = recorder
+                watcher = Watcher(bus, recorder, MonotonicClock())
                 watcher.begin()
                 try:
                     self._swarm.start()
@@ -258,6 +261,7 @@ class _Run:
             incarnation=next_life(self._run_dir, spec.role, spec.id),
             started_ns=self._started_ns,
             run_dir=self._run_dir,
+            before=None if self._recorder is None else self._recorder.observed.newest_stats(spec.role, spec.id),
         )
 
     def _wait(
@@ -298,10 +302,10 @@ class _Run:
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = time.monotonic()
-        self._book = watcher.book
+        self._book = watcher.recorder.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
-            ordered.look(watcher.book, watcher.alive, time.monotonic())
+            ordered.look(watcher.recorder.book, watcher.alive, time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S)
             self._tell(watcher)
@@ -357,7 +361,7 @@ class _Run:
             title = f"{self._scenario.name}, {summary.elapsed_s:.0f} s" + (
                 f", live view {watcher.live_view}" if watcher.live_view else ""
             )
-            self._terminal.show(title, summary, self._swarm.by_role(), self._swarm.restarts)
+            self._terminal.show(title, summary)
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:
@@ -391,8 +395,6 @@ class _Run:
             self._terrain,
             run_id=self._run_id,
             seconds=seconds,
-            processes=len(self._swarm.running),
-            restarts=self._swarm.restarts,
             startup_s=self._startup_s,
         )
         numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}

@@ -17,7 +17,7 @@ from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
 from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.stats import Counters
+from swarm.runtime.stats import ENDED, Counters
 
 log = logging.getLogger(__name__)
 
@@ -139,6 +139,7 @@ class Process:
         try:
             with collected_rarely():
                 self._loop(counters)
+            counters.gauge(ENDED, 1.0)
         finally:
             # A second signal must not interrupt the end, not even that of the interpreter.
             for number in self._signals:
