@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
@@ -50,6 +51,9 @@ from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.processes import RunInfo
 
+if TYPE_CHECKING:
+    from launch_scripts.metrics.of_launcher import LauncherMetrics
+
 log = logging.getLogger(__name__)
 
 _TURN_S = 0.05
@@ -63,11 +67,12 @@ _QUIET_NOTES = frozenset({"live_view"})
 class UpOptions:
     """Options of a run.
 
-    joins      there is a router elsewhere: none is started here
-    rank       of planners and the targets process, start only those of this rank; if None all
-    run_id     the run to take part in; if None it is made or found
-    began_s    time.monotonic() at which the command was given
-    table      other processes than the scenario's
+    joins         there is a router elsewhere: none is started here
+    rank          of planners and the targets process, start only those of this rank; if None all
+    run_id        the run to take part in; if None it is made or found
+    began_s       time.monotonic() at which the command was given
+    table         other processes than the scenario's
+    metrics_port  where figures are served to Prometheus; 0 is any
     """
 
     scenario: Scenario
@@ -80,6 +85,7 @@ class UpOptions:
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
     table: tuple[ProcessSpec, ...] | None = None
+    metrics_port: int | None = None
 
 
 class _RefusedError(SwarmError):
@@ -176,8 +182,18 @@ class _Run:
         self._swarm = LocalSwarm(_table(options), self._setup_of, run_dir)
         self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
+        self._metrics = self._open_metrics()
         for sentence in begin_run(run_dir, options.scenario, run_id):
             self._terminal.say(sentence, "yellow")
+
+    def _open_metrics(self) -> LauncherMetrics | None:
+        if self._options.metrics_port is None:
+            return None
+        from launch_scripts.metrics.of_launcher import LauncherMetrics  # takes time to import
+
+        metrics = LauncherMetrics(self._options.metrics_port, self._run_id, self._scenario.name, self._started_ns)
+        self._terminal.say(f"metrics at {metrics.url}")
+        return metrics
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
@@ -189,6 +205,8 @@ class _Run:
             return self._run()
         finally:
             self._warm_up.close()
+            if self._metrics is not None:
+                self._metrics.close()
 
     def _run(self) -> int:
         with self._stop_asked.interrupting():
@@ -343,6 +361,8 @@ class _Run:
         return [spec.name for spec in specs if (spec.role, spec.id) not in watcher.ever_up]
 
     def _tell(self, watcher: Watcher) -> None:
+        if self._metrics is not None:
+            self._metrics.answer(watcher.recorder.observed)
         if (sentence := self._disk.look(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
         if (compiled := self._warm_up.news()) is not None:
