@@ -19,7 +19,7 @@ from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm
 from launch_scripts.launcher.up import UpOptions, _StopAsked, run_swarm
 from launch_scripts.launcher.warm_up import WarmUp
-from launch_scripts.process_table import ROLES, STOP_ORDER, ProcessSpec, processes_of
+from launch_scripts.process_table import NICENESS, ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
 from swarm.errors import ConfigError
 from swarm.runtime.role import RoleSetup
@@ -69,6 +69,11 @@ def test_the_table_has_a_process_for_each_target_and_each_25_vehicles() -> None:
         *("targets-0", "agent-a0", "agent-a1", "agent-a2"),
     ]
     assert [spec.name for spec in processes_of(scenario, ("router", "agent"))][:2] == ["router-0", "agent-a0"]
+
+
+def test_the_table_says_of_every_role_how_urgent_it_is_and_none_before_those_that_drive() -> None:
+    assert set(NICENESS) == set(ROLES)
+    assert NICENESS["agent"] == NICENESS["targets"] == min(NICENESS.values()) == 0
 
 
 def test_the_table_has_standbys_after_those_that_lead_and_may_be_limited_to_a_rank() -> None:
@@ -124,6 +129,12 @@ def test_processes_end_role_by_role_and_each_has_a_log(swarms: list[LocalSwarm],
     for role, id, _ in rows:
         wait_for_line(order, f"+{role}-{id}")
     assert swarm.by_role()["planner"] == (1, 1)
+    ours = os.getpriority(os.PRIO_PROCESS, 0)
+    for running in swarm.running:
+        assert running.process is not None
+        assert running.process.pid is not None
+        niceness = min(ours + NICENESS[running.spec.role], 19)
+        assert os.getpriority(os.PRIO_PROCESS, running.process.pid) == niceness
     assert swarm.stop(lambda: time.sleep(0.02)) == []
     assert order.read_text().split()[4:] == ["-agent-a0", "-planner-t0", "-keeper-0", "-router-0"]
     assert "hello from t0" in (tmp_path / "planner-t0.log").read_text()
