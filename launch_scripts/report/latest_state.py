@@ -150,7 +150,7 @@ class Observed(Counts):
         """A gauge, summed over the processes which are alive; None if none of them has published it."""
         told = [
             stats.gauges[name]
-            for key, stats in self.newest_of_each().items()
+            for key, stats in self.newest().items()
             if name in stats.gauges and self._alive.get(key)
         ]
         return sum(told) if told else None

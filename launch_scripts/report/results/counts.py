@@ -35,7 +35,7 @@ class Counts:
         """What the newest incarnation of a process has said last."""
         return self._newest.get((role, id))
 
-    def newest_of_each(self) -> dict[tuple[str, str], Stats]:
+    def newest(self) -> dict[tuple[str, str], Stats]:
         """(role, id) -> what its newest incarnation has said last, in order."""
         return dict(sorted(self._newest.items()))
 
@@ -58,7 +58,7 @@ class Counts:
 
     def gauge(self, name: str) -> float | None:
         """A gauge, summed over the newest incarnation of each process; None if no process has published it."""
-        told = [stats.gauges[name] for stats in self.newest_of_each().values() if name in stats.gauges]
+        told = [stats.gauges[name] for _, stats in self.newest().items() if name in stats.gauges]
         return sum(told) if told else None
 
     def counts_by(self, name: str) -> dict[str, int]:

@@ -160,7 +160,7 @@ def _in_run(told: Told, known: bool, began_ns: int) -> Alarm:
 
 def _told(observed: Observed) -> Iterator[Found]:
     """What processes say. What lasted when one went is not said any more."""
-    for (role, id), stats in observed.newest_of_each().items():
+    for (role, id), stats in observed.newest().items():
         for alarm in stats.alarms:
             if alarm.over_ns is not None or observed.is_well(role, id):
                 yield alarm, True

@@ -155,9 +155,9 @@ FACTS: tuple[Fact, ...] = (
 TARGET_FACTS: tuple[TargetFact, ...] = (
     TargetFact("target", "target", "", lambda t: t.title, _word, "Its id, and what is unusual about it."),
     TargetFact("chased_by", "following", "", lambda t: t.following, count, "Vehicles that go for it."),
-    TargetFact("nearest_m", "nearest", "m", lambda t: t.nearest_m, distance, "Distance of the nearest one."),
+    TargetFact("nearest_m", "nearest", "m", lambda t: t.nearest_m, distance, "Distance of the nearest vehicle."),
     TargetFact("re_plans", "re-plans", "", lambda t: t.growths, count, "How often its tree was grown or repaired."),
-    TargetFact("growth_ms", "tree", "ms", lambda t: t.growth_ms, duration, "What growing the whole tree took last."),
+    TargetFact("growth_ms", "tree", "ms", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
     TargetFact(
         "certified_gap", "certified gap", "", lambda t: t.gap, _gap_mean,
         "How far above the optimum the routes to it can be at most, in the mean.",
