@@ -18,7 +18,7 @@ from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
 from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, ThreadWorker, end_with
+from swarm.runtime.process import Process, ThreadWorker, end_with, tick_phase
 from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
@@ -55,7 +55,9 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             boundary.function("all kernels", lambda: kernels.complete, bool),
             boundary.outside(prepared, PREPARED_COSTS),
         )
-        process = Process(boundary.service(service), inbox, clock, scenario.planner.tick_hz)
+        process = Process(
+            boundary.service(service), inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id)
+        )
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

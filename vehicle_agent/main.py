@@ -9,7 +9,7 @@ from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, end_with
+from swarm.runtime.process import Process, end_with, tick_phase
 from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
@@ -37,7 +37,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         inbox = Inbox()
         kept = boundary.outside(store, PROMISE_STORE)
         service = AgentService(setup, terrain, truth, boundary.bus(bus), inbox.post, kept)
-        process = Process(boundary.service(service), inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz)
+        tick_hz = setup.scenario.vehicles.tick_hz
+        process = Process(boundary.service(service), inbox, MonotonicClock(), tick_hz, tick_phase(setup.id))
         service.when_over = process.stop
         process.stop_on_signals()
         if stop_when is not None:

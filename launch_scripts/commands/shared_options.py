@@ -97,5 +97,9 @@ class RunOptions:
             "--record-inputs", help="Record what every process hears, so that `swarm replay` can repeat it."
         ),
     ] = False
+    metrics_port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Serve figures to Prometheus on this port of loopback; 0 picks one."),
+    ] = None
     plain: Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live table.")] = False
     as_json: AsJson = False

@@ -91,13 +91,13 @@ class MonitorService:
         live_url: str | None = None,
         recording: RecordingWatch | None = None,
     ) -> None:
-        self.recorder = Recorder(setup.scenario, terrain.grid)
+        self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
         self._setup = setup
         self._terrain = terrain
         self._bus = bus
         self._post = post
         self._live_url = live_url
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self.counters: Counters = self._member.counters
         self._cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, self._cost_map)

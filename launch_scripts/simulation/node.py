@@ -21,6 +21,7 @@ from swarm.runtime.process import Service
 from swarm.runtime.recording.boundary import Boundary
 from swarm.runtime.recording.recording import Recording
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import ENDED
 from vehicle_agent.promise_store import PROMISE_STORE, MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
@@ -113,6 +114,8 @@ class Node:
             incarnation=self._life,
             started_ns=EPOCH_NS,
             added=self.added,
+            restarts=self.crashes,
+            before=simulation.recorder.observed.newest_stats(self.spec.role, self.spec.id),
         )
         boundary = Boundary()
         if simulation.record_to is not None:
@@ -179,7 +182,8 @@ class Node:
                 self._shell.handle(event, self.now_ns())
 
     def stop(self) -> None:
-        if self._shell is not None:
+        if self.service is not None and self._shell is not None:
+            self.service.counters.gauge(ENDED, 1.0)
             self._shell.stop(self.now_ns())
 
     def end_recording(self, *, ended: bool = True) -> None:
