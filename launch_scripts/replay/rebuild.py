@@ -24,6 +24,8 @@ from swarm.runtime.process import Service
 from swarm.runtime.recording.records import Head
 from swarm.runtime.recording.replaying import Replaying
 from swarm.runtime.role import RoleSetup
+from swarm.wire.codec import decode
+from swarm.wire.messages.processes import Stats
 from vehicle_agent.promise_store import PROMISE_STORE, PromiseStore
 from vehicle_agent.service import AgentService
 
@@ -70,7 +72,8 @@ class Grounds:
 
 
 def setup_of(head: Head, folder: Path) -> RoleSetup:
-    """What a recorded process was started with. Raises ConfigError where its scenario cannot be read here."""
+    """What a recorded process was started with. Raises ConfigError where its scenario cannot be read here, and
+    ProtocolError on counts that are none."""
     return RoleSetup(
         scenario=parse_scenario(head.scenario),
         run_id=head.run_id,
@@ -80,6 +83,8 @@ def setup_of(head: Head, folder: Path) -> RoleSetup:
         started_ns=head.started_ns,
         run_dir=folder,
         added=head.added,
+        restarts=head.restarts,
+        before=decode(head.before, Stats) if head.before else None,
     )
 
 

@@ -182,8 +182,8 @@ class Node:
                 self._shell.handle(event, self.now_ns())
 
     def stop(self) -> None:
-        if self.service is not None and self._shell is not None:
-            self.service.counters.gauge(ENDED, 1.0)
+        if self._shell is not None:
+            self._shell.counters.gauge(ENDED, 1.0)
             self._shell.stop(self.now_ns())
 
     def end_recording(self, *, ended: bool = True) -> None:

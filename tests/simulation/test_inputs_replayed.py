@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 from pathlib import Path
@@ -32,6 +33,7 @@ from swarm.runtime.recording.records import (
     RecordReader,
     packed,
 )
+from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent
 
 SECONDS = 8
@@ -252,3 +254,8 @@ def test_the_command_says_what_is_the_same_and_exits_with_1_where_something_diff
     assert max(map(len, told.stdout.splitlines()[:2])) <= 80
     with pytest.raises(ConfigError, match="no process 'planner-x'"):
         recordings_of(run, "planner-x")
+
+
+def test_all_that_a_process_is_started_with_is_recorded() -> None:
+    here = {"run_dir", "record_inputs"}  # where a process keeps its files is no input: what it reads there is
+    assert {field.name for field in dataclasses.fields(RoleSetup)} - here <= set(records.Head.__struct_fields__)

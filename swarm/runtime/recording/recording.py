@@ -19,7 +19,7 @@ from swarm.errors import StoreError
 from swarm.runtime.process import Service
 from swarm.runtime.recording.boundary import Boundary, BoundaryAnswerer, BoundaryBus, BoundaryObject, BoundaryWorker
 from swarm.runtime.recording.events import JobDone, record_of
-from swarm.runtime.recording.loop_figures import figures_since
+from swarm.runtime.recording.loop_figures import LoopCounters
 from swarm.runtime.recording.outside import Outside, content_of, pack
 from swarm.runtime.recording.records import (
     FOLDER,
@@ -95,6 +95,8 @@ class Recording(Boundary):
                 scenario=scenario_text(setup.scenario, Path.cwd()),
                 terrain=terrain,
                 added=setup.added,
+                restarts=setup.restarts,
+                before=b"" if setup.before is None else content_of(setup.before),
                 versions=versions(),
             )
         )
@@ -203,15 +205,14 @@ class _RecordedService:
     def __init__(self, service: Service, recording: Recording) -> None:
         self._service = service
         self._recording = recording
-        self._before = Counters()
-        """The loop's own figures, as last recorded."""
+        self._counters = LoopCounters(service.counters)
 
     @property
     def counters(self) -> Counters:
-        return self._service.counters
+        return self._counters
 
     def start(self, now_ns: int) -> None:
-        with self._recording.call(Started(now_ns, figures_since(self._before, self.counters))):
+        with self._recording.call(Started(now_ns, self._counters.changed())):
             self._service.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
@@ -222,11 +223,11 @@ class _RecordedService:
             self._service.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        with self._recording.call(Ticked(now_ns, figures_since(self._before, self.counters))):
+        with self._recording.call(Ticked(now_ns, self._counters.changed())):
             self._service.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        with self._recording.call(Stopped(now_ns, figures_since(self._before, self.counters))):
+        with self._recording.call(Stopped(now_ns, self._counters.changed())):
             self._service.stop(now_ns)
 
 

@@ -43,6 +43,7 @@ class Head(Record, frozen=True, tag=0):
 
     scenario  as TOML, with every setting
     terrain   digest
+    before    what its earlier lives have counted, as a payload; empty if that is not known
     versions  package -> version of what made it
     """
 
@@ -54,6 +55,8 @@ class Head(Record, frozen=True, tag=0):
     scenario: str
     terrain: str
     added: AddedAgent | None
+    restarts: int
+    before: bytes
     versions: dict[str, str]
 
 
