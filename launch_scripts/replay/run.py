@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +14,11 @@ from swarm.runtime.recording.recording import path_of, versions
 from swarm.runtime.recording.records import (
     CALLS,
     FOLDER,
-    MAGIC,
     SUFFIX,
     Cut,
     Head,
     RecordReader,
-    packed,
+    RecordWriter,
 )
 from swarm.runtime.recording.replaying import Outcome, Progress, replay
 
@@ -131,25 +129,27 @@ def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
     head = recorded.head
     path = path_of(folder, head.role, head.id, head.incarnation)
     until_ns = None if until_s is None else head.started_ns + int(until_s * NS_PER_S)
+    if path.exists():
+        raise StoreError(f"{path} is there already: choose another folder")
+    with RecordReader(recorded.path) as reader:
+        writer = RecordWriter(path)
+        writer.write(head)
+        for record in reader:
+            if isinstance(record, CALLS) and until_ns is not None and record.now_ns > until_ns:
+                writer.write(Cut(f"kept until {until_s:g} s", whole=True))
+                break
+            writer.write(record)
+        writer.close()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if writer.cut is not None:
+            raise StoreError(writer.cut)
+        if reader.damaged is not None:
+            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until")
         (folder / SCENARIO_FILE).write_text(head.scenario, encoding="utf-8")
-        with RecordReader(recorded.path) as reader, path.open("xb") as file:
-            file.write(MAGIC + packed(head))
-            for record in reader:
-                if isinstance(record, CALLS) and until_ns is not None and record.now_ns > until_ns:
-                    file.write(packed(Cut(f"kept until {until_s:g} s", whole=True)))
-                    break
-                file.write(packed(record))
-            if reader.damaged is not None:
-                raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until")
-    except FileExistsError as error:
-        raise StoreError(f"{path} is there already: choose another folder") from error
     except OSError as error:
-        raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+        raise StoreError(f"cannot write {folder / SCENARIO_FILE}: {error.strerror or error}") from error
     except StoreError:
-        with contextlib.suppress(OSError):
-            path.unlink()
+        path.unlink(missing_ok=True)
         raise
     return path
 

@@ -100,6 +100,7 @@ class Recording(Boundary):
                 versions=versions(),
             )
         )
+        self._writer.flush()  # a process that is killed at once is named, too
 
     def bus(self, bus: Bus) -> Bus:
         return BoundaryBus(bus, self)

@@ -1,9 +1,9 @@
-"""A recording as a file: records behind each other, each with its length and checksum.
+"""A recording as a file: blocks behind each other, each with its length and checksum, of compressed records.
 
-    "swarm recording 1\n" {length u32, crc32 u32, body} {length, crc32, body} ...
+    "swarm recording 1\n" {length u32, crc32 u32, zlib({length u32, record} {length, record} ...)} ...
 
-Bodies are MessagePack, little-endian heads. A process that is killed leaves a file that can be read up to its last
-whole record. Records are hostile until parsed: whatever stands in a file, reading raises nothing but StoreError.
+Records are MessagePack, numbers little-endian. A process that is killed leaves a file that can be read up to its
+last whole block. Whatever stands in a file, reading it raises nothing but StoreError.
 """
 
 from __future__ import annotations
@@ -28,10 +28,16 @@ MAGIC = b"swarm recording 1\n"
 SUFFIX = ".inputs"
 FOLDER = "inputs"
 """Of a run's folder: one recording per life of a process."""
-MOST_BYTES = 128 << 20
+MOST_BYTES = 64 << 20
 """Of one recording: what comes later is not recorded, and the last record says so."""
-_BUFFER_BYTES = 1 << 16
+_BLOCK_BYTES = 1 << 16
+"""Of records, before they are compressed: a block is written once it has more."""
+_LONGEST_BLOCK_BYTES = 256 << 20
+"""A block is taken to hold no more, whatever it says."""
+_LEVEL = 1
+"""Of compression, the fastest: it leaves a third to a quarter of the bytes."""
 _HEAD = struct.Struct("<II")
+_LENGTH = struct.Struct("<I")
 
 
 class Record(msgspec.Struct, frozen=True, array_like=True):
@@ -216,9 +222,13 @@ _encode = msgspec.msgpack.Encoder().encode
 _decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(AnyRecord)
 
 
-def packed(record: Record) -> bytes:
-    """A record as it stands in the file."""
-    body = _encode(record)
+def packed(*records: Record) -> bytes:
+    """Records as they stand in the file: in a block of their own."""
+    return _block(b"".join(_LENGTH.pack(len(body)) + body for body in map(_encode, records)))
+
+
+def _block(content: bytes | bytearray) -> bytes:
+    body = zlib.compress(content, _LEVEL)
     return _HEAD.pack(len(body), zlib.crc32(body)) + body
 
 
@@ -233,40 +243,40 @@ class RecordWriter:
         self.cut: str | None = None
         self._most_bytes = most_bytes
         self._bytes = 0
-        self._buffer = bytearray(MAGIC)
+        self._waiting = bytearray()
+        """Records of the next block."""
         self._file: BinaryIO | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("xb", buffering=0)
+            self._append(MAGIC)
         except OSError as error:
-            self._cut(f"cannot write {path}: {error.strerror or error}")
+            self._end(f"cannot write {path}: {error.strerror or error}")
 
     def write(self, record: Record) -> None:
         if self._file is None:
             return
         body = _encode(record)
-        if self._bytes + len(body) > self._most_bytes:
-            why = f"a recording takes {self._most_bytes >> 20} MiB at most"
-            self._buffer += packed(Cut(why))
-            self._cut(why)
-            return
-        self._bytes += _HEAD.size + len(body)
-        self._buffer += _HEAD.pack(len(body), zlib.crc32(body))
-        self._buffer += body
-        if len(self._buffer) >= _BUFFER_BYTES:
+        self._waiting += _LENGTH.pack(len(body))
+        self._waiting += body
+        if len(self._waiting) >= _BLOCK_BYTES:
             self.flush()
 
     def flush(self) -> None:
         """Hand over to the system what waits."""
-        file, waiting = self._file, self._buffer
-        if file is None or not waiting:
+        if self._file is None or not self._waiting:
             return
-        self._buffer = bytearray()
+        block = _block(self._waiting)
+        self._waiting = bytearray()
         try:
-            if file.write(waiting) != len(waiting):
-                raise OSError("the disk is full")
+            if self._bytes + len(block) > self._most_bytes:
+                why = f"a recording takes {self._most_bytes >> 20} MiB at most"
+                self._append(packed(Cut(why)))
+                self._end(why)
+            else:
+                self._append(block)
         except OSError as error:
-            self._cut(f"cannot write {self.path}: {error.strerror or error}")
+            self._end(f"cannot write {self.path}: {error.strerror or error}")
 
     def close(self) -> None:
         self.flush()
@@ -275,8 +285,15 @@ class RecordWriter:
                 self._file.close()
             self._file = None
 
-    def _cut(self, why: str) -> None:
+    def _append(self, content: bytes) -> None:
+        assert self._file is not None
+        if self._file.write(content) != len(content):
+            raise OSError("the disk is full")
+        self._bytes += len(content)
+
+    def _end(self, why: str) -> None:
         self.cut = why
+        self._waiting = bytearray()
         self.close()
         log.warning("inputs are not recorded any more: %s", why)
 
@@ -285,15 +302,16 @@ class RecordReader:
     """Reads a recording from its beginning. Raises StoreError on a file that is none.
 
     head     its first record
+    at       how many of its bytes are read
     damaged  why it cannot be read further, in a sentence; None until that is found
-    torn     whether it ends within a record, as where a process was killed; found at its end
+    torn     whether it ends within a block, as where a process was killed; found at its end
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.at = 0
         self.damaged: str | None = None
         self.torn = False
-        self._at = 0
         try:
             check_bytes(path, FileKind.RECORDING)
             self._file = path.open("rb")
@@ -302,10 +320,12 @@ class RecordReader:
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
                 raise StoreError(f"{path} is no recording: it does not begin with {MAGIC.decode().strip()!r}")
-            self._at = len(MAGIC)
-            head = self._next()
+            self.at = len(MAGIC)
+            self._records = self._read()
+            head = next(self._records, None)
             if not isinstance(head, Head):
-                raise StoreError(f"{path} is damaged: {self.damaged or 'it does not say which process it is of'}")
+                why = self.damaged or "it does not say which process it is of"
+                raise StoreError(f"recording {path} is damaged: {why}")
         except StoreError:
             self._file.close()
             raise
@@ -318,34 +338,40 @@ class RecordReader:
         self._file.close()
 
     def __iter__(self) -> Iterator[AnyRecord]:
-        while (record := self._next()) is not None:
-            yield record
+        return self._records
 
-    @property
-    def at(self) -> int:
-        """How many bytes are read."""
-        return self._at
-
-    def _next(self) -> AnyRecord | None:
-        if self.damaged is not None or self.torn:
-            return None
+    def _read(self) -> Iterator[AnyRecord]:
         try:
-            head = self._file.read(_HEAD.size)
-            if len(head) < _HEAD.size:
-                self.torn = len(head) > 0
-                return None
-            length, checksum = _HEAD.unpack(head)
-            if length > FileKind.RECORDING.most_bytes:
-                raise ValueError(f"a record of {length} bytes")
-            body = self._file.read(length)
-            if len(body) < length:
-                self.torn = True
-                return None
-            if zlib.crc32(body) != checksum:
-                raise ValueError("a record does not match its checksum")
-            record: AnyRecord = _decoder.decode(body)
-        except (OSError, ValueError, RecursionError, msgspec.MsgspecError) as error:
-            self.damaged = f"damaged at byte {self._at}: {error}"
+            while (block := self._next_block()) is not None:
+                start = 0
+                while start < len(block):
+                    (length,) = _LENGTH.unpack_from(block, start)
+                    start += _LENGTH.size + length
+                    if start > len(block):
+                        raise ValueError("a record is longer than its block")
+                    record: AnyRecord = _decoder.decode(block[start - length : start])
+                    yield record
+        except (OSError, ValueError, RecursionError, struct.error, zlib.error, msgspec.MsgspecError) as error:
+            self.damaged = f"damaged at byte {self.at}: {error}"
+
+    def _next_block(self) -> bytes | None:
+        """The records of the next block; None if there is no whole one."""
+        head = self._file.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            self.torn = len(head) > 0
             return None
-        self._at += _HEAD.size + length
-        return record
+        length, checksum = _HEAD.unpack(head)
+        if length > FileKind.RECORDING.most_bytes:
+            raise ValueError(f"a block of {length} bytes")
+        body = self._file.read(length)
+        if len(body) < length:
+            self.torn = True
+            return None
+        if zlib.crc32(body) != checksum:
+            raise ValueError("a block does not match its checksum")
+        content = zlib.decompressobj()
+        block = content.decompress(body, _LONGEST_BLOCK_BYTES)
+        if content.unconsumed_tail:
+            raise ValueError(f"a block of more than {_LONGEST_BLOCK_BYTES} bytes")
+        self.at += len(head) + length
+        return block
