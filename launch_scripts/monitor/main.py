@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
 
 from launch_scripts.monitor.blueprint import make_blueprint
@@ -20,13 +19,9 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup
 
-NICE = 5
-"""Where the processor is short, whoever drives or answers goes first."""
-
 
 def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     """Records and shows the run until SIGTERM, SIGINT or the end of the launcher."""
-    os.nice(NICE)
     config = setup.scenario.monitor
     mesh = TerrainMesh(load_terrain(setup), config.height_factor)
     terrain = load_terrain(setup)  # mapped anew: of what the mesh has read most is not read again

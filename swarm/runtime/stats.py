@@ -63,6 +63,10 @@ class Histogram:
     def count(self) -> int:
         return sum(self.buckets.values())
 
+    def values(self) -> list[tuple[float, int]]:
+        """Middles of the buckets, rising, and how many values are in each."""
+        return [(_value(bucket), count) for bucket, count in sorted(self.buckets.items())]
+
     def quantile(self, q: float) -> float | None:
         """The value below which a share `q` of all values lies, within 2 %; None if there are none."""
         total = self.count
@@ -82,7 +86,7 @@ class Histogram:
         if total == 0:
             return None
         # In order, so that the sum does not depend on the order of merging.
-        return math.fsum(_value(bucket) * count for bucket, count in sorted(self.buckets.items())) / total
+        return math.fsum(value * count for value, count in self.values()) / total
 
 
 def _value(bucket: int) -> float:

@@ -30,12 +30,16 @@ class Counts:
 
     def gauge(self, name: str) -> float | None:
         """A gauge, summed over the newest incarnation of each process; None if no process has published it."""
-        newest: dict[tuple[str, str], Stats] = {}
-        for (role, id, incarnation), stats in self._stats.items():
-            if (role, id) not in newest or incarnation > newest[role, id].incarnation:
-                newest[role, id] = stats
-        told = [stats.gauges[name] for _, stats in sorted(newest.items()) if name in stats.gauges]
+        told = [stats.gauges[name] for _, stats in sorted(self.newest().items()) if name in stats.gauges]
         return sum(told) if told else None
+
+    def newest(self) -> dict[tuple[str, str], Stats]:
+        """(role, id) -> what the newest incarnation of each process says."""
+        found: dict[tuple[str, str], Stats] = {}
+        for (role, id, incarnation), stats in self._stats.items():
+            if (role, id) not in found or incarnation > found[role, id].incarnation:
+                found[role, id] = stats
+        return found
 
     def counts_by(self, name: str) -> dict[str, int]:
         """Counts per target or vehicle, summed as `total`."""
