@@ -28,7 +28,7 @@ from launch_scripts.launcher.stop_signals import StopAsked
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
-from launch_scripts.launcher.what_is_left import what_is_left
+from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
@@ -348,6 +348,7 @@ class _Run:
         for note in watcher.take_notes():
             if note.kind == "live_view":
                 self._terminal.say(f"live view: {note.text}", "bold")
+                self._terminal.say(f"from another computer: {tunnel(note.text)}, then the same address there")
             elif note.kind not in _QUIET_NOTES:
                 self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if self._terminal.due():
