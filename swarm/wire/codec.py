@@ -69,10 +69,10 @@ def decode_either(payload: bytes, usual: type[M], other: type[N] | None) -> M | 
 def _read(payload: bytes, message_type: type[M]) -> M:
     """The message in a payload, its types and ranges checked. Raises ProtocolError.
 
-    What a swarm sends is short and right, and msgspec reads it at once; a payload of `MAX_ITEMS` bytes cannot hold
-    more items than one may. A longer one goes the long way, so that its items are counted; one that msgspec refuses,
-    so that the error says which field is wrong and what was found; and one that does not begin with its schema,
-    because msgspec takes a tag that is missing for the right one.
+    What a swarm sends is short and right, and msgspec reads it at once; `MAX_ITEMS` bytes cannot hold more items
+    than a payload may. A longer one goes the long way, so that its items are counted; one that msgspec refuses, so
+    that the error says which field is wrong and what was found; and one that does not begin with its schema, as
+    msgspec takes a tag that is missing for the right one.
     """
     if len(payload) <= MAX_ITEMS and _begins_with_schema(payload):
         decoder = _DECODERS.get(message_type) or _DECODERS.setdefault(
