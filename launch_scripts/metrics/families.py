@@ -1,7 +1,8 @@
 """What a swarm says of itself, as metric families of OpenMetrics. Pure: no bus, no socket, no clock.
 
 Names follow the conventions of Prometheus: the prefix `swarm_`, base units (seconds, bytes, metres, ratios) at the
-end, `_total` on what only grows. A process starts again with its counts at zero, which `rate()` expects.
+end, `_total` on what only grows. A process that its launcher
+starts again goes on counting; one that was started by hand begins at zero, which `rate()` expects.
 """
 
 from __future__ import annotations

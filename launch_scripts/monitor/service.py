@@ -40,9 +40,8 @@ from swarm.clock import NS_PER_S
 from swarm.grid import Window
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
-from swarm.runtime.own_usage import ENDED
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
+from swarm.runtime.stats import ENDED, Counters
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
@@ -95,7 +94,7 @@ class MonitorService:
         live_url: str | None = None,
         recording: RecordingWatch | None = None,
     ) -> None:
-        self.recorder = Recorder(setup.scenario, terrain.grid)
+        self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
         self.over = False
         """Set for good by `stop`. Read by other threads, too."""
         self._setup = setup
@@ -103,7 +102,7 @@ class MonitorService:
         self._bus = bus
         self._post = post
         self._live_url = live_url
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self.counters: Counters = self._member.counters
         self._cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, self._cost_map)

@@ -12,8 +12,6 @@ CPU_S = "cpu_s"
 """Gauge: seconds of CPU that a process has used since it began."""
 RSS_BYTES = "rss_bytes"
 """Gauge: memory that a process has in use, with what it shares."""
-ENDED = "ended"
-"""Gauge: 1 in the last `Stats` of a process that ends as it was asked to."""
 
 _STATM = "/proc/self/statm"
 

@@ -20,8 +20,8 @@ from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
 from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.own_usage import ENDED, OwnUsage
-from swarm.runtime.stats import Counters
+from swarm.runtime.own_usage import OwnUsage
+from swarm.runtime.stats import ENDED, Counters
 
 log = logging.getLogger(__name__)
 
