@@ -44,7 +44,9 @@ def check(
     try:
         table = json.loads(options)
     except ValueError as error:
-        raise ConfigError(f"--options: {error}; expected a JSON object") from error
+        raise ConfigError(
+            f"--options: found {options[:40]!r}, expected a JSON object: {str(error).lower()}"
+        ) from error
     if not isinstance(table, dict):
         raise ConfigError(f"--options: found {options[:40]!r}, expected a JSON object")
     broken = check_plugin(kind, name, table, str(folder), range(seeds))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
 import hashlib
 import secrets
@@ -17,6 +16,7 @@ from launch_scripts.process_table import certificate_name
 from shared_map.terrain.importers.sources import is_terrain
 from swarm.bus.endpoints import host_port
 from swarm.config.cost_rules import cost_of_preset
+from swarm.config.explain import explain, nearest
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TerrainConfig, TlsConfig
@@ -34,15 +34,32 @@ def find_scenario(name: str, preset: str | None = None) -> Scenario:
         return Scenario(name=path.stem, terrain=TerrainConfig(source=name), cost=cost_of_preset(preset))
     if preset is not None:
         raise ConfigError(f"--preset goes with a terrain file: in the scenario {name} set cost.preset")
-    if path.suffix == ".toml" or path.is_file():
-        return load_scenario(path)
+    return load_scenario(scenario_path(name))
+
+
+def scenario_path(name: str) -> Path:
+    """The file of a built-in scenario, or the one named. Raises ConfigError where there is none."""
+    path = Path(name)
+    if path.is_file():
+        return path
     built_in = SCENARIOS / f"{name}.toml"
     if "/" not in name and built_in.is_file():
-        return load_scenario(built_in)
+        return built_in
+    if path.is_dir():
+        within = sorted(each.name for each in path.glob("*.toml"))[:5]
+        hint = f"; in it are {', '.join(within)}" if within else ""
+        raise ConfigError(f"no scenario {name!r}: it is a folder, expected a .toml file{hint}")
     names = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise ConfigError(f"no scenario {name!r}{hint}: give a .toml file or one of: {', '.join(names)}")
+    if path.suffix == ".toml":
+        raise ConfigError(
+            f"cannot read scenario {name}: No such file; `swarm new {name}` writes one, built in are"
+            f" {', '.join(names)}"
+        )
+    if path.suffix in (".tif", ".tiff", ".hgt", ".asc", ".npz"):
+        raise ConfigError(f"no terrain {name!r}: no such file")
+    raise ConfigError(
+        f"no scenario {name!r}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"
+    )
 
 
 def with_network(
@@ -78,7 +95,7 @@ def _replaced(network: NetworkConfig, changes: dict[str, object]) -> NetworkConf
     try:
         return msgspec.convert(raw, NetworkConfig)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"network: {error}") from error
+        raise ConfigError(f"network: {explain(str(error), raw, NetworkConfig)}") from error
 
 
 def tls_of(ca: str | None, certificate: str | None, key: str | None) -> TlsConfig | None:
@@ -187,5 +204,6 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StoreError(f"cannot make a run folder in {runs}: {error.strerror or error}") from error
+        why = "it is not a folder" if runs.is_file() else error.strerror or error
+        raise StoreError(f"cannot make a run folder in {runs}: {why}; choose another with --runs") from error
     return run_dir.resolve()

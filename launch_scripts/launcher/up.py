@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from launch_scripts.check.ground import check_places
+from launch_scripts.check.settings import check_start
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import log_to
@@ -96,6 +98,7 @@ class _RefusedError(SwarmError):
 
 def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
+    check_start(options.scenario, joins=options.joins)
     for spec in _table(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
@@ -181,6 +184,7 @@ class _Run:
         if prepared is None:
             return self._stopped_early()
         self._terrain, self._truth = prepared
+        check_places(self._scenario, self._terrain, self._truth)
         log.info("terrain is ready")
         self._wait(lambda: self._warm_up.progress, self._warm_up.done)
         if self._stop_asked:

@@ -8,6 +8,7 @@ same link; replies are posted on Zenoh's own thread, because a thread per query 
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -85,9 +86,12 @@ def open_bus(
     except zenoh.ZError as error:
         if patient and not any(map(listening, endpoints)):
             return open_bus(network, patient=True, authenticator=authenticator)
-        reason = str(error).split(" at /")[0]
+        # Zenoh's words where they say more than that: a certificate that is refused, an address that is not ours.
+        reason = re.sub(
+            r"Unable to connect to any of .*?\]\. Timeout!", "nobody answers", str(error).split(" at /")[0]
+        )
         what = "listen on" if mode == "router" else "reach a router at"
-        hint = "is the port taken?" if mode == "router" else "is `swarm router` running there?"
+        hint = "is the port taken?" if mode == "router" else "is the swarm running, or `swarm router` there?"
         raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason} ({hint})") from error
 
 

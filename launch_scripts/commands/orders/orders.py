@@ -84,11 +84,15 @@ def set_(
 
     swarm set time_scale --as-scenario
     """
+    from swarm.config.explain import choice
     from swarm.errors import ConfigError
+    from swarm.order_book import SETTINGS
     from swarm.wire.messages.orders import GiveOrder
 
     if as_scenario == (value is not None):
         raise ConfigError("set: give either a value or --as-scenario")
+    if key not in SETTINGS:
+        raise ConfigError(f"set: {key!r} cannot change while the swarm runs{choice(key, list(SETTINGS))}")
     fields = {"subject": "set", "name": key, "value": value, "off": as_scenario}
     give([checked(GiveOrder, fields)], where, tls, as_json)
 

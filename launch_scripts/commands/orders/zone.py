@@ -84,6 +84,8 @@ def add(
     if file is None:
         if layer is not None or crs is not None:
             raise ConfigError("zone add: --layer and --crs go with --file")
+        if polygon is None and polygon_m is None:
+            raise ConfigError("zone add: give --polygon, --polygon-m or --file; `swarm zone add -h` shows examples")
         _give(checked(ZoneOrder, fields), where, tls, as_json, places)
         return
     if polygon is not None or polygon_m is not None:

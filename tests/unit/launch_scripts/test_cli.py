@@ -71,7 +71,7 @@ def test_the_launcher_never_imports_numba_or_rerun() -> None:
 def test_an_unknown_scenario_gets_the_nearest_name(run) -> None:  # type: ignore[no-untyped-def]
     code, out, err = run("up", "jaksboro")
     assert (code, out) == (2, "")
-    assert err.startswith("swarm: no scenario 'jaksboro' (did you mean 'jacksboro'?)")
+    assert err.startswith("swarm: no scenario 'jaksboro'; did you mean 'jacksboro'?")
 
 
 def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
@@ -93,10 +93,8 @@ def test_a_scenario_file_that_is_not_there(run, tmp_path: Path) -> None:  # type
 
 def test_an_unknown_role_is_refused(run) -> None:  # type: ignore[no-untyped-def]
     code, _, err = run("up", "synthetic", "--only", "driver")
-    assert (code, err) == (
-        2,
-        "swarm: --only: no role 'driver'; the roles are router, keeper, monitor, planner, targets, agent\n",
-    )
+    roles = "'router', 'keeper', 'monitor', 'planner', 'targets', 'agent'"
+    assert (code, err) == (2, f"swarm: --only: no role 'driver'; the roles are {roles}\n")
 
 
 def test_a_planner_for_a_target_that_the_scenario_does_not_have(run) -> None:  # type: ignore[no-untyped-def]
