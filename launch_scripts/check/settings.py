@@ -108,12 +108,12 @@ def _certificates(scenario: Scenario, tls: TlsConfig) -> Iterator[Finding]:
     lacking: list[str] = []
     for name in certificate_names(scenario) if folder else [""]:
         own = Path(tls.certificate, f"{name}.pem" if folder else "")
-        key = Path(tls.key, f"{name}.key" if Path(tls.key).is_dir() else "")
-        if not own.is_file() or not key.is_file():
+        secret = Path(tls.key, f"{name}.key" if Path(tls.key).is_dir() else "")
+        if not own.is_file() or not secret.is_file():
             lacking.append(name)
             continue
         try:
-            check_signed(Path(tls.ca), own, key)
+            check_signed(Path(tls.ca), own, secret)
         except SwarmError as error:
             yield failure("network.tls", str(error))
             return

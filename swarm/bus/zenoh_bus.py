@@ -8,7 +8,6 @@ same link; replies are posted on Zenoh's own thread, because a thread per query 
 from __future__ import annotations
 
 import logging
-import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -33,6 +32,7 @@ from swarm.bus.bus import (
     newest_of,
 )
 from swarm.bus.endpoints import listening, wait_for_router
+from swarm.bus.open_errors import why_not_listening, why_unreachable
 from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_threads import attached, guarded, says_json, taken_after, taken_from, timeout_of, waiting_in
@@ -86,13 +86,12 @@ def open_bus(
     except zenoh.ZError as error:
         if patient and not any(map(listening, endpoints)):
             return open_bus(network, patient=True, authenticator=authenticator)
-        # Zenoh's words where they say more than that: a certificate that is refused, an address that is not ours.
-        reason = re.sub(
-            r"Unable to connect to any of .*?\]\. Timeout!", "nobody answers", str(error).split(" at /")[0]
-        )
-        what = "listen on" if mode == "router" else "reach a router at"
-        hint = "is the port taken?" if mode == "router" else "is the swarm running, or `swarm router` there?"
-        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason} ({hint})") from error
+        log.info("zenoh says: %s", error)
+        if mode == "router":
+            what, reason = "listen on", why_not_listening(error)
+        else:
+            what, reason = "reach a router at", why_unreachable(endpoints, encrypted=network.tls is not None)
+        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason}") from error
 
 
 class ZenohBus:
