@@ -15,9 +15,9 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from launch_scripts.command_line import usage
+from launch_scripts.command_line import complete, usage
 from launch_scripts.command_line.families import CONTEXT, Family, rooted
-from launch_scripts.command_line.panels import ADMIN, LEFT, ORDER, PREPARE, RUN
+from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
 from launch_scripts.commands import before, chaos, query, roles
 from launch_scripts.commands.orders import orders
 from launch_scripts.commands.shared_options import (
@@ -109,6 +109,8 @@ def demo(run: RunOptions) -> None:
 
     The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
     report.json, report.png and a log file per process.
+
+    swarm demo --seconds 20 --port 0
     """
     _up("jacksboro", run)
 
@@ -121,14 +123,25 @@ def up(
     tls: Tls,
     connect: Annotated[
         str | None,
-        typer.Option(help="Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here."),
+        typer.Option(
+            help="Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here.",
+            rich_help_panel=NETWORK,
+        ),
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(help="Where the router listens too, for other machines, such as tls/0.0.0.0:7448."),
+        typer.Option(
+            help="Where the router listens too, for other machines, such as tls/0.0.0.0:7448.",
+            rich_help_panel=NETWORK,
+        ),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="Start only this role; may be given several times.")
+        list[str] | None,
+        typer.Option(
+            help="Start only this role; may be given several times.",
+            rich_help_panel=PART,
+            autocompletion=complete.words("launch_scripts.process_table", "ROLES"),
+        ),
     ] = None,
     rank: Annotated[
         int | None,
@@ -136,10 +149,14 @@ def up(
             min=0,
             max=HIGHEST_RANK,
             help="Of planners and the targets process, start those of this rank: 0 lead, 1 stand by, and so on.",
+            rich_help_panel=PART,
         ),
     ] = None,
     run_id: Annotated[
-        str | None, typer.Option(help="Take part in this run; by default a new one, or the one in the namespace.")
+        str | None,
+        typer.Option(
+            help="Take part in this run; by default a new one, or the one in the namespace.", rich_help_panel=PART
+        ),
     ] = None,
     namespace: Namespace = None,
 ) -> None:
@@ -227,6 +244,7 @@ def simulate(
             metavar="SCENARIO",
             help="A .toml file or a built-in name; with --seeds also a small world: small, wide, open, doors, "
             "corridor, maze. With --seeds and without a name each seed takes the next of these worlds.",
+            autocompletion=complete.scenarios_and_worlds,
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = None,
@@ -269,7 +287,12 @@ def simulate(
 
 @app.command(rich_help_panel=LEFT)
 def compare(
-    run: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs, or their names in --runs.")],
+    run: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="RUN...", help="Folders of runs, or their names in --runs.", autocompletion=complete.runs
+        ),
+    ],
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> None:

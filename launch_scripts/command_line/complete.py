@@ -28,6 +28,13 @@ def scenarios(ctx: typer.Context, incomplete: str) -> list[str]:
     return [name for name in [*built_in, *_files(incomplete, ".toml")] if name.startswith(incomplete)]
 
 
+def scenarios_and_worlds(ctx: typer.Context, incomplete: str) -> list[str]:
+    """As `scenarios`, and the small worlds of `swarm simulate --seeds`."""
+    from launch_scripts.simulation.worlds import WORLDS
+
+    return [*scenarios(ctx, incomplete), *(name for name in WORLDS if name.startswith(incomplete))]
+
+
 def terrains(ctx: typer.Context, incomplete: str) -> list[str]:
     """Built-in terrains; files are the shell's own matter."""
     from swarm.config.load import BUILT_IN_TERRAINS
@@ -101,7 +108,8 @@ def _scenario(ctx: typer.Context) -> Scenario | None:
     from launch_scripts.report.results.run_folder import LAST, SCENARIO_FILE, find_run
     from swarm.errors import SwarmError
 
-    name = ctx.params.get("scenario")
+    # While an option still lacks its value, the words before it are left as they are.
+    name = next((word for word in ctx.args if not word.startswith("-")), ctx.params.get("scenario"))
     with contextlib.suppress(SwarmError, OSError):
         return find_scenario(name or str(find_run(LAST, _runs_folder(ctx)) / SCENARIO_FILE))
     return None

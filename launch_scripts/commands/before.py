@@ -66,3 +66,19 @@ def check(
     from launch_scripts.commands.check import check_scenario
 
     check_scenario(scenario, runs, port, as_json)
+
+
+@app.command(rich_help_panel=PREPARE)
+def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> None:
+    """Look at this machine and this installation: is it fit for a swarm, and what is to be done?
+
+    Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, ports, clock, browser and
+    disk. Each line is ok, a warning or a failure. Exit code 1 if a swarm cannot run here.
+
+    swarm doctor
+
+    swarm doctor --json | jq .findings
+    """
+    from launch_scripts.commands.doctor import look_at_machine
+
+    look_at_machine(runs, as_json)

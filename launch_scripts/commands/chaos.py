@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from launch_scripts.command_line import complete
 from launch_scripts.command_line.panels import RUN
 from launch_scripts.commands.shared_options import AsJson, Runs
 
@@ -22,18 +23,30 @@ app = typer.Typer()
 @app.command(rich_help_panel=RUN)
 def chaos(
     scenario: Annotated[
-        str, typer.Argument(metavar="SCENARIO", help="A .toml file, or the name of a built-in scenario.")
+        str,
+        typer.Argument(
+            metavar="SCENARIO",
+            help="A .toml file, or the name of a built-in scenario.",
+            autocompletion=complete.scenarios,
+        ),
     ] = "besieged",
     seconds: Annotated[float | None, typer.Option(min=1, help="End after so many seconds.")] = None,
     messages: Annotated[
         int | None, typer.Option(min=1, help="End once so many hostile messages have been sent.")
     ] = None,
     blow: Annotated[
-        list[str] | None, typer.Option(help="Only this: kill, hang or messages; may be given several times.")
+        list[str] | None,
+        typer.Option(
+            help="Only this: kill, hang or messages; may be given several times.",
+            autocompletion=complete.words("launch_scripts.chaos.blows", "BLOWS"),
+        ),
     ] = None,
     hostile: Annotated[
         list[str] | None,
-        typer.Option(help="Only these messages: flipped, numbers, replayed or lies; may be given several times."),
+        typer.Option(
+            help="Only these messages: flipped, numbers, replayed or lies; may be given several times.",
+            autocompletion=complete.words("launch_scripts.chaos.hostile", "KINDS"),
+        ),
     ] = None,
     spare: Annotated[
         list[str] | None, typer.Option(help="Say nothing hostile under this topic; may be given several times.")

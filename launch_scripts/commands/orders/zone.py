@@ -101,7 +101,10 @@ def add(
 def remove(
     name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, tls: Tls, as_json: AsJson = False
 ) -> None:
-    """Open a zone again."""
+    """Open a zone again.
+
+    swarm zone remove bridge
+    """
     from swarm.wire.messages.orders import ZoneOrder
 
     _give(checked(ZoneOrder, {"action": "remove", "name": name}), where, tls, as_json)
@@ -110,7 +113,10 @@ def remove(
 @app.command(name="list")
 @spread
 def list_zones(where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Print the zones that stand."""
+    """Print the zones that stand.
+
+    swarm zone list
+    """
     from launch_scripts.commands.run_frame import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
     from swarm.orders import Operator
