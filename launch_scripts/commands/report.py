@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from launch_scripts.command_line import complete
 from launch_scripts.commands.shared_options import Runs
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -19,7 +20,9 @@ def _root() -> None:
 
 @app.command()
 def export(
-    run: Annotated[str, typer.Argument(help="A run's folder, or its name in --runs.")],
+    run: Annotated[
+        str, typer.Argument(help="A run's folder, or its name in --runs.", autocompletion=complete.runs)
+    ],
     out: Annotated[Path, typer.Option(help="Write .gpkg (layers, in the map's metres) or .geojson (WGS 84).")],
     runs: Runs = Path("runs"),
 ) -> None:
