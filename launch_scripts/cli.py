@@ -81,7 +81,7 @@ def demo(run: RunOptions) -> None:
     """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 18 processes.
 
     The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
-    report.json, report.png and a log file per process.
+    report.html, report.json, report.png and a log file per process.
     """
     _up("jacksboro", run)
 
@@ -323,6 +323,59 @@ def compare(
     compare_runs(run, runs, as_json)
 
 
+RunArgument = Annotated[str, typer.Argument(metavar="RUN", help="A run's folder, its name in --runs, or LAST.")]
+
+
+@app.command()
+def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
+    """Write a run's page again: report.html, one file that opens anywhere without a network.
+
+    It has the run's figures and what they mean, its map, plots over time, tables per target, group and vehicle, the
+    scenario as it ran, machine and versions. Every run writes it at its end.
+
+    swarm report LAST
+    """
+    from launch_scripts.commands.report import write_report_page
+
+    write_report_page(run, runs)
+
+
+@app.command()
+def export(
+    run: RunArgument = "LAST",
+    what: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="tracks, targets, captures, routes or marks; may be given several times; all by default."
+        ),
+    ] = None,
+    format: Annotated[
+        str, typer.Option(help="geojson or csv, a file per layer; gpkg, one file with all layers.")
+    ] = "geojson",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write to; by default export/ in the run's folder.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace files that are there.")] = False,
+    gif: Annotated[bool, typer.Option("--gif", help="Write a moving picture of the run instead.")] = False,
+    runs: Runs = Path("runs"),
+) -> None:
+    """Write what a run has left for a GIS, a spreadsheet, or as a moving picture.
+
+    Layers: vehicle_tracks and target_tracks with the time of each point, captures, routes that vehicles began with
+    their certified gaps, and marks as areas that say the same. GeoJSON and the columns lat and lon of CSV are in
+    WGS 84 where the terrain has a place, else in metres of its map; a GeoPackage is in the map's metres.
+
+    swarm export LAST
+
+    swarm export LAST --format gpkg --what tracks --what marks
+
+    swarm export LAST --gif
+    """
+    from launch_scripts.commands.report import export_from
+
+    export_from(run, runs, what or (), format, out, force, gif)
+
+
 app.add_typer(roles.app)
 app.add_typer(query.app)
 app.add_typer(orders.app)
@@ -353,7 +406,6 @@ _mount(
 )
 _mount("terrain", "launch_scripts.commands.terrain.terrain", "Look at terrains. See `swarm terrain --help`.")
 _mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
-_mount("report", "launch_scripts.commands.report", "What runs have left. See `swarm report --help`.")
 _mount("zone", "launch_scripts.commands.orders.zone", "Close areas while the swarm runs. See `swarm zone --help`.")
 _mount(
     "target", "launch_scripts.commands.orders.target", "Add, move and remove targets. See `swarm target --help`."
