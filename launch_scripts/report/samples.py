@@ -35,7 +35,7 @@ class Sample:
     marks: int | None
     reroute_requests: int | None
     routes_served: int | None
-    messages: int
+    messages_per_s: float | None
     alive: int
     gaps: dict[str, float]
     growth_ms: dict[str, float]
@@ -74,12 +74,8 @@ class Samples:
 
 
 def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
-    """(time, rate) between successive samples, from the first published count on."""
-    return [
-        (late.time_s, max(late.messages - early.messages, 0) / (late.time_s - early.time_s))
-        for early, late in itertools.pairwise(samples)
-        if late.time_s > early.time_s and early.messages > 0
-    ]
+    """(time, rate) of the samples in which the processes had said what they send."""
+    return [(sample.time_s, sample.messages_per_s) for sample in samples if sample.messages_per_s is not None]
 
 
 def certified_gaps(samples: Sequence[Sample]) -> list[dict[str, float | None]]:

@@ -20,7 +20,8 @@ from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
 from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.stats import Counters
+from swarm.runtime.own_usage import OwnUsage
+from swarm.runtime.stats import ENDED, Counters
 
 log = logging.getLogger(__name__)
 
@@ -157,6 +158,7 @@ class Process:
         try:
             with collected_rarely():
                 self._loop(counters)
+            counters.gauge(ENDED, 1.0)  # not where an error ends it
         finally:
             # A second signal must not interrupt the end, not even that of the interpreter.
             for number in self._signals:
@@ -169,6 +171,7 @@ class Process:
         due_ns = events_until_ns = self._clock.now_ns()
         if self._phase_ns is not None:
             due_ns += (self._phase_ns - due_ns) % self._tick_ns
+        usage = OwnUsage()
         while not self._stopping:
             now_ns = self._clock.now_ns()
             if now_ns >= due_ns and (now_ns >= events_until_ns or not len(self._inbox)):
@@ -176,6 +179,7 @@ class Process:
                 counters.count("ticks_dropped", missed)
                 counters.count("ticks_late", missed + (late_ns > self._tick_ns // 2))
                 due_ns += (missed + 1) * self._tick_ns
+                usage.look(counters, now_ns)
                 self._service.tick(now_ns)
                 took_ns = self._clock.now_ns() - now_ns
                 events_until_ns = now_ns + 2 * took_ns

@@ -17,11 +17,10 @@ from launch_scripts.report.pictures.map_picture import (
     colours_of_groups,
     group_of,
     in_km,
-    length_text,
     mark_overlay,
-    round_length,
 )
 from launch_scripts.report.pictures.palette import GROUPS
+from launch_scripts.report.pictures.scale_bar import round_length, said_length
 from swarm.config.input_files import FileKind, read_bytes
 
 WIDTH = 1000
@@ -65,7 +64,7 @@ def map_parts(folder: Path, tracks: RunTracks, report: Mapping[str, Any]) -> dic
             {"target": track.id, "place": [round(float(v), 1) for v in in_km(track, grid)[0] * scale]}
             for track in tracks.captures
         ],
-        "bar": {"units": round(bar_km * scale, 1), "text": length_text(bar_km)},
+        "bar": {"units": round(bar_km * scale, 1), "text": said_length(bar_km * 1000)},
     }
 
 

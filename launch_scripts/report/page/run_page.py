@@ -13,10 +13,12 @@ from launch_scripts.report.files import write_file
 from launch_scripts.report.geo.track_file import TRACKS_FILE, read_tracks
 from launch_scripts.report.page.map_svg import map_parts
 from launch_scripts.report.page.theme import themed_svg
-from launch_scripts.report.pictures.plots import PLOTS, draw_plot, duration
+from launch_scripts.report.pictures.plots import PLOTS, draw_plot
 from launch_scripts.report.results.certified_gap import percent
 from launch_scripts.report.results.result_tables import TABLES
 from launch_scripts.report.results.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
+from launch_scripts.report.run_state.alarms import Alarm
+from launch_scripts.report.run_state.facts import count, duration, fact
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import StoreError
 
@@ -53,7 +55,8 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         name=folder.resolve().name,
         where=f"{folder.resolve().parent.name}/{folder.resolve().name}",
         cards=_cards(report),
-        alarms=alarms(report),
+        alarms=_alarms(report),
+        left_behind=_left_behind(report),
         map=map_parts(folder, read_tracks(tracks), report) if tracks.exists() else None,
         plots=[
             (plot, themed_svg(lambda axes, plot=plot: draw_plot(axes, plot, report, titled=False)))  # type: ignore[misc]
@@ -76,17 +79,8 @@ def environment_of_pages() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(percent=percent, number=number, when=_when, duration=duration)
+    environment.filters.update(percent=percent, count=count, when=_when)
     return environment
-
-
-def number(value: Any) -> str:
-    """A figure for people."""
-    if value is None:
-        return "–"
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return str(value)
-    return f"{value:,.4g}" if isinstance(value, float) and value < 1e4 else f"{value:,.0f}"
 
 
 def _when(text: str) -> str:
@@ -104,12 +98,12 @@ def _cards(report: Mapping[str, Any]) -> list[Card]:
     gap = report["certified_gap"]
     unproven = gap.get("unproven") or 0
     return [
-        _count(report, "captures", "captures", "Times that a vehicle came within capture range of a target."),
+        _of_fact(report, "captures"),
         (
             "certified gap, mean",
             percent(gap["mean"]),
             "Routes that vehicles began cost at most so much more than the cheapest that exist: proven, by a lower "
-            "bound with each." + (f" {number(unproven)} had none and are not counted." if unproven else ""),
+            "bound with each." + (f" {count(unproven)} had none and are not counted." if unproven else ""),
             "",
         ),
         (
@@ -118,25 +112,22 @@ def _cards(report: Mapping[str, Any]) -> list[Card]:
             f"Of 100 routes, 95 are proven to be at least as good as this. The worst: {percent(gap['max'])}.",
             "",
         ),
-        _never(report, "collisions", "collisions", "Times that two vehicles stood in one cell: none is allowed."),
-        _never(report, "lethal_entries", "lethal entries", "Times that a vehicle drove where nothing can drive."),
-        _never(report, "lost", "vehicles lost", "At the end, without a route that they could still follow."),
-        _count(report, "marks", "marks", "Cells that vehicles found to differ from the map."),
-        _count(report, "reroute_requests", "re-route requests", "Times that vehicles asked for another way."),
-        _count(report, "routes_served", "routes served", "Answers of all planners to vehicles that asked."),
+        _of_fact(report, "collisions", must_be_zero=True),
+        _of_fact(report, "lethal_entries", must_be_zero=True),
+        _of_fact(report, "marks"),
+        _of_fact(report, "reroute_requests"),
+        _of_fact(report, "routes_served"),
         _timing(report, "growth_ms", "growing a tree, p50", "All cheapest paths to one target"),
         _timing(report, "route_query_ms", "asking for a route, p50", "From a vehicle's question to the answer"),
         _timing(report, "mark_to_tree_ms", "from mark to tree, p50", "From what a sensor sees to a tree's cost"),
-    ]  # fmt: skip
+        ("messages/s, mean", count(report["messages_per_s"]), "Of all processes, over the whole run.", ""),
+    ]
 
 
-def _count(report: Mapping[str, Any], name: str, label: str, meaning: str) -> Card:
-    return label, number(report[name]), meaning, ""
-
-
-def _never(report: Mapping[str, Any], name: str, label: str, meaning: str) -> Card:
-    count = report[name]
-    return label, number(count), meaning, "" if count is None else "bad" if count else "good"
+def _of_fact(report: Mapping[str, Any], name: str, must_be_zero: bool = False) -> Card:
+    value, told = report[name], fact(name)
+    tone = "" if not must_be_zero or value is None else "bad" if value else "good"
+    return told.label, told.text(value), told.meaning, tone
 
 
 def _timing(report: Mapping[str, Any], name: str, label: str, meaning: str) -> Card:
@@ -144,24 +135,28 @@ def _timing(report: Mapping[str, Any], name: str, label: str, meaning: str) -> C
     return label, duration(quantiles["p50"]), f"{meaning}; p99 {duration(quantiles['p99'])}.", ""
 
 
-def alarms(report: Mapping[str, Any]) -> list[str]:
-    """What a person should look at, in sentences."""
-    tracking = report.get("tracking") or {}
-    counted = (
-        (report.get("collisions"), "collision", "collisions"),
-        (report.get("lethal_entries"), "lethal cell was entered", "lethal cells were entered"),
-        (report.get("driven_into"), "body was driven into", "bodies were driven into"),
-        (report.get("hit_by_bodies"), "vehicle was hit by a body", "vehicles were hit by bodies"),
-        (report.get("lost"), "vehicle is lost at the end", "vehicles are lost at the end"),
-        (report.get("stranded"), "vehicle is stranded at the end", "vehicles are stranded at the end"),
-        (report.get("restarts"), "process was started again", "processes were started again"),
-        (report.get("payloads_dropped"), "message was dropped", "messages were dropped"),
-        (tracking.get("lost"), "time that a target lost its tracker", "times that targets lost their trackers"),
-    )
-    said = [f"{number(count)} {one if count == 1 else many}" for count, one, many in counted if count]
-    vehicles, routed = report.get("vehicles"), report.get("vehicles_routed")
-    if vehicles and routed is not None and routed < vehicles:
-        said.append(f"{number(vehicles - routed)} of {number(vehicles)} vehicles never had a route")
+def _alarms(report: Mapping[str, Any]) -> list[tuple[Alarm, str]]:
+    """What went wrong, the serious first, each with its place in words."""
+    told = [
+        (
+            Alarm(row["kind"], row["about"], row["text"], row["since_s"], row["over_s"], target=row["target"]),
+            "" if row["row"] is None else f"row {row['row']}, col {row['col']}",
+        )
+        for row in report.get("alarms") or []
+    ]
+    return sorted(told, key=lambda alarm: not alarm[0].serious)
+
+
+def _left_behind(report: Mapping[str, Any]) -> list[str]:
+    """What vehicles did not do, in sentences."""
+    said = [
+        f"{count(report[name])} of {count(report['vehicles'])} vehicles {words}"
+        for name, words in (("lost", "are lost at the end"), ("stranded", "are stranded at the end"))
+        if report.get(name)
+    ]
+    vehicles, routed = report["vehicles"], report.get("vehicles_routed")
+    if routed is not None and routed < vehicles:
+        said.append(f"{count(vehicles - routed)} of {count(vehicles)} vehicles never had a route")
     return said
 
 
@@ -220,4 +215,4 @@ def _cell(name: str, value: Any) -> tuple[str, Any]:
         return f"{value / 1000:,.2f}", value
     if name.endswith("_s"):
         return f"{value:,.0f}", value
-    return number(value), value
+    return (count(value) if isinstance(value, int | float) else str(value)), value

@@ -22,11 +22,10 @@ from launch_scripts.report.pictures.map_picture import (
     colours_of_groups,
     group_of,
     in_km,
-    length_text,
     mark_overlay,
-    round_length,
 )
 from launch_scripts.report.pictures.palette import BLACK, FAINT, GROUPS, INK, RED, YELLOW
+from launch_scripts.report.pictures.scale_bar import round_length, said_length
 from launch_scripts.report.results.run_folder import read_report
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
@@ -246,7 +245,7 @@ class _Scene:
         draw.line([(x, y), (x + bar_km * self._scale, y)], INK, 2 * _FINE)
         draw.text(
             (x, y - 5 * _FINE),
-            length_text(bar_km),
+            said_length(bar_km * 1000),
             INK,
             self._small,
             "lb",

@@ -27,6 +27,7 @@ from launch_scripts.report.pictures.palette import (
     YELLOW,
 )
 from launch_scripts.report.pictures.plots import halo
+from launch_scripts.report.pictures.scale_bar import round_length, said_length
 from shared_map.terrain.places import MapFrame
 from swarm.grid import GridSpec
 from swarm.wire.statements import MarkKind
@@ -199,7 +200,8 @@ def _draw_scale_bar(axes: Axes, width_km: float, height_km: float) -> None:
     for colour, width in (("white", 6.0), (INK, 3.0)):
         axes.plot([x0, x0 + length_km], [y0, y0], color=colour, linewidth=width, solid_capstyle="butt", zorder=11)
     axes.annotate(
-        length_text(length_km), (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left", fontsize=9.5,
+        said_length(length_km * 1000), (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left",
+        fontsize=9.5,
         fontweight="bold", zorder=11, path_effects=halo(),
     )  # fmt: skip
 
@@ -211,16 +213,6 @@ def _draw_north(axes: Axes) -> None:
         arrowprops={"arrowstyle": "-|>,head_width=0.22,head_length=0.45", "color": INK, "linewidth": 1.6,
                     "path_effects": halo()},
     )  # fmt: skip
-
-
-def length_text(length_km: float) -> str:
-    return f"{length_km:g} km" if length_km >= 1 else f"{length_km * 1000:g} m"
-
-
-def round_length(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above the value."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= value * 1.0001))
 
 
 def _legend(ground: GroundPicture, groups: Mapping[str, str]) -> list[Any]:

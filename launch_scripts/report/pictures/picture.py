@@ -15,8 +15,9 @@ from launch_scripts.report.pictures.ground_picture import GroundPicture
 from launch_scripts.report.pictures.map_picture import draw_map
 from launch_scripts.report.pictures.palette import FAINT, GREEN, INK, RED, RULE
 from launch_scripts.report.pictures.plot_style import STYLE
-from launch_scripts.report.pictures.plots import PLOTS, draw_plot, duration
+from launch_scripts.report.pictures.plots import PLOTS, draw_plot
 from launch_scripts.report.results.certified_gap import percent
+from launch_scripts.report.run_state.facts import count, duration, fact
 
 WIDTH_IN, HEIGHT_IN, DPI = 12.8, 9.6, 150
 
@@ -75,18 +76,24 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
     title = f"{report['vehicles']} vehicles chase {report['targets']} targets"
     figure.text(0.033, 0.966, title, fontsize=21, fontweight="bold", va="center")
     figure.text(0.033, 0.936, "   ·   ".join(_facts(report)), fontsize=9, color=FAINT, va="center")
+    gap = report["certified_gap"]
     tiles = [
-        ("captures", _number(report["captures"]), GREEN),
-        ("marks", _number(report["marks"]), INK),
-        ("re-route requests", _number(report["reroute_requests"]), INK),
-        ("routes served", _number(report["routes_served"]), INK),
-        ("certified gap, mean", percent(report["certified_gap"]["mean"]), INK),
-        ("certified gap, p95", percent(report["certified_gap"]["p95"]), INK),
+        *(
+            (fact(name).label, count(report[name]), INK)
+            for name in ("captures", "marks", "reroute_requests", "routes_served")
+        ),
+        ("certified gap, mean", percent(gap["mean"]), INK),
+        ("certified gap, p95", percent(gap["p95"]), INK),
         ("growth of a tree, p50", duration(report["growth_ms"]["p50"]), INK),
         ("route query, p99", duration(report["route_query_ms"]["p99"]), INK),
-        ("collisions", _number(report["collisions"]), RED if report["collisions"] else GREEN),
-        ("lethal entries", _number(report["lethal_entries"]), RED if report["lethal_entries"] else GREEN),
-        ("lost", _number(report["lost"]), RED if report["lost"] else GREEN),
+        *(
+            (label, count(report[name]), RED if report[name] else GREEN)
+            for name, label in (
+                ("collisions", "collisions"),
+                ("lethal_entries", "lethal entries"),
+                ("lost", "lost"),
+            )
+        ),
     ]
     for y in (0.918, 0.853):
         figure.add_artist(Line2D([0.033, 0.967], [y, y], color=RULE, linewidth=1))
@@ -117,7 +124,3 @@ def _facts(report: dict[str, Any]) -> list[str]:
 
 def _several(count: int | None, one: str, many: str) -> str:
     return "" if count is None else f"{count} {one if count == 1 else many}"
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:,.0f}"

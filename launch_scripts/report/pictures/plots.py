@@ -26,6 +26,7 @@ from launch_scripts.report.pictures.palette import (
     VIOLET,
 )
 from launch_scripts.report.results.certified_gap import percent
+from launch_scripts.report.run_state.facts import duration
 
 Report = Mapping[str, Any]
 NO_GAP = 5e-7
@@ -158,7 +159,7 @@ def _growing(axes: Axes, report: Report) -> bool:
     axes.plot(time_s, growth_ms, color=GREEN, linewidth=_WIDE)
     axes.set_ylim(0, max(growth_ms.max() * 1.15, 1e-3))
     axes.yaxis.set_major_locator(MaxNLocator(4))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: duration(value) if value else "0"))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _tick_ms(value) if value else "0"))
     return True
 
 
@@ -233,7 +234,7 @@ def _timings(axes: Axes, report: Report) -> bool:
     axes.set_yticks([])
     axes.tick_params(axis="x", which="both", length=0)
     axes.xaxis.set_major_locator(LogLocator(numticks=7))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: duration(value)))
+    axes.xaxis.set_major_formatter(FuncFormatter(_tick_ms))
     axes.xaxis.set_minor_formatter(NullFormatter())
     return True
 
@@ -321,11 +322,8 @@ def _short(value: float, _: object = None) -> str:
     return f"{value / 1000:g}k" if abs(value) >= 1000 else f"{value:g}"
 
 
-def duration(milliseconds: float | None) -> str:
-    """A number for a person to read."""
-    if milliseconds is None:
-        return "–"
-    return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1000:.3g} s"
+def _tick_ms(value: float, _: object = None) -> str:
+    return f"{value:g} ms" if value < 1000 else f"{value / 1000:g} s"
 
 
 def halo() -> list[Any]:
