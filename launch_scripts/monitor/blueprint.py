@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn
 
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.levels import level_for
+from launch_scripts.monitor.movers.mover_drawing import mover_overrides
 
 BACKGROUND = (17, 22, 28)
-TRAIL_S = 25.0
 
 
-def make_blueprint(mesh: TerrainMesh) -> rrb.Blueprint:
-    """The 3D view on the left; figures, plots and the log on the right."""
+def make_blueprint(mesh: TerrainMesh, vehicles: int = 100) -> rrb.Blueprint:
+    """The 3D view on the left; figures, plots and the log on the right.
+
+    vehicles  how many there are, which decides how much is drawn of each
+    """
     return rrb.Blueprint(
         rrb.Horizontal(
-            _view_3d(mesh),
+            _view_3d(mesh, vehicles),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/summary", name="Now"),
                 _plot("captures_and_marks", "Captures and marks"),
@@ -40,14 +43,9 @@ def make_blueprint(mesh: TerrainMesh) -> rrb.Blueprint:
     )
 
 
-def _view_3d(mesh: TerrainMesh) -> rrb.Spatial3DView:
+def _view_3d(mesh: TerrainMesh, vehicles: int) -> rrb.Spatial3DView:
     middle = (mesh.width_m / 2, -mesh.depth_m / 2, float(mesh.heights_m.mean()))
     far = max(mesh.width_m, mesh.depth_m)
-    trail = rr.VisibleTimeRange(
-        "sim_time",
-        start=rr.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
-        end=rr.TimeRangeBoundary.cursor_relative(),
-    )
     return rrb.Spatial3DView(
         origin="/world",
         name="Swarm",
@@ -59,10 +57,7 @@ def _view_3d(mesh: TerrainMesh) -> rrb.Spatial3DView:
             look_target=(middle[0], middle[1] - 0.125 * far, middle[2]),
             eye_up=(0, 0, 1),
         ),
-        overrides={
-            "/world/trails/vehicles": rrb.VisibleTimeRanges([trail]),
-            "/world/trails/targets": rrb.VisibleTimeRanges([trail]),
-        },
+        overrides=mover_overrides(level_for(vehicles)),
     )
 
 
