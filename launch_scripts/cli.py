@@ -187,6 +187,7 @@ def _up(
         run_id=run_id,
         as_json=run.as_json,
         plain=run.plain,
+        metrics_port=run.metrics_port,
         began_s=_began_s(),
     )
     raise typer.Exit(run_swarm(chosen))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,6 +32,11 @@ ENTRIES = {
     "agent": "vehicle_agent.main:run",
 }
 """`module:function` of each role's `run(setup, stop_when)`."""
+
+
+NICENESS: Mapping[str, int] = {"router": 0, "agent": 0, "targets": 0, "planner": 5, "keeper": 10, "monitor": 10}
+"""By how much less urgent each role is than the launcher, where the processor is short. A vehicle that is driven
+late stands, and a target jumps; a route may come a little later, what is kept or shown much."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
 from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, ThreadWorker, end_with
+from swarm.runtime.process import Process, ThreadWorker, end_with, tick_phase
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 
@@ -46,7 +46,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         service = PlannerService(
             setup, terrain, bus, inbox.post, worker, time.thread_time_ns, lambda: kernels.complete, prepared
         )
-        process = Process(service, inbox, clock, scenario.planner.tick_hz)
+        process = Process(service, inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id))
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

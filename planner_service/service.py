@@ -66,7 +66,7 @@ class PlannerService:
         self._bus = bus
         self._post = post
         self._worker = worker
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters
         self._cost_map = CostMap(terrain)

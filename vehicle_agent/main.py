@@ -9,7 +9,7 @@ from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, end_with
+from swarm.runtime.process import Process, end_with, tick_phase
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 from vehicle_agent.promise_store import FilePromiseStore, MemoryPromiseStore, PromiseStore
@@ -32,7 +32,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     with open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus:
         inbox = Inbox()
         service = AgentService(setup, terrain, truth, bus, inbox.post, store)
-        process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz)
+        process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz, tick_phase(setup.id))
         service.when_over = process.stop
         process.stop_on_signals()
         if stop_when is not None:

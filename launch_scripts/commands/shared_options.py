@@ -91,5 +91,9 @@ class RunOptions:
     no_live: Annotated[
         bool, typer.Option("--no-live", help="Serve no live view. The run is recorded all the same.")
     ] = False
+    metrics_port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Serve figures to Prometheus on this port of loopback; 0 picks one."),
+    ] = None
     plain: Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live table.")] = False
     as_json: AsJson = False

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from launch_scripts.launcher.log_file import log_to
+from launch_scripts.process_table import NICENESS
 from swarm.errors import SwarmError
 from swarm.runtime.role import RoleSetup
 
@@ -37,6 +38,8 @@ class ExitReason:
 
 def run_child(entry: str, setup: RoleSetup, log_path: Path, pipe: Connection) -> None:
     """Runs a role until it is told to stop. Ends the process with the role's exit code."""
+    with contextlib.suppress(OSError):  # not every system lets a process choose
+        os.nice(NICENESS.get(setup.role, 0))  # before there are other threads, which inherit it
     _redirect(log_path)
     # The launcher alone decides when to stop: it blocks SIGINT for all its processes, and SIGTERM until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})

@@ -1,4 +1,4 @@
-"""The only module that logs to rerun: takes the scene's arrays.
+"""Logs figures and notes to rerun. What lies still is logged in `ground/`, what moves in `movers/`.
 
 Few entities with many instances each, arrays instead of lists, style logged once: see what was measured in
 docs/decisions/0008-the-live-view.md.
@@ -12,21 +12,17 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
 from launch_scripts.monitor.movers.looks import HUES
 from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.report.samples import Sample
 from swarm.wire.messages.vehicles import VehicleState
 
-_WINDOW_COLOUR = (255, 200, 60)
-
 
 class Drawing:
     """Logs the scene to one recording stream."""
 
-    def __init__(self, rec: rr.RecordingStream | Streams, mesh: TerrainMesh, target_ids: Sequence[str]) -> None:
+    def __init__(self, rec: rr.RecordingStream | Streams, target_ids: Sequence[str]) -> None:
         self._rec = rec
-        self._mesh = mesh
         self._target_ids = list(target_ids)
 
     def set_time(self, frame: int, seconds: float) -> None:
@@ -35,13 +31,7 @@ class Drawing:
         self._rec.set_time("sim_time", duration=seconds)
 
     def begin(self) -> None:
-        """Logs what never changes: the terrain's mesh and the styles."""
-        rec, mesh = self._rec, self._mesh
-        rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for tile in mesh.mesh_tiles():
-            self._tile(tile)
-        line = _screen_points(1.3)
-        rec.log("world/windows", _style(rr.LineStrips3D, [_WINDOW_COLOUR], [line]), static=True)
+        """Logs what never changes: the styles."""
         states = [state.name.lower() for state in VehicleState]
         self._series("states", states, HUES[: len(states)])
         self._series("captures_and_marks", ["captures", "marks / 100"], [(255, 210, 31), (170, 110, 240)])
@@ -52,35 +42,8 @@ class Drawing:
     def _colours(self) -> list[tuple[int, ...]]:
         return [HUES[n % len(HUES)] for n in range(len(self._target_ids))]
 
-    def _tile(self, tile: MeshTile) -> None:
-        self._rec.log(
-            f"world/ground/{tile.index}",
-            rr.Mesh3D.from_fields(
-                vertex_positions=tile.vertices,
-                triangle_indices=tile.triangles,
-                vertex_texcoords=tile.texcoords,
-            ),
-            static=True,
-        )
-
     def _series(self, chart: str, names: list[str], colours: Sequence[tuple[int, ...]]) -> None:
         self._rec.log(f"plots/{chart}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
-
-    def texture(self, tile: int, image: Bytes) -> None:
-        """Logs the photo of a tile, with its marks. Not static: a viewer which joins late gets only recent data."""
-        height, width, _ = image.shape
-        self._rec.log(
-            f"world/ground/{tile}",
-            rr.Mesh3D.from_fields(
-                albedo_texture_buffer=np.ascontiguousarray(image).tobytes(),
-                albedo_texture_format=rr.components.ImageFormat(
-                    width=width, height=height, color_model="RGB", channel_datatype="U8"
-                ),
-            ),
-        )
-
-    def windows(self, strips: Floats) -> None:
-        self._rec.log("world/windows", rr.LineStrips3D.from_fields(strips=strips))
 
     def plots(self, sample: Sample, messages_per_s: float | None) -> None:
         log = self._scalars
@@ -102,12 +65,3 @@ class Drawing:
 
     def note(self, text: str, level: str) -> None:
         self._rec.log("log", rr.TextLog(text, level=level))
-
-
-def _style(archetype: type[rr.LineStrips3D], colours: list[tuple[int, ...]], radii: list[float]) -> rr.LineStrips3D:
-    return archetype.from_fields(colors=colours, radii=radii)
-
-
-def _screen_points(radius: float) -> float:
-    """A radius in points of the viewer's window, the same at every zoom: rerun takes negative radii so."""
-    return -radius

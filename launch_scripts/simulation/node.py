@@ -17,6 +17,7 @@ from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.runtime.process import Service
 from swarm.runtime.role import RoleSetup
+from swarm.runtime.stats import ENDED
 from vehicle_agent.promise_store import MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
@@ -105,6 +106,8 @@ class Node:
             incarnation=self._life,
             started_ns=EPOCH_NS,
             added=self.added,
+            restarts=self.crashes,
+            before=simulation.recorder.observed.newest_stats(self.spec.role, self.spec.id),
         )
         self.service = self._build(setup, bus, post, worker)
         self.service.start(self.now_ns())
@@ -163,6 +166,7 @@ class Node:
 
     def stop(self) -> None:
         if self.service is not None:
+            self.service.counters.gauge(ENDED, 1.0)
             self.service.stop(self.now_ns())
 
     def _leave(self) -> None:

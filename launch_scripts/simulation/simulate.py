@@ -93,7 +93,7 @@ class Simulation:
         self.authenticator = Authenticator(b"simulated", self.run_id)
         self.terrain = terrain or build_terrain(scenario)
         self.truth = build_truth(scenario, self.terrain)
-        self.recorder = Recorder(scenario, self.terrain.grid)
+        self.recorder = Recorder(scenario, self.terrain.grid, EPOCH_NS)
         self.scheduler = Scheduler(ManualClock(EPOCH_NS))
         self.log = EventLog(EPOCH_NS, trace)
         chance = random.Random(f"simulation/{scenario.seed}")
@@ -198,7 +198,7 @@ class Simulation:
 
     def _watch(self) -> None:
         """Subscribes the recorder to its topics."""
-        bus = self.network.bus(OBSERVER, self.scenario.network.namespace)
+        bus = self.network.bus(OBSERVER, self.scenario.network.namespace, self.authenticator)
         clock, recorder = self.scheduler.clock, self.recorder
 
         def post(event: Event) -> None:

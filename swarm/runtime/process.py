@@ -4,23 +4,28 @@ inbox."""
 from __future__ import annotations
 
 import logging
+import math
 import os
 import queue
+import re
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Protocol
+from zlib import crc32
 
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
 from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.stats import Counters
+from swarm.runtime.own_usage import OwnUsage
+from swarm.runtime.stats import ENDED, Counters
 
 log = logging.getLogger(__name__)
 
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 _WORKER_NICE = 5
 """By how much less urgent jobs of a worker are than their process."""
 
@@ -91,18 +96,32 @@ class ThreadWorker:
         self._jobs.put(None)
 
 
+def tick_phase(id: str) -> float:
+    """Where in their period the ticks of a process fall, from 0 to 1: processes of one kind must not tick together.
+
+    Their ids differ by a number. Its multiples of the golden ratio lie spread, however many there are (Knuth, The
+    Art of Computer Programming, vol. 3, 6.4, theorem S).
+    """
+    digits = "".join(re.findall("[0-9]", id))
+    return (int(digits[-9:]) if digits else crc32(id.encode())) * _GOLDEN % 1.0
+
+
 class Process:
     """Runs one service until `stop`.
 
     tick_hz  ticks a second; those that come too late are dropped and counted (`ticks_dropped`). `ticks_late` counts
              these and those that come later than half a period after they were due
+    phase    where in the clock's periods ticks fall, from 0 to 1; if None, the first comes at once
     """
 
-    def __init__(self, service: Service, inbox: Inbox, clock: Clock, tick_hz: float) -> None:
+    def __init__(
+        self, service: Service, inbox: Inbox, clock: Clock, tick_hz: float, phase: float | None = None
+    ) -> None:
         self._service = service
         self._inbox = inbox
         self._clock = clock
         self._tick_ns = int(NS_PER_S / tick_hz)
+        self._phase_ns = None if phase is None else int(phase * self._tick_ns)
         self._stopping = False
         """Set by `stop` from any thread, for good; read after each event."""
         self._signals: tuple[signal.Signals, ...] = ()
@@ -139,6 +158,7 @@ class Process:
         try:
             with collected_rarely():
                 self._loop(counters)
+            counters.gauge(ENDED, 1.0)  # not where an error ends it
         finally:
             # A second signal must not interrupt the end, not even that of the interpreter.
             for number in self._signals:
@@ -149,6 +169,9 @@ class Process:
 
     def _loop(self, counters: Counters) -> None:
         due_ns = events_until_ns = self._clock.now_ns()
+        if self._phase_ns is not None:
+            due_ns += (self._phase_ns - due_ns) % self._tick_ns
+        usage = OwnUsage()
         while not self._stopping:
             now_ns = self._clock.now_ns()
             if now_ns >= due_ns and (now_ns >= events_until_ns or not len(self._inbox)):
@@ -156,6 +179,7 @@ class Process:
                 counters.count("ticks_dropped", missed)
                 counters.count("ticks_late", missed + (late_ns > self._tick_ns // 2))
                 due_ns += (missed + 1) * self._tick_ns
+                usage.look(counters, now_ns)
                 self._service.tick(now_ns)
                 took_ns = self._clock.now_ns() - now_ns
                 events_until_ns = now_ns + 2 * took_ns

@@ -18,7 +18,7 @@ from launch_scripts.report.pictures import palette
 from swarm.wire.messages.vehicles import VehicleState
 
 Colour = tuple[int, int, int]
-Shape = Literal["ball", "box", "pin", "ring", "disc", "line"]
+Shape = Literal["ball", "box", "pin", "ring", "disc", "line", "fill", "hatch"]
 
 
 def _rgb(colour: str) -> Colour:
@@ -38,11 +38,13 @@ NOBODY: Colour = (170, 176, 182)
 TARGET_COLOUR: Colour = (255, 255, 255)
 """Of all targets, where hues are groups."""
 LOST_COLOUR: Colour = (120, 124, 130)
-BODY_COLOUR: Colour = (35, 38, 44)
+BODY_COLOUR: Colour = (118, 84, 60)
 SIGHTED_COLOUR: Colour = (255, 255, 255)
 ROUTE_COLOUR: Colour = (205, 212, 220)
 ALARM_COLOUR: Colour = (255, 64, 48)
-HINT = "point at a vehicle or target: who it is and what it does"
+HINT = "point at a vehicle or target to read who it is"
+_GROUPS = 4
+"""Groups in the legend: more have no place there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,10 +62,10 @@ class Shade:
 SHADES: dict[VehicleState, Shade] = {
     VehicleState.FOLLOWING: Shade((0, 0, 0), 0.0, "on its way"),
     VehicleState.ARRIVED: Shade((255, 255, 255), 0.65, "arrived"),
-    VehicleState.WAITING: Shade((0, 0, 0), 0.55, "waits for a route, or has no target"),
+    VehicleState.WAITING: Shade((0, 0, 0), 0.55, "waits"),
     VehicleState.IDLE: Shade((0, 0, 0), 0.55, None),
-    VehicleState.STRANDED: Shade((0, 0, 0), 0.9, "stranded: no way"),
-    VehicleState.LOST: Shade((128, 132, 138), 0.85, "its planner or target is lost"),
+    VehicleState.STRANDED: Shade((0, 0, 0), 0.9, "stranded"),
+    VehicleState.LOST: Shade((128, 132, 138), 0.85, "planner or target lost"),
     VehicleState.OUTDATED: Shade((128, 132, 138), 0.85, None),
 }
 
@@ -130,9 +132,9 @@ class Looks:
         """What is drawn of all that moves."""
         first = next(iter(self._hue.values()), NOBODY)
         if self.by_target:
-            who = [Look("ball", first, "vehicle, in the colour of its target")]
+            who = [Look("ball", first, "vehicle, hue by target")]
         else:
-            who = [Look("ball", self._hue[name], f"vehicle of {name}") for name in self.groups[:6]]
+            who = [Look("ball", self._hue[name], f"of {name[:14]}") for name in self.groups[:_GROUPS]]
         states = [
             Look("ball", shaded(first, state), shade.meaning)
             for state, shade in SHADES.items()
@@ -141,11 +143,10 @@ class Looks:
         return [
             *who,
             *states,
-            Look("box", first, "guest: not of the scenario"),
+            Look("box", (240, 243, 246), "around guests"),
             Look("pin", self.target(next(iter(self.target_ids), "")), "target"),
-            Look("pin", LOST_COLOUR, "target that nobody tracks"),
-            Look("ring", SIGHTED_COLOUR, "where a hidden target was seen"),
+            Look("ring", SIGHTED_COLOUR, "hidden target seen"),
             Look("disc", BODY_COLOUR, "body to keep off"),
-            Look("line", self.route(next(iter(self.target_ids), "")), "routes ahead, and trails"),
+            Look("line", self.route(next(iter(self.target_ids), "")), "route, trail"),
             Look("pin", ALARM_COLOUR, "alarm"),
         ]

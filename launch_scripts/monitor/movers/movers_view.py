@@ -12,7 +12,8 @@ from launch_scripts.monitor.movers.mover_drawing import MoverDrawing
 from launch_scripts.monitor.movers.targets_view import TargetsView
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
 from launch_scripts.monitor.serving.sinks import Streams
-from launch_scripts.report.recorder import LiveSummary, Recorder
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.run_state.state import RunState
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.config.scenario import Scenario
@@ -43,7 +44,7 @@ class MoversView:
         self._recorder = recorder
         self._counters = counters
         level = level_for(scenario.vehicle_count)
-        looks = Looks([group.name for group in scenario.groups], scenario.target_ids)
+        self.looks = looks = Looks([group.name for group in scenario.groups], scenario.target_ids)
         self._drawing = MoverDrawing(rec, looks, level)
         self._vehicles = VehiclesView(self._drawing, mesh, scenario, level, looks)
         self._targets = TargetsView(self._drawing, mesh, looks, trails_of(scenario, mesh, level))
@@ -52,6 +53,8 @@ class MoversView:
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
         self._details: dict[str, str] = {}
         """Target -> a sentence about it."""
+        self._crew: frozenset[tuple[str, str]] = frozenset()
+        """(role, id) of the processes that the run needs; of others that went, vehicles have left."""
         self._fleets_new = False
 
     def begin(self) -> None:
@@ -72,16 +75,18 @@ class MoversView:
                 if not self._vehicles.begun(followed, now_ns):
                     self._counters.count("routes_unreadable")
 
-    def summarised(self, summary: LiveSummary) -> None:
+    def summarised(self, summary: RunState) -> None:
         """Takes what the figures say of targets, so that all places say the same."""
         self._details = {line.id: target_details(line) for line in summary.targets}
+        plan = self._recorder.plan
+        self._crew = frozenset(plan.crew_now(plan.targets_now(self._recorder.book)))
 
     def tick(self, now_ns: int) -> None:
         """Draws what is due in one frame."""
         observed = self._recorder.observed
         if self._fleets_new:
             self._fleets_new = False
-            self._vehicles.draw(observed.vehicles(), observed.groups, now_ns)
+            self._vehicles.draw(observed.driven(self._crew, now_ns), observed.groups, now_ns)
         self._sightings.expire(now_ns)
         lost = self._recorder.tracked.lost(now_ns)
         self._targets.draw(observed.targets(), lost, self._sightings.best(now_ns), self._details, now_ns)

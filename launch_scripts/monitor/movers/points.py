@@ -54,7 +54,7 @@ def body_points(mesh: TerrainMesh, bodies: Sequence[Body]) -> tuple[Points, Floa
 
 def label_places(mesh: TerrainMesh, targets: Points) -> Floats:
     """Places of the targets' names: above them."""
-    names: Floats = targets.positions + np.array([0, 0, 3.4 * mesh.scale_m], np.float32)
+    names: Floats = targets.positions + np.array([0, 0, 4.2 * mesh.scale_m], np.float32)
     return names
 
 

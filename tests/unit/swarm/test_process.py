@@ -10,11 +10,13 @@ import time
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from swarm.bus.bus import Event, Heard, HeardMany, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S, ManualClock, MonotonicClock
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.process import Process, ThreadWorker
+from swarm.runtime.process import Process, ThreadWorker, tick_phase
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import TargetPose
@@ -192,6 +194,39 @@ def test_a_tick_is_late_which_comes_more_than_half_a_period_after_it_was_due_or_
     process.run()
     assert service.counters.counts["ticks_late"] == late
     assert service.counters.counts["ticks_dropped"] == (took_ms - 100) // 100
+
+
+@given(st.integers(0, 10**6), st.integers(2, 60), st.sampled_from(["a", "t", "scout-", "t0.r"]))
+def test_ticks_of_processes_with_successive_ids_lie_spread_over_the_period(first, count, name):
+    phases = sorted(tick_phase(f"{name}{first + index}") for index in range(count))
+    apart = np.diff([*phases, phases[0] + 1.0]) * count
+    # Were they evenly spread, all would be 1; the least and the most hold for any count, unlike those of chance.
+    assert apart.min() > 0.4
+    assert apart.max() < 2.0
+
+
+def test_an_id_of_any_letters_has_a_phase():
+    for id in ("", "rover", "é²", "9" * 40):
+        assert 0.0 <= tick_phase(id) == tick_phase(id) < 1.0
+
+
+@pytest.mark.parametrize("start_ms", [0, 29, 31, 99, 1_700_000_000_030])
+def test_ticks_fall_where_the_phase_says_whenever_the_process_starts_and_however_late_one_is(start_ms):
+    clock, inbox = ManualClock(start_ms * 10**6), Inbox()
+    for n in range(1000):
+        inbox.post(note(str(n)))  # what else makes the time pass
+
+    def on_tick(ticks: list[int]) -> None:
+        clock.advance_to(clock.now_ns() + (130_000_000 if len(ticks) == 2 else 0))
+        if len(ticks) == 5:
+            process.stop()
+
+    service = Recording(on_tick, lambda event: clock.advance_to(clock.now_ns() + 1_000_000))
+    process = Process(service, inbox, clock, tick_hz=10, phase=0.3)
+    process.run()
+    first_ms = start_ms + (30 - start_ms) % 100
+    ticks_ms = [tick // 10**6 - first_ms for tick in service.ticks]
+    assert (ticks_ms[:2], ticks_ms[3:]) == ([0, 100], [400, 500])  # that of 200 took too long, so one comes late
 
 
 def test_events_are_handled_between_ticks_and_ticks_come_though_the_inbox_is_full():
