@@ -316,7 +316,7 @@ class _Replay:
             event=self._events + (step.call is not None),
             what=MAKING if step.call is None else described(step.call),
             seconds=self._seconds,
-            recorded=None if recorded is None else f"{recorded.to} ({_size(recorded)})",
+            recorded=None if recorded is None else _named(recorded),
             replayed=replayed,
         )
 
@@ -345,13 +345,15 @@ def _was_raised(step: _Step) -> bool:
     return any(output.to.startswith(RAISED) for output in step.outputs)
 
 
-def _size(output: Output) -> str:
-    return f"{output.length} bytes, digest {output.digest.hex()}"
+def _named(output: Output) -> str:
+    if not output.length:
+        return output.to
+    return f"{output.to} ({output.length} bytes, digest {output.digest.hex()})"
 
 
 def _said(let_out: _LetOut) -> str:
     text = "" if let_out.what is None else f": {let_out.what}"
-    return f"{let_out.output.to} ({_size(let_out.output)}){text}"
+    return f"{_named(let_out.output)}{text}"
 
 
 class _NoBus:
