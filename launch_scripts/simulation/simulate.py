@@ -154,6 +154,7 @@ class Simulation:
                     node.stop()
                     node.ticking = False
         self.run_until(self.now_s + _STOP_S)
+        self.recorder.finish(self.scheduler.clock.now_ns())
 
     def report(self, seconds: float) -> dict[str, Any]:
         recorder = self.recorder
