@@ -15,6 +15,7 @@ from rich.console import Console
 from launch_scripts.commands.running.status import StatusWatch, print_status, status_fields
 from launch_scripts.launcher.live_table import live_table
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.details import _DOES
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.state import RunState
@@ -116,11 +117,18 @@ class Logged:
     def __init__(self) -> None:
         self.newest: dict[str, Any] = {}
 
-    def log(self, path: str, archetype: Any, *, static: bool = False) -> None:
-        self.newest[path] = archetype
+    def log(self, path: str, *parts: Any, static: bool = False) -> None:
+        self.newest[path] = parts[0]
+        for part in parts[1:]:
+            for batch in part.as_component_batches():
+                self.newest[f"{path}:details"] = _words(batch)
 
     def set_time(self, *args: object, **kwargs: object) -> None:
         pass
+
+    def details(self, *paths: str) -> list[str]:
+        """What people read who point at things of these entities."""
+        return [text for path in paths for text in self.newest.get(f"{path}:details", ())]
 
     @property
     def summary(self) -> str:
@@ -185,6 +193,16 @@ class Watched:
         watch = StatusWatch(bus, post)
         return watch
 
+    def draw_all(self, now_ns: int) -> None:
+        """One frame in which nothing waits for the next, the figures first."""
+        self.monitor._figures_due_ns = 0
+        self.monitor.tick(now_ns)
+        movers = self.monitor._movers
+        for due in (movers._vehicles._due, movers._targets._due):
+            due._next_ns = dict.fromkeys(due._next_ns, 0)
+        movers._fleets_new = True
+        self.monitor.tick(now_ns)
+
     def hush(self) -> None:
         """Nobody says anything any more, and what was said arrives."""
         for node in self.simulation.nodes.values():
@@ -239,8 +257,7 @@ def test_no_fact_that_is_shown_in_two_places_differs(
 
     now_ns = watched.now_ns
     watched.watching = False
-    watched.monitor._figures_due_ns = 0
-    watched.monitor.tick(now_ns)
+    watched.draw_all(now_ns)
     state = simulation.recorder.summary(now_ns)
     status = watch.status(now_ns)
     assert status is not None
@@ -274,6 +291,16 @@ def test_no_fact_that_is_shown_in_two_places_differs(
     )
     told = [(each["kind"], each["about"], each["over_s"]) for each in values["report"]["alarms"]]
     assert told == [(each["kind"], each["about"], each["over_s"]) for each in values["status as JSON"]["alarms"]]
+
+    vehicles = watched.logged.details("world/vehicles", "world/guests")
+    does = {each.name.lower(): sum(f": {words}" in text for text in vehicles) for each, words in _DOES.items()}
+    assert len(vehicles) == state.vehicles
+    assert does == state.states
+    always = [column for column in facts.TARGET_FACTS if column.always]
+    for text in watched.logged.details("world/targets/balls"):
+        title, _, rest = text.partition(": ")
+        line = next(line for line in state.targets if line.title == title)
+        assert rest == ", ".join(f"{column.label} {column.shown(line)}" for column in always[1:])
 
     # The end: what the recording shows last is what the report says.
     simulation.finish()
