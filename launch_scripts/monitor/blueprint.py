@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn
 
-from launch_scripts.monitor.ground import layers
-from launch_scripts.monitor.ground.layers import Layer
+from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.legend import BACKGROUND, HEIGHT_PX, WIDTH_PX
 from launch_scripts.monitor.ground.map_margin import said_heights
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
@@ -15,9 +16,8 @@ from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 TRAIL_S = 25.0
 
 
-def make_blueprint(mesh: TerrainMesh, *, knows_truth: bool = False) -> rrb.Blueprint:
+def make_blueprint(mesh: TerrainMesh, shown: Sequence[Layer] = (PHOTO,)) -> rrb.Blueprint:
     """Layers of the 3D view on the left, each with its legend; figures, plots and the log on the right."""
-    shown = [layers.PHOTO, layers.COST, *([layers.KNOWN] if knows_truth else [])]
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Tabs(*(_layer(mesh, layer) for layer in shown), active_tab=0),
@@ -64,8 +64,10 @@ def _view_3d(mesh: TerrainMesh, layer: Layer) -> rrb.Spatial3DView:
         end=rr.TimeRangeBoundary.cursor_relative(),
     )
     contents = ["+ $origin/**", "- $origin/layers/**"]
-    if layer is not layers.PHOTO:
-        contents += [f"- /{layers.PHOTO.entity}/**", f"+ /{layer.entity}/**"]
+    if layer is not PHOTO:
+        contents += [f"- /{PHOTO.entity}/**", f"+ /{layer.entity}/**"]
+    if layer.target is not None:
+        contents += ["- /world/routes/**", f"+ /world/routes/{layer.target}"]
     return rrb.Spatial3DView(
         origin="/world",
         contents=contents,

@@ -21,13 +21,7 @@ from swarm.wire.messages.vehicles import VehicleState
 
 _NAMES_SHOWN = 40
 _TARGET_TRAIL_COLOUR = (255, 70, 70)
-_PLOT_COLOURS = [
-    tuple(int(colour[n : n + 2], 16) for n in (1, 3, 5))
-    for colour in (
-        *(palette.SKY, palette.ORANGE, palette.GREEN, "#F0E442", palette.PINK, "#D55E00", "#8DA0CB", "#66C2A5"),
-        *("#E5C494", "#B3B3B3", "#A6D854", "#FC8D62"),
-    )
-]
+_PLOT_COLOURS = [palette.rgb(colour) for colour in palette.SERIES]
 
 
 class Drawing:

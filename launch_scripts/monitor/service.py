@@ -1,6 +1,7 @@
 """The monitor's shell: draws what it hears of the swarm, frame by frame.
 
-It only listens. It may be late, stalled, killed or absent; no process waits for it.
+It listens, and asks planners for the costs that its layers show. It may be late, stalled, killed or absent; no
+process waits for it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import rerun as rr
 from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.ground.ground_view import GroundView
+from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.ground.zones import Area
 from launch_scripts.monitor.movers.points import (
@@ -36,18 +38,18 @@ from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post
+from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.bodies import Body
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
+from swarm.wire.topics import BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
 from vehicle_agent.bodies import Bodies
 
 log = logging.getLogger(__name__)
@@ -64,6 +66,7 @@ _ROUTES_NS = 3 * NS_PER_S // 2
 _ROUTES_SHOWN = 400
 _ROUTES_KEPT = 1 << 15
 """Vehicles whose routes are remembered. Beyond that all are forgotten: their agents never had so many."""
+_ANSWER_S = 5.0
 _ANNOUNCE_NS = NS_PER_S // 2
 
 
@@ -75,6 +78,7 @@ class MonitorService:
     recording  watches the file of the recording, if there is one
     truth      the true ground, where this process knows it
     zones      of the scenario
+    layers     tabs of the view; the photo if there are none
     """
 
     def __init__(
@@ -90,6 +94,7 @@ class MonitorService:
         recording: RecordingWatch | None = None,
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
+        layers: Sequence[Layer] = (),
     ) -> None:
         self.recorder = Recorder(setup.scenario, terrain.grid)
         self._setup = setup
@@ -107,7 +112,10 @@ class MonitorService:
         self._rec = rec
         self._recording = recording
         self._drawing = Drawing(rec, self._target_ids)
-        self._ground = GroundView(rec, self._mesh, terrain, cost_map, replica, truth, zones)
+        shown = layers or [PHOTO]
+        self._ground = GroundView(
+            rec, self._mesh, terrain, cost_map, replica, shown, self._target_ids, truth, zones
+        )
         scale = setup.scenario.time_scale
         quickest_m = 4 * scale * max(setup.scenario.cost.road_speed_m_per_s, 1.0)
         self._vehicle_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
@@ -146,6 +154,8 @@ class MonitorService:
             return
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
+        if isinstance(event, Replied) and isinstance(event.message, CostReply):
+            self._ground.hear_costs(event.message, now_ns)
         if not isinstance(event, Heard):
             return
         self.recorder.heard(event.message, event.fields, now_ns)
@@ -175,6 +185,9 @@ class MonitorService:
         self._drawing.set_time(self._frame, self._seconds())
         self._watch_recording(now_ns)
         self._ground.tick(now_ns)
+        if (target := self._ground.samples.next_target(now_ns)) is not None:
+            request = self._ground.samples.request
+            self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
         self._draw_movers(now_ns)
         self._draw_plots(now_ns)
 

@@ -98,6 +98,9 @@ def _check(scenario: Scenario, source: str) -> None:
                 if name != "*" and name not in names:
                     where = f"{source}: groups: {group.name}: {key}"
                     raise ConfigError(f"{where} names {name!r}, which is no group{nearest(name, names)}")
+    shown = scenario.monitor.show_target
+    if shown and shown not in ids:
+        raise ConfigError(f"{source}: monitor.show_target is {shown!r}, which is no target{nearest(shown, ids)}")
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
             check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")

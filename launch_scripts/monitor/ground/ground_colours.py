@@ -23,10 +23,13 @@ LETHAL_MARK, SLOW_MARK, FAST_MARK = (98, 30, 165), (235, 150, 0), (90, 200, 250)
 LETHAL_PRIOR, HATCH, NO_GO, ROAD = (12, 14, 20), (200, 200, 212), rgb(palette.RED), (232, 222, 196)
 STILL_HIDDEN_LETHAL, STILL_HIDDEN_SLOW = rgb(palette.RED), rgb(palette.ORANGE)
 FOUND, OVERRULED = rgb(palette.SKY), rgb(palette.PINK)
-WINDOW = (255, 200, 60)
+WINDOW, TREE = (255, 200, 60), (255, 255, 255)
+UNREACHED = (70, 60, 66)
 _HATCH_TEXELS = 7
 COST_COLOURS = "cividis"
 """From dear to cheap."""
+COST_TO_GO_COLOURS = "viridis_r"
+"""From the target outwards."""
 _COST_STEPS = 256
 
 
@@ -113,10 +116,17 @@ class GroundColours:
             image[seen] = _mixed(image[seen], colour, 0.85)
         return image
 
-    def shaded(self, colours: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bytes:
-        """Colours on the relief of these texels."""
-        shade = 0.5 + 0.5 * self._shade[rows[:, None], cols[None, :]]
+    def lethal_at(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bools:
+        """Whether the map says that these rows and columns of cells are lethal: bool (rows, cols)."""
+        lethal: Bools = np.isinf(self._now[rows[:, None], cols])
+        return lethal
+
+    def on_relief(self, colours: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bytes:
+        """Colours of these rows and columns of cells, float32 (rows, cols, 3), lit; lethal ground is dark."""
+        side = self._mesh.texel
+        shade = 0.5 + 0.5 * self._shade[rows[:, None] // side, cols // side]
         lit: Bytes = np.clip(colours * shade, 0, 255).astype(np.uint8)
+        lit[self.lethal_at(rows, cols)] = LETHAL_PRIOR
         return lit
 
     def _hatch(self, image: Bytes, window: Window) -> None:

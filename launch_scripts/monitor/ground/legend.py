@@ -74,6 +74,11 @@ FOUND = (
     Entry("fill", colours.SLOW_MARK, "found slow"),
     Entry("fill", colours.FAST_MARK, "found quick"),
 )
+TO_TARGET = (
+    Entry("line", colours.TREE, "where the cost falls most"),
+    Entry("fill", colours.UNREACHED, "no way from here"),
+    Entry("fill", colours.LETHAL_PRIOR, "lethal"),
+)
 LETHAL_COST = Entry("fill", colours.LETHAL_PRIOR, "found lethal")
 KNOWN_OR_NOT = (
     Entry("fill", colours.FOUND, "hidden, and found"),

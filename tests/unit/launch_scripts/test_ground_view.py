@@ -24,7 +24,7 @@ from launch_scripts.monitor.ground.ground_colours import (
     STILL_HIDDEN_SLOW,
     GroundColours,
 )
-from launch_scripts.monitor.ground.layers import COST, KNOWN, PHOTO, legends
+from launch_scripts.monitor.ground.layers import COST, KNOWN, PHOTO, legends, nearest_legend, to_target_legend
 from launch_scripts.monitor.ground.legend import HEIGHT_PX, WIDTH_PX
 from launch_scripts.monitor.ground.map_margin import map_margin, said_heights
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
@@ -198,8 +198,9 @@ def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
 
 
 def test_every_layer_has_a_legend() -> None:
-    pictures = legends(colours_of(flat()), [PHOTO.entity, COST.entity, KNOWN.entity])
-    assert set(pictures) == {"photo", "cost", "known"}
+    pictures = legends(colours_of(flat()), [PHOTO, COST, KNOWN])
+    pictures["to"], pictures["nearest"] = to_target_legend("t0", 5400), nearest_legend(["t0", "t1"] * 9)
+    assert set(pictures) == {"photo", "cost", "known", "to", "nearest"}
     for picture in pictures.values():
         image = Image.open(io.BytesIO(picture)).convert("RGB")
         assert image.size == (WIDTH_PX, HEIGHT_PX)

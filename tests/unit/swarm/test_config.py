@@ -53,6 +53,7 @@ def refusal(text: str) -> str:
         ("[[cost.zones]]\nkind = 'road'", ["cost.zones[0]", "missing required field `polygon`"]),
         ("[[groups]]\nvehicles = 0", ["groups[0].vehicles", ">= 1", "found 0"]),
         ("[[groups]]\nvehicles = 2.5", ["groups[0].vehicles", "expected `int`, got `float`", "found 2.5"]),
+        ("[monitor]\nshow_target = 'u'", ["monitor.show_target is 'u', which is no target"]),
         ("[[groups]]\ntargets = ['u']\n[[targets]]\nname = 't'", ["groups: all chases 'u', which is no target"]),
         ("[[groups]]\ntargets = ['t']\n[[targets]]\ncount = 2", ["all chases 't'", "did you mean 't"]),
         ("[[groups]]\n[[groups]]", ["two groups share a name"]),
