@@ -11,7 +11,7 @@ import sys
 import time
 import types
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -160,7 +160,7 @@ class LocalSwarm:
                 endings.append(self._ended(running, process))
             elif running.due_s is not None and time.monotonic() >= running.due_s:
                 try:
-                    self._start(running)
+                    self._start(running, running.restarts + 1)
                     running.restarts += 1
                 except SwarmError as error:  # its folder cannot be written
                     wait_s = running.backoff.crashed(0.0)
@@ -204,12 +204,17 @@ class LocalSwarm:
                 running.process.join(1.0)
                 self._forget(running)
 
-    def _start(self, running: Running) -> None:
+    def _start(self, running: Running, restarts: int = 0) -> None:
         listen, tell = self._context.Pipe(duplex=False)
         spec = running.spec
         process = self._context.Process(
             target=run_child,
-            args=(spec.entry, self._setup_of(spec), self._log_dir / f"{spec.name}.log", tell),
+            args=(
+                spec.entry,
+                replace(self._setup_of(spec), restarts=restarts),
+                self._log_dir / f"{spec.name}.log",
+                tell,
+            ),
             name=spec.name,
             daemon=True,  # should the launcher itself fail, multiprocessing ends them
         )

@@ -16,8 +16,8 @@ from rich.text import Text
 from launch_scripts.launcher.busy_line import busy_line
 from launch_scripts.launcher.lasting_output import make_output_last
 from launch_scripts.launcher.live_table import live_table, plain_line
-from launch_scripts.report.recorder import LiveSummary
 from launch_scripts.report.results.certified_gap import gap_text
+from launch_scripts.report.run_state.state import RunState
 
 log = logging.getLogger(__name__)
 
@@ -89,14 +89,12 @@ class Terminal:
         """Whether it is time to show the next summary."""
         return time.monotonic() >= self._due_s
 
-    def show(
-        self, title: str, summary: LiveSummary, processes: Mapping[str, tuple[int, int]], restarts: int
-    ) -> None:
+    def show(self, title: str, state: RunState) -> None:
         self._due_s = time.monotonic() + (_DRAW_EVERY_S if self._table else _PLAIN_EVERY_S)
         if not self._table:
-            self.say(plain_line(summary, processes, restarts))
+            self.say(plain_line(state))
             return
-        table = live_table(summary, processes, restarts, title)
+        table = live_table(state, title)
         with contextlib.suppress(OSError):  # of a terminal that is gone
             if self._live is None:
                 self._live = Live(table, console=self._console, auto_refresh=False, transient=False)

@@ -6,7 +6,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,11 +28,12 @@ from launch_scripts.launcher.stop_signals import StopAsked
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
-from launch_scripts.launcher.what_is_left import what_is_left
+from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.run_folder import begin_run
+from launch_scripts.report.run_state.plan import plan_of_members
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
@@ -71,6 +72,7 @@ class UpOptions:
     began_s       time.monotonic() at which the command was given
     table         other processes than the scenario's
     metrics_port  where figures are served to Prometheus; 0 is any
+    record_inputs  of every process, for `swarm replay`
     """
 
     scenario: Scenario
@@ -83,6 +85,7 @@ class UpOptions:
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
     table: tuple[ProcessSpec, ...] | None = None
+    record_inputs: bool = False
     metrics_port: int | None = None
 
 
@@ -101,11 +104,11 @@ def run_swarm(options: UpOptions) -> int:
     check_plugins(options.scenario, options.roles)
     if not options.joins:
         check_ports(options.scenario, options.roles)
-    run_id = _run_id(options)
+    run_id, started_ns = _run_id(options)
     run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / "launcher.log")
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
-    return _Run(options, run_id, run_dir).run()
+    return _Run(options, run_id, run_dir, started_ns).run()
 
 
 def _table(options: UpOptions) -> list[ProcessSpec]:
@@ -119,28 +122,38 @@ def _table(options: UpOptions) -> list[ProcessSpec]:
     return table
 
 
-def _run_id(options: UpOptions) -> str:
-    """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario."""
+def _run_id(options: UpOptions) -> tuple[str, int | None]:
+    """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario. With
+    the id comes when the run began, if it runs already."""
     found: list[RunInfo] = []
     if options.joins:
         log_to(None)  # it may have to wait, and says so
         found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
-    if options.run_id is not None:
-        return options.run_id
-    if set(ROLES[1:]) <= set(options.roles) and options.rank is None:
-        return new_run_id()
-    return found[0].run_id if found else common_run_id(options.scenario)
+    whole = set(ROLES[1:]) <= set(options.roles) and options.rank is None
+    run_id = options.run_id
+    if run_id is None and whole:
+        run_id = new_run_id()
+    elif run_id is None:
+        run_id = found[0].run_id if found else common_run_id(options.scenario)
+    return run_id, plan_of_members(info for info in found if info.run_id == run_id).started_ns
+
+
+def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
+    """The processes that are started here, in words."""
+    return ", ".join(f"{every} {role}" for role, (_, every) in processes.items())
 
 
 class _Run:
     """A run in progress; all of it happens on the main thread."""
 
-    def __init__(self, options: UpOptions, run_id: str, run_dir: Path) -> None:
+    def __init__(self, options: UpOptions, run_id: str, run_dir: Path, started_ns: int | None) -> None:
         self._options = options
         self._scenario = as_process(options.scenario, LAUNCHER, "0")
         self._run_dir = run_dir
         self._run_id = run_id
-        self._started_ns = time.time_ns()
+        self._joined_ns = started_ns
+        """When the run began that this is a part of; None if it begins here."""
+        self._started_ns = started_ns or time.time_ns()
         self._book = OrderBook()
         """What operators have ordered, once somebody watches the swarm."""
         self._terminal = Terminal(options.as_json, options.plain)
@@ -149,6 +162,7 @@ class _Run:
         self._swarm = LocalSwarm(_table(options), self._setup_of, run_dir)
         self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
+        self._recorder: Recorder | None = None
         self._metrics = self._open_metrics()
         for sentence in begin_run(run_dir, options.scenario, run_id):
             self._terminal.say(sentence, "yellow")
@@ -158,7 +172,7 @@ class _Run:
             return None
         from launch_scripts.metrics.of_launcher import LauncherMetrics  # takes time to import
 
-        metrics = LauncherMetrics(self._options.metrics_port, self._run_id, self._scenario.name, self._started_ns)
+        metrics = LauncherMetrics(self._options.metrics_port, self._run_id, self._scenario.name)
         self._terminal.say(f"metrics at {metrics.url}")
         return metrics
 
@@ -187,6 +201,7 @@ class _Run:
             return self._stopped_early()
         log.info("kernels are loaded")
         failures: list[str] = []
+        self._started_ns = self._joined_ns or time.time_ns()
         try:
             if not self._options.joins and "router" in self._options.roles:
                 self._swarm.start("router")
@@ -199,7 +214,9 @@ class _Run:
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
                 self._say_begin()
-                watcher = Watcher(bus, Recorder(self._scenario, self._terrain.grid), MonotonicClock())
+                recorder = Recorder(self._scenario, self._terrain.grid, self._started_ns)
+                self._recorder = recorder
+                watcher = Watcher(bus, recorder, MonotonicClock())
                 watcher.begin()
                 try:
                     self._swarm.start()
@@ -248,6 +265,8 @@ class _Run:
             incarnation=next_life(self._run_dir, spec.role, spec.id),
             started_ns=self._started_ns,
             run_dir=self._run_dir,
+            record_inputs=self._options.record_inputs,
+            before=None if self._recorder is None else self._recorder.observed.newest_stats(spec.role, spec.id),
         )
 
     def _wait(self, text: Callable[[], str], done: Callable[[float], bool], within_s: float = 600.0) -> None:
@@ -278,10 +297,10 @@ class _Run:
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = time.monotonic()
-        self._book = watcher.book
+        self._book = watcher.recorder.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
-            ordered.look(watcher.book, watcher.alive, time.monotonic())
+            ordered.look(watcher.recorder.book, watcher.alive, time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S)
             self._tell(watcher)
@@ -324,7 +343,7 @@ class _Run:
 
     def _tell(self, watcher: Watcher) -> None:
         if self._metrics is not None:
-            self._metrics.answer(watcher.recorder.observed)
+            self._metrics.answer(watcher.recorder.observed, self._started_ns)
         if (sentence := self._disk.look(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
         if (compiled := self._warm_up.news()) is not None:
@@ -332,6 +351,7 @@ class _Run:
         for note in watcher.take_notes():
             if note.kind == "live_view":
                 self._terminal.say(f"live view: {note.text}", "bold")
+                self._terminal.say(f"from another computer: {tunnel(note.text)}, then the same address there")
             elif note.kind not in _QUIET_NOTES:
                 self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if self._terminal.due():
@@ -339,7 +359,7 @@ class _Run:
             title = f"{self._scenario.name}, {summary.elapsed_s:.0f} s" + (
                 f", live view {watcher.live_view}" if watcher.live_view else ""
             )
-            self._terminal.show(title, summary, self._swarm.by_role(), self._swarm.restarts)
+            self._terminal.show(title, summary)
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:
@@ -384,7 +404,7 @@ class _Run:
     def _say_begin(self) -> None:
         self._terminal.say(
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
-            f"{len(self._swarm.running)} processes"
+            f"{_counted(self._swarm.by_role())}"
         )
         for line in said_of(self._terrain):
             self._terminal.say(line)
@@ -397,8 +417,6 @@ class _Run:
             self._terrain,
             run_id=self._run_id,
             seconds=seconds,
-            processes=len(self._swarm.running),
-            restarts=self._swarm.restarts,
             startup_s=self._startup_s,
         )
         numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}

@@ -1,7 +1,8 @@
 """What a swarm says of itself, as metric families of OpenMetrics. Pure: no bus, no socket, no clock.
 
 Names follow the conventions of Prometheus: the prefix `swarm_`, base units (seconds, bytes, metres, ratios) at the
-end, `_total` on what only grows. A process starts again with its counts at zero, which `rate()` expects.
+end, `_total` on what only grows. A process that its launcher
+starts again goes on counting; one that was started by hand begins at zero, which `rate()` expects.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ _RENAMED = {
     "growths": "tree_growths",
     "growth_ms": "tree_growth_ms",
     "window_ms": "tree_window_growth_ms",
+    "cpu_s": "cpu_seconds",
 }
 """Counters, gauges and histograms whose names say little beside those of other programs."""
 _TAKEN = ("_total", "_count", "_sum", "_bucket", "_created", "_info", "_gcount", "_gsum")
@@ -83,6 +85,9 @@ HELP = {
     "saves_failed": "Writes that the keeper's store refused",
     "blocked_ticks": "Ticks at which a vehicle had to wait for another",
     "strangers": "Processes of another run, or with another terrain, that were heard",
+    "cpu_s": "CPU that the process has used",
+    "rss_bytes": "Memory that the process has in use, with what it shares",
+    "ended": "1 in the last figures of a process that ends as asked",
     "trackers_lost": "Times that a target's tracker fell silent",
 }
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.layers import shown_layers
@@ -49,7 +51,18 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             layers=layers,
         )
         process = Process(service, inbox, MonotonicClock(), FRAME_HZ)
+        sinks.tell_page(lambda: page_facts(setup, service, path))
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)
         process.run()
+
+
+def page_facts(setup: RoleSetup, service: MonitorService, recording: Path | None) -> dict[str, Any]:
+    """What the page says beside the view: how far the run is, and how to open its recording."""
+    return {
+        "life": f"{setup.incarnation:x}",
+        "at_s": service.at_s,
+        "over": service.over,
+        "recording": "" if recording is None else f"rerun {recording}",
+    }

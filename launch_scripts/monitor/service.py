@@ -43,10 +43,10 @@ from swarm.clock import NS_PER_S
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
+from swarm.runtime.stats import ENDED, Counters
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import CostReply, PlannerStatus
-from swarm.wire.messages.processes import Note
+from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
@@ -64,10 +64,13 @@ _TRAILS_NS = NS_PER_S // 2
 _ROUTES_NS = 3 * NS_PER_S // 2
 """Period in which the routes to every target are drawn once."""
 _ROUTES_SHOWN = 400
+_ENDED_KEPT = 4096
 _ROUTES_KEPT = 1 << 15
 """Vehicles whose routes are remembered. Beyond that all are forgotten: their agents never had so many."""
 _ANSWER_S = 5.0
 _ANNOUNCE_NS = NS_PER_S // 2
+_LAST_WORD_NS = NS_PER_S // 2
+"""So long after a process went its last figures are waited for, which say whether it was asked to end."""
 
 
 class MonitorService:
@@ -96,13 +99,15 @@ class MonitorService:
         zones: Sequence[Area] = (),
         layers: Sequence[Layer] = (),
     ) -> None:
-        self.recorder = Recorder(setup.scenario, terrain.grid)
+        self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
+        self.over = False
+        """Set for good by `stop`. Read by other threads, too."""
         self._setup = setup
         self._terrain = terrain
         self._bus = bus
         self._post = post
         self._live_url = live_url
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self.counters: Counters = self._member.counters
         cost_map = CostMap(terrain)
         replica = MapReplica(terrain.grid, cost_map)
@@ -133,6 +138,10 @@ class MonitorService:
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
+        self._gone: dict[Peer, int] = {}
+        """Processes that went and that nobody was told of yet, and when."""
+        self._ended: set[Peer] = set()
+        """Processes which said in their last figures that they end as they were asked to."""
         self._trails_due_ns = self._routes_due_ns = 0
         self._next_route_target = 0
         self._last_sample_s = -1.0
@@ -173,6 +182,8 @@ class MonitorService:
                 self._ground.hear_status(status)
             case Followed() as followed:
                 self._follow(followed)
+            case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
+                self._ended.add(Peer(stats.role, stats.id, stats.incarnation))
             case Note() as note:
                 self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
@@ -181,6 +192,7 @@ class MonitorService:
         self._sync.tick(now_ns)
         self._member.tick(now_ns)
         self._announce(now_ns)
+        self._tell_gone(now_ns - _LAST_WORD_NS)
         self._frame += 1
         self._drawing.set_time(self._frame, self._seconds())
         self._watch_recording(now_ns)
@@ -192,15 +204,34 @@ class MonitorService:
         self._draw_plots(now_ns)
 
     def stop(self, now_ns: int) -> None:
+        self._tell_gone(now_ns)
+        self.over = True
         self._member.publish_stats(now_ns)
+
+    @property
+    def at_s(self) -> float:
+        """Seconds since launch that the view has come to. Read by other threads, too."""
+        return self._seconds()
 
     # --- in -----------------------------------------------------------------------------------------------------
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         self.recorder.alive(peer, up, now_ns)
-        if now_ns - self._started_ns > 2 * NS_PER_S:  # those that were there before are not news
-            text = f"{peer.role} {peer.id} is {'up' if up else 'gone'}"
-            self._drawing.note(text, "INFO" if up else "WARN")
+        if now_ns - self._started_ns <= 2 * NS_PER_S:  # those that were there before are not news
+            return
+        if up:
+            self._gone.pop(peer, None)
+            self._drawing.note(f"{peer.role} {peer.id} is up", "INFO")
+        else:
+            self._gone[peer] = now_ns
+
+    def _tell_gone(self, until_ns: int) -> None:
+        """Tells who went: a moment later, as a process's last word may come after it."""
+        for peer in [peer for peer, at_ns in self._gone.items() if at_ns <= until_ns]:
+            del self._gone[peer]
+            ended = peer in self._ended
+            text = f"{peer.role} {peer.id} {'has ended as asked' if ended else 'is gone'}"
+            self._drawing.note(text, "INFO" if ended else "WARN")
 
     def _follow(self, followed: Followed) -> None:
         cells = cells_along(self._terrain.grid, followed.start, followed.directions)

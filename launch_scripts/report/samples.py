@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ class Sample:
     marks: int | None
     reroute_requests: int | None
     routes_served: int | None
-    messages: int
+    messages_per_s: float | None
     alive: int
     gaps: dict[str, float]
     growth_ms: dict[str, float]
@@ -54,9 +53,5 @@ class Samples:
 
 
 def messages_per_s(samples: Sequence[Sample]) -> list[tuple[float, float]]:
-    """(time, rate) between successive samples, from the first published count on."""
-    return [
-        (late.time_s, max(late.messages - early.messages, 0) / (late.time_s - early.time_s))
-        for early, late in itertools.pairwise(samples)
-        if late.time_s > early.time_s and early.messages > 0
-    ]
+    """(time, rate) of the samples in which the processes had said what they send."""
+    return [(sample.time_s, sample.messages_per_s) for sample in samples if sample.messages_per_s is not None]

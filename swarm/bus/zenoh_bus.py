@@ -32,6 +32,7 @@ from swarm.bus.bus import (
     newest_of,
 )
 from swarm.bus.endpoints import listening, wait_for_router
+from swarm.bus.open_errors import why_not_listening, why_unreachable
 from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_threads import attached, guarded, says_json, taken_after, taken_from, timeout_of, waiting_in
@@ -85,10 +86,12 @@ def open_bus(
     except zenoh.ZError as error:
         if patient and not any(map(listening, endpoints)):
             return open_bus(network, patient=True, authenticator=authenticator)
-        reason = str(error).split(" at /")[0]
-        what = "listen on" if mode == "router" else "reach a router at"
-        hint = "is the port taken?" if mode == "router" else "is `swarm router` running there?"
-        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason} ({hint})") from error
+        log.info("zenoh says: %s", error)
+        if mode == "router":
+            what, reason = "listen on", why_not_listening(error)
+        else:
+            what, reason = "reach a router at", why_unreachable(endpoints, encrypted=network.tls is not None)
+        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason}") from error
 
 
 class ZenohBus:
@@ -173,15 +176,7 @@ class ZenohBus:
                 post(heard)
 
         def arrive_together(samples: list[zenoh.Sample]) -> None:
-            keyed = list(self._packed(topic, samples))
-            keys = [key for key, _ in keyed]
-            decoded = decode_many([payload for _, payload in keyed], topic.message)
-            heard: list[tuple[str, Message]] = []
-            for key, message in zip(keys, decoded, strict=True):
-                if isinstance(message, ProtocolError):
-                    self._drop(key, message)
-                else:
-                    heard.append((key[len(self._namespace) + 1 :], message))
+            heard = self._together(topic, samples)
             if heard:
                 post(HeardMany(topic, heard))
 
@@ -207,6 +202,25 @@ class ZenohBus:
         heard: list[Heard] = []
         for subscriber in self._collecting.get(topic.name, ()):
             heard += self._newest(topic, taken_from(subscriber.handler, topic.buffer))
+        return heard
+
+    def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
+        samples: list[zenoh.Sample] = []
+        for subscriber in self._collecting.get(topic.name, ()):
+            samples += taken_from(subscriber.handler, topic.buffer)
+        return self._together(topic, samples) if samples else []
+
+    def _together(self, topic: Topic, samples: list[zenoh.Sample]) -> list[tuple[str, Message]]:
+        """Keys below the namespace and messages of samples, without those that are rejected."""
+        keyed = list(self._packed(topic, samples))
+        keys = [key for key, _ in keyed]
+        decoded = decode_many([payload for _, payload in keyed], topic.message)
+        heard: list[tuple[str, Message]] = []
+        for key, message in zip(keys, decoded, strict=True):
+            if isinstance(message, ProtocolError):
+                self._drop(key, message)
+            else:
+                heard.append((key[len(self._namespace) + 1 :], message))
         return heard
 
     def _newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:

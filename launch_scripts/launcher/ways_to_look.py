@@ -1,9 +1,12 @@
-"""What a run has left on the disk, and how to look at it: the last lines of a launcher."""
+"""How to look at a run: the commands that a launcher names."""
 
 from __future__ import annotations
 
+import os
 import shutil
+import socket
 import sys
+import urllib.parse
 from pathlib import Path
 
 _FILES = (("report", "report.json"), ("report", "report.html"), ("picture", "report.png"))
@@ -25,6 +28,12 @@ def rerun_command() -> str:
     """How to call rerun's viewer from where this command was called."""
     beside = Path(sys.executable).with_name("rerun")
     return "rerun" if shutil.which("rerun") or not beside.exists() else shown(beside)
+
+
+def tunnel(page: str) -> str:
+    """How to reach a page of this machine from another one."""
+    port = urllib.parse.urlsplit(page).port
+    return f"ssh -N -L {port}:127.0.0.1:{port} {os.environ.get('USER', 'USER')}@{socket.gethostname()}"
 
 
 def shown(path: Path) -> str:
