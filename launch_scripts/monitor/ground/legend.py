@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import io
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from launch_scripts.monitor.ground import ground_colours as colours
 from launch_scripts.monitor.movers.points import (
@@ -22,9 +23,12 @@ from swarm.wire.messages.vehicles import VehicleState
 
 BACKGROUND = (17, 22, 28)
 WIDTH_PX, HEIGHT_PX = 1840, 132
-_DPI = 200
-_TEXT = "#dfe3e8"
-_ROWS = 3
+_TEXT = (223, 227, 232)
+_ROWS, _ROW_PX, _TOP_PX = 3, 36, 31
+_SIZE_PX, _SWATCH_PX, _GAP_PX = 22, (42, 20), 34
+_LEFT_PX, _SCALE_PX = 14, 580
+_FINE = 4
+"""Shapes are drawn so many times as large, and then made smaller, so that their edges are smooth."""
 
 Colour = tuple[int, ...]
 
@@ -40,9 +44,9 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """A bar with the colours of a colour map of matplotlib, and texts evenly along it."""
+    """A bar of colours, evenly between those named, and texts evenly along it."""
 
-    colour_map: str
+    colours: tuple[str, ...]
     title: str
     texts: tuple[str, ...]
 
@@ -91,60 +95,49 @@ KNOWN_OR_NOT = (
 @functools.lru_cache(maxsize=16)
 def legend_picture(entries: tuple[Entry, ...], scale: Scale | None = None) -> bytes:
     """A PNG of `WIDTH_PX` x `HEIGHT_PX`."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH_PX / _DPI, HEIGHT_PX / _DPI), dpi=_DPI, facecolor=_shares(BACKGROUND))
-    left = 0.006
+    image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), BACKGROUND)
+    draw = ImageDraw.Draw(image)
+    font = ImageFont.load_default(_SIZE_PX)
+    left = float(_LEFT_PX)
     if scale is not None:
-        _draw_scale(figure, scale)
-        left = 0.36
-    figure.legend(
-        handles=[_handle(entry) for entry in entries], loc="center left", bbox_to_anchor=(left, 0.5),
-        ncol=-(-len(entries) // _ROWS), frameon=False, labelcolor=_TEXT, fontsize=8, handlelength=1.9,
-        handleheight=0.9, columnspacing=1.6, borderaxespad=0, borderpad=0, handletextpad=0.6, labelspacing=0.55,
-    )  # fmt: skip
+        _draw_scale(image, draw, scale)
+        left += _SCALE_PX + 2 * _GAP_PX
+    for first in range(0, len(entries), _ROWS):
+        column = entries[first : first + _ROWS]
+        for row, entry in enumerate(column):
+            middle = _TOP_PX + row * _ROW_PX
+            image.paste(_swatch(entry), (round(left), middle - _SWATCH_PX[1] // 2))
+            draw.text((left + _SWATCH_PX[0] + 12, middle), entry.text, _TEXT, font, anchor="lm")
+        left += _SWATCH_PX[0] + 12 + max(font.getlength(entry.text) for entry in column) + _GAP_PX
     file = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(file)  # type: ignore[no-untyped-call]
+    image.save(file, "PNG")
     return file.getvalue()
 
 
-def _handle(entry: Entry) -> Any:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    colour, text = _shares(entry.colour), entry.text
+def _swatch(entry: Entry) -> Image.Image:
+    width, height = (_FINE * side for side in _SWATCH_PX)
+    image = Image.new("RGB", (width, height), BACKGROUND)
+    draw = ImageDraw.Draw(image)
     match entry.shape:
         case "fill":
-            return Patch(facecolor=colour, edgecolor=_TEXT, linewidth=0.3, label=text)
+            draw.rectangle((0, 0, width - 1, height - 1), entry.colour, _TEXT, _FINE // 2)
         case "hatch":
-            return Patch(facecolor=(0.1, 0.11, 0.13), edgecolor=colour, hatch="/////", linewidth=0.6, label=text)
+            for start in range(-height, width, height // 2):
+                draw.line((start, height, start + height, 0), entry.colour, 2 * _FINE)
+            draw.rectangle((0, 0, width - 1, height - 1), None, entry.colour, _FINE)
         case "line":
-            return Line2D([], [], color=colour, linewidth=1.8, label=text)
+            draw.line((0, height // 2, width, height // 2), entry.colour, 4 * _FINE)
         case "ball":
-            return Line2D([], [], color="none", marker="o", markersize=6.5, markerfacecolor=colour,
-                          markeredgecolor="none", label=text)  # fmt: skip
+            draw.ellipse(((width - height) // 2, 0, (width + height) // 2, height), entry.colour)
+    return image.resize(_SWATCH_PX, Image.Resampling.LANCZOS)
 
 
-def _draw_scale(figure: Any, scale: Scale) -> None:
-    axes = figure.add_axes((0.012, 0.42, 0.31, 0.2))
-    axes.imshow(
-        np.linspace(0, 1, 256)[None],
-        cmap=scale.colour_map,
-        aspect="auto",
-        extent=(0, 1, 0, 1),
-        interpolation="nearest",
-    )
-    axes.set_yticks([])
-    axes.set_xticks(np.linspace(0, 1, len(scale.texts)), scale.texts, color=_TEXT, fontsize=7.5)
-    axes.tick_params(length=2, pad=2, color=_TEXT)
-    for label, side in zip((axes.get_xticklabels()[0], axes.get_xticklabels()[-1]), ("left", "right"), strict=True):
-        label.set_horizontalalignment(side)
-    axes.set_title(scale.title, color=_TEXT, fontsize=8, loc="left", pad=3)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def _shares(colour: Colour) -> tuple[float, float, float]:
-    red, green, blue = (value / 255 for value in colour)
-    return red, green, blue
+def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, scale: Scale) -> None:
+    small, font = ImageFont.load_default(_SIZE_PX - 2), ImageFont.load_default(_SIZE_PX)
+    draw.text((_LEFT_PX, _TOP_PX), scale.title, _TEXT, font, anchor="lm")
+    bar = colours.between(scale.colours, _SCALE_PX).astype(np.uint8)
+    image.paste(Image.fromarray(np.repeat(bar[None], 26, axis=0)), (_LEFT_PX, _TOP_PX + _ROW_PX - 16))
+    for n, text in enumerate(scale.texts):
+        share = n / (len(scale.texts) - 1)
+        anchor = "lm" if n == 0 else "rm" if share == 1 else "mm"
+        draw.text((_LEFT_PX + share * _SCALE_PX, _TOP_PX + 2 * _ROW_PX - 6), text, _TEXT, small, anchor=anchor)

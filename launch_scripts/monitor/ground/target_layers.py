@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from launch_scripts.monitor.ground.cost_to_go import CostSamples, coarse_tree, full_scale_s, nearest_target, spread
-from launch_scripts.monitor.ground.ground_colours import COST_TO_GO_COLOURS, UNREACHED, GroundColours, colours_of
+from launch_scripts.monitor.ground.ground_colours import COST_TO_GO_COLOURS, UNREACHED, GroundColours, between
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.report.pictures import palette
 
@@ -42,7 +42,7 @@ class TargetPictures:
             ((np.arange(max(1, round(side * share))) + 0.5) / max(1, round(side * share)) * side).astype(np.intp)
             for side in (grid.rows, grid.cols)
         )
-        self._palette = colours_of(COST_TO_GO_COLOURS, 256)
+        self._palette = between(COST_TO_GO_COLOURS, 256)
         self.full_s = 0.0
 
     def to_target(self, target: str) -> Bytes:
