@@ -24,6 +24,7 @@ from launch_scripts.monitor.ground.target_layers import TargetPictures
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.ground.windows import window_outlines
 from launch_scripts.monitor.ground.zones import Area, closed_cells, ordered_areas
+from launch_scripts.monitor.movers.looks import Look
 from launch_scripts.monitor.serving.sinks import Streams
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
@@ -65,6 +66,7 @@ class GroundView:
     zones    those of the scenario
     layers   tabs of the view
     targets  in order of their colours
+    movers   what the legends say of all that moves
     """
 
     def __init__(
@@ -78,8 +80,10 @@ class GroundView:
         targets: Sequence[str],
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
+        movers: Sequence[Look] = (),
     ) -> None:
         self._mesh, self._cost_map, self._replica, self._zones = mesh, cost_map, replica, list(zones)
+        self._movers = movers
         self._cells = terrain.grid.cells
         self._drawing = GroundDrawing(rec, mesh)
         self._colours = colours = GroundColours(mesh, terrain, cost_map.ground_s_per_m, truth)
@@ -106,9 +110,9 @@ class GroundView:
         """Draws all of it."""
         tiled = [each.layer.entity for each in self._layers if each.layer is not PHOTO]
         wholes = [layer.entity for layer in self._shown if layer not in (each.layer for each in self._layers)]
-        self._drawing.begin(tiled, wholes, legends(self._colours, self._shown), self._zones)
+        self._drawing.begin(tiled, wholes, legends(self._colours, self._shown, self._movers), self._zones)
         if NEAREST in self._shown:
-            self._drawing.legend(NEAREST.name, nearest_legend(self._target_ids))
+            self._drawing.legend(NEAREST.name, nearest_legend(self._target_ids, self._movers))
         self._pictures.full_s = 0.0  # so that the next answer draws a legend
         self._drawing.ordered(self._ordered)
         for layer in self._layers:
@@ -169,7 +173,7 @@ class GroundView:
         tree = self._pictures.tree(target)
         self._drawing.tree(layer.entity, tree.lines, tree.radii)
         if self._pictures.full_s != before_s:
-            self._drawing.legend(layer.name, to_target_legend(target, self._pictures.full_s))
+            self._drawing.legend(layer.name, to_target_legend(target, self._pictures.full_s, self._movers))
 
     def _draw_ordered(self, now_ns: int) -> None:
         """Draws operators' zones when they change, and now and then for viewers that join late."""

@@ -8,21 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from launch_scripts.monitor.ground.cost_to_go import unit_of
-from launch_scripts.monitor.ground.ground_colours import COST_COLOURS, COST_TO_GO_COLOURS, UNREACHED, GroundColours
+from launch_scripts.monitor.ground.ground_colours import COST_COLOURS, COST_TO_GO_COLOURS, GroundColours
 from launch_scripts.monitor.ground.ground_drawing import PHOTO as PHOTO_ENTITY
 from launch_scripts.monitor.ground.legend import (
     CLOSED,
     FOUND,
     KNOWN_OR_NOT,
     LETHAL_COST,
-    LINES,
-    MOVERS,
     TO_TARGET,
-    Entry,
+    WINDOW,
     Scale,
     legend_picture,
 )
-from launch_scripts.report.pictures import palette
+from launch_scripts.monitor.movers.looks import HUES, Look
 from swarm.config.scenario import Scenario
 
 
@@ -66,31 +64,30 @@ def shown_layers(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
     return shown
 
 
-def legends(colours: GroundColours, shown: Sequence[Layer]) -> dict[str, bytes]:
-    """Name -> PNG, of those layers whose legend stays as it is."""
+def legends(colours: GroundColours, shown: Sequence[Layer], movers: Sequence[Look] = ()) -> dict[str, bytes]:
+    """Name -> PNG, of those layers whose legend stays as it is.
+
+    movers  what it says of all that moves
+    """
     scales = {COST.name: _cost_scale(colours)}
     return {
-        layer.name: legend_picture((*entries, *MOVERS, *LINES), scales.get(layer.name))
+        layer.name: legend_picture((*entries, WINDOW, *movers), scales.get(layer.name))
         for layer, entries in _ENTRIES.items()
         if layer in shown
     }
 
 
-def to_target_legend(target: str, full_s: float) -> bytes:
+def to_target_legend(target: str, full_s: float, movers: Sequence[Look] = ()) -> bytes:
     """PNG of the legend of a cost-to-go, of which so much is at the end of the scale."""
     unit, unit_s = unit_of(full_s)
     texts = tuple(f"{full_s * n / 5 / unit_s:.3g}" for n in range(6))
-    return legend_picture((*TO_TARGET, *MOVERS, *LINES), Scale(COST_TO_GO_COLOURS, f"{unit} to {target}", texts))
+    return legend_picture((*TO_TARGET, WINDOW, *movers), Scale(COST_TO_GO_COLOURS, f"{unit} to {target}", texts))
 
 
-def nearest_legend(targets: Sequence[str]) -> bytes:
-    """PNG of the legend of territories."""
-    named = [
-        Entry("fill", palette.rgb(colour), f"nearest: {t}")
-        for t, colour in zip(targets, palette.SERIES, strict=False)
-    ]
-    more = [Entry("fill", UNREACHED, "none; colours repeat")] if len(targets) > len(named) else []
-    return legend_picture((*named, *more, *MOVERS))
+def nearest_legend(targets: Sequence[str], movers: Sequence[Look] = ()) -> bytes:
+    """PNG of the legend of territories: of as many targets as there are colours."""
+    named = [Look("fill", hue, f"nearest: {target}") for target, hue in zip(targets, HUES, strict=False)]
+    return legend_picture((*named, WINDOW, *movers))
 
 
 def _cost_scale(colours: GroundColours) -> Scale:

@@ -5,41 +5,23 @@ from __future__ import annotations
 import functools
 import io
 from dataclasses import dataclass
-from typing import Literal
+from typing import assert_never
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from launch_scripts.monitor.ground import ground_colours as colours
-from launch_scripts.monitor.movers.points import (
-    BODY_COLOUR,
-    ROUTE_COLOUR,
-    STATE_COLOURS,
-    TARGET_COLOUR,
-    TRAIL_COLOUR,
-)
+from launch_scripts.monitor.movers.looks import Colour, Look
 from launch_scripts.report.pictures import palette
-from swarm.wire.messages.vehicles import VehicleState
 
 BACKGROUND = (17, 22, 28)
-WIDTH_PX, HEIGHT_PX = 1840, 132
+WIDTH_PX, HEIGHT_PX = 1840, 156
 _TEXT = (223, 227, 232)
-_ROWS, _ROW_PX, _TOP_PX = 3, 36, 31
-_SIZE_PX, _SWATCH_PX, _GAP_PX = 22, (42, 20), 34
-_LEFT_PX, _SCALE_PX = 14, 580
+_ROWS, _ROW_PX, _TOP_PX = 5, 29, 20
+_SIZE_PX, _SWATCH_PX, _GAP_PX = 21, (40, 18), 30
+_LEFT_PX, _SCALE_PX = 14, 420
 _FINE = 4
 """Shapes are drawn so many times as large, and then made smaller, so that their edges are smooth."""
-
-Colour = tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One line of a legend: a filled or hatched patch, a line, a ball, or a bar of colours from `low` to `high`."""
-
-    shape: Literal["fill", "hatch", "line", "ball"]
-    colour: Colour
-    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +33,7 @@ class Scale:
     texts: tuple[str, ...]
 
 
-MOVERS = (
-    Entry("ball", STATE_COLOURS[VehicleState.FOLLOWING], "vehicle following"),
-    Entry("ball", STATE_COLOURS[VehicleState.WAITING], "waiting"),
-    Entry("ball", STATE_COLOURS[VehicleState.ARRIVED], "arrived"),
-    Entry("ball", TARGET_COLOUR, "target"),
-    Entry("ball", BODY_COLOUR, "body to keep off"),
-)
-LINES = (
-    Entry("line", ROUTE_COLOUR, "route"),
-    Entry("line", TRAIL_COLOUR, "trail"),
-    Entry("line", colours.WINDOW, "part grown last"),
-)
+WINDOW = Look("line", colours.WINDOW, "part grown last")
 ZONE_COLOURS: dict[str, Colour] = {
     "no-go": colours.NO_GO,
     "slow": colours.SLOW_MARK,
@@ -70,30 +41,30 @@ ZONE_COLOURS: dict[str, Colour] = {
     "pace": palette.rgb(palette.PINK),
 }
 CLOSED = (
-    Entry("hatch", colours.HATCH, "known to be lethal"),
-    Entry("hatch", colours.NO_GO, "no-go zone"),
+    Look("hatch", colours.HATCH, "known to be lethal"),
+    Look("hatch", colours.NO_GO, "no-go zone"),
 )
 FOUND = (
-    Entry("fill", colours.LETHAL_MARK, "found lethal"),
-    Entry("fill", colours.SLOW_MARK, "found slow"),
-    Entry("fill", colours.FAST_MARK, "found quick"),
+    Look("fill", colours.LETHAL_MARK, "found lethal"),
+    Look("fill", colours.SLOW_MARK, "found slow"),
+    Look("fill", colours.FAST_MARK, "found quick"),
 )
 TO_TARGET = (
-    Entry("line", colours.TREE, "where the cost falls most"),
-    Entry("fill", colours.UNREACHED, "no way from here"),
-    Entry("fill", colours.LETHAL_PRIOR, "lethal"),
+    Look("line", colours.TREE, "where the cost falls most"),
+    Look("fill", colours.UNREACHED, "no way from here"),
+    Look("fill", colours.LETHAL_PRIOR, "lethal"),
 )
-LETHAL_COST = Entry("fill", colours.LETHAL_PRIOR, "found lethal")
+LETHAL_COST = Look("fill", colours.LETHAL_PRIOR, "found lethal")
 KNOWN_OR_NOT = (
-    Entry("fill", colours.FOUND, "hidden, and found"),
-    Entry("fill", colours.STILL_HIDDEN_LETHAL, "lethal, not yet found"),
-    Entry("fill", colours.STILL_HIDDEN_SLOW, "slower or quicker, not yet found"),
-    Entry("fill", colours.OVERRULED, "marked or ordered, yet not so"),
+    Look("fill", colours.FOUND, "hidden, and found"),
+    Look("fill", colours.STILL_HIDDEN_LETHAL, "lethal, not yet found"),
+    Look("fill", colours.STILL_HIDDEN_SLOW, "slower or quicker, not yet found"),
+    Look("fill", colours.OVERRULED, "marked or ordered, yet not so"),
 )
 
 
 @functools.lru_cache(maxsize=16)
-def legend_picture(entries: tuple[Entry, ...], scale: Scale | None = None) -> bytes:
+def legend_picture(entries: tuple[Look, ...], scale: Scale | None = None) -> bytes:
     """A PNG of `WIDTH_PX` x `HEIGHT_PX`."""
     image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), BACKGROUND)
     draw = ImageDraw.Draw(image)
@@ -107,37 +78,51 @@ def legend_picture(entries: tuple[Entry, ...], scale: Scale | None = None) -> by
         for row, entry in enumerate(column):
             middle = _TOP_PX + row * _ROW_PX
             image.paste(_swatch(entry), (round(left), middle - _SWATCH_PX[1] // 2))
-            draw.text((left + _SWATCH_PX[0] + 12, middle), entry.text, _TEXT, font, anchor="lm")
-        left += _SWATCH_PX[0] + 12 + max(font.getlength(entry.text) for entry in column) + _GAP_PX
+            draw.text((left + _SWATCH_PX[0] + 12, middle), entry.meaning, _TEXT, font, anchor="lm")
+        left += _SWATCH_PX[0] + 12 + max(font.getlength(entry.meaning) for entry in column) + _GAP_PX
     file = io.BytesIO()
     image.save(file, "PNG")
     return file.getvalue()
 
 
-def _swatch(entry: Entry) -> Image.Image:
+def _swatch(look: Look) -> Image.Image:
     width, height = (_FINE * side for side in _SWATCH_PX)
     image = Image.new("RGB", (width, height), BACKGROUND)
     draw = ImageDraw.Draw(image)
-    match entry.shape:
+    middle, radius, colour, thick = width // 2, height // 2, look.colour, 2 * _FINE
+    square = (middle - radius, 0, middle + radius - 1, height - 1)
+    match look.shape:
         case "fill":
-            draw.rectangle((0, 0, width - 1, height - 1), entry.colour, _TEXT, _FINE // 2)
+            draw.rectangle((0, 0, width - 1, height - 1), colour, _TEXT, _FINE // 2)
         case "hatch":
             for start in range(-height, width, height // 2):
-                draw.line((start, height, start + height, 0), entry.colour, 2 * _FINE)
-            draw.rectangle((0, 0, width - 1, height - 1), None, entry.colour, _FINE)
+                draw.line((start, height, start + height, 0), colour, thick)
+            draw.rectangle((0, 0, width - 1, height - 1), None, colour, _FINE)
         case "line":
-            draw.line((0, height // 2, width, height // 2), entry.colour, 4 * _FINE)
+            draw.line((0, radius, width, radius), colour, 2 * thick)
         case "ball":
-            draw.ellipse(((width - height) // 2, 0, (width + height) // 2, height), entry.colour)
+            draw.ellipse(square, colour)
+        case "ring":
+            draw.ellipse(square, None, colour, thick)
+        case "box":
+            draw.rectangle(square, None, colour, thick)
+        case "disc":
+            draw.ellipse((middle - 3 * radius // 2, radius // 2, middle + 3 * radius // 2, 3 * radius // 2), colour)
+        case "pin":
+            draw.line((middle, radius // 2, middle, height), colour, thick)
+            draw.ellipse((middle - radius // 2, 0, middle + radius // 2, radius), colour)
+        case _:
+            assert_never(look.shape)
     return image.resize(_SWATCH_PX, Image.Resampling.LANCZOS)
 
 
 def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, scale: Scale) -> None:
     small, font = ImageFont.load_default(_SIZE_PX - 2), ImageFont.load_default(_SIZE_PX)
-    draw.text((_LEFT_PX, _TOP_PX), scale.title, _TEXT, font, anchor="lm")
+    top = HEIGHT_PX // 2 - 42
+    draw.text((_LEFT_PX, top), scale.title, _TEXT, font, anchor="lm")
     bar = colours.between(scale.colours, _SCALE_PX).astype(np.uint8)
-    image.paste(Image.fromarray(np.repeat(bar[None], 26, axis=0)), (_LEFT_PX, _TOP_PX + _ROW_PX - 16))
+    image.paste(Image.fromarray(np.repeat(bar[None], 28, axis=0)), (_LEFT_PX, top + 20))
     for n, text in enumerate(scale.texts):
         share = n / (len(scale.texts) - 1)
         anchor = "lm" if n == 0 else "rm" if share == 1 else "mm"
-        draw.text((_LEFT_PX + share * _SCALE_PX, _TOP_PX + 2 * _ROW_PX - 6), text, _TEXT, small, anchor=anchor)
+        draw.text((_LEFT_PX + share * _SCALE_PX, top + 66), text, _TEXT, small, anchor=anchor)

@@ -10,14 +10,14 @@ import numpy as np
 from launch_scripts.monitor.ground.cost_to_go import CostSamples, coarse_tree, full_scale_s, nearest_target, spread
 from launch_scripts.monitor.ground.ground_colours import COST_TO_GO_COLOURS, UNREACHED, GroundColours, between
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.report.pictures import palette
+from launch_scripts.monitor.movers.looks import HUES
 
 _PIXELS = 160
 """Of a picture's longer side: some for each sample, so that slopes are smooth."""
 _BANDS = 10
 _SHOWN_PERCENT = 97
 """Of the places lie within the scale: a few that are far off must not take half of it."""
-_SERIES = np.array([palette.rgb(colour) for colour in palette.SERIES], np.float32)
+_HUES = np.array(HUES, np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,10 +72,10 @@ class TargetPictures:
         return Tree(lines, -radii.astype(np.float32))
 
     def territories(self, order: Sequence[str]) -> Bytes:
-        """Which target each place is nearest to in cost, in the colours of the targets' plots."""
+        """Which target each place is nearest to in cost, in the colours that targets have in the plots."""
         costs: Mapping[str, Floats] = {t: self._spread(each) for t, each in self._samples.costs_s.items()}
         nearest = nearest_target(dict(costs), list(order))
-        pixels = _SERIES[nearest % len(_SERIES)]
+        pixels = _HUES[nearest % len(_HUES)]
         pixels[nearest < 0] = UNREACHED
         return self._colours.on_relief(pixels, self._rows, self._cols)
 

@@ -10,13 +10,10 @@ ORANGE, SKY, PINK, VIOLET = "#E69F00", "#56B4E9", "#CC79A7", "#4a1486"
 YELLOW, BLACK, GREY = "#FFD21F", "#1b1b1b", "#b8bcc0"
 INK, FAINT, RULE = "#22272e", "#6b7480", "#d5dade"
 
-SERIES = (
-    *(SKY, ORANGE, GREEN, "#F0E442", PINK, "#D55E00", "#8DA0CB", "#66C2A5"),
-    *("#E5C494", "#B3B3B3", "#A6D854", "#FC8D62"),
-)
-"""Of lines that belong to one target each, in order of the targets; after the last the first again."""
-
 MARKED_LETHAL, MARKED_SLOW = VIOLET, ORANGE
+LETHAL_GROUND, FORBIDDEN = "#39404a", YELLOW
+GROUPS = (GREEN, BLUE, PINK, SKY, BLACK)
+"""Of groups, in the scenario's order; then from the first again."""
 STATE_COLOURS = {
     VehicleState.FOLLOWING: GREEN,
     VehicleState.ARRIVED: BLUE,
