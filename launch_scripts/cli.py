@@ -151,7 +151,8 @@ def _up(
     import msgspec
 
     from launch_scripts.launcher import options
-    from launch_scripts.launcher.up import UpOptions, run_swarm
+    from launch_scripts.launcher.up import run_swarm
+    from launch_scripts.launcher.up_options import UpOptions
     from launch_scripts.process_table import ROLES
     from swarm.errors import ConfigError
 

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import json
-import time
-from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, spread
-from swarm.places import extent_of, fields_of, written
+from swarm.places import written
 
 if TYPE_CHECKING:
-    from launch_scripts.report.results.certified_gap import CertifiedGap
-    from shared_map.terrain.places import MapFrame
     from swarm.config.scenario import NetworkConfig
-    from swarm.wire.messages.planning import PlannerStatus
-    from swarm.wire.messages.processes import RunInfo, Stats
 
 app = typer.Typer()
 
@@ -33,8 +27,33 @@ _STATUS_LISTEN_S = 1.5
 class Where:
     """Router and namespace of the swarm that a command asks."""
 
-    connect: Annotated[str, typer.Option(help="The router's endpoint.")] = "tcp/127.0.0.1:7447"
-    namespace: Annotated[str, typer.Option(help="Prefix of all keys.")] = "swarm"
+    connect: Annotated[
+        str | None,
+        typer.Option(
+            help="The router's endpoint; if not given, that of the newest run here, or tcp/127.0.0.1:7447."
+        ),
+    ] = None
+    namespace: Annotated[
+        str | None, typer.Option(help="Prefix of all keys; if not given, that of the run, or `swarm`.")
+    ] = None
+    run: Annotated[
+        str | None, typer.Option(help="The run to ask, where several run here: its name in --runs, or its folder.")
+    ] = None
+    runs: Annotated[Path, typer.Option(help="Folder of the runs of this machine.")] = Path("runs")
+
+    @cached_property
+    def _found(self) -> NetworkConfig:
+        from launch_scripts.commands.running.find_swarm import check_alone, find_swarm
+        from swarm.config.scenario import NetworkConfig
+
+        check_alone(self.connect, self.run)
+        if self.connect is not None:
+            return NetworkConfig()
+        found = find_swarm(self.runs, self.run)
+        if found.others:
+            told = ", ".join(found.others[:3])
+            typer.echo(f"asking run {found.run}, the newest; also running: {told} (--run NAME)", err=True)
+        return found.network
 
     def network(self, tls: Tls) -> NetworkConfig:
         import msgspec
@@ -43,12 +62,18 @@ class Where:
         from launch_scripts.process_table import LAUNCHER
         from swarm.config.scenario import Scenario
 
-        chosen = with_network(Scenario(), connect=self.connect, namespace=self.namespace, tls=tls.config())
+        chosen = with_network(
+            msgspec.structs.replace(Scenario(), network=self._found),
+            connect=self.connect,
+            namespace=self.namespace,
+            tls=tls.config(),
+        )
         network = as_process(chosen, LAUNCHER, "0").network
         return msgspec.structs.replace(network, connect_timeout_s=_CONNECT_S)
 
     def __str__(self) -> str:
-        return f"in namespace {self.namespace!r} at {self.connect}"
+        endpoint = self.connect or ", ".join(self._found.connect)
+        return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -125,7 +150,6 @@ def _route_on_terrain(
     from launch_scripts.commands.routes.route_files import profile_of, write_route
     from launch_scripts.commands.terrain.route_on_terrain import find_route
     from shared_map.terrain.places import MapFrame
-    from swarm.places import written
 
     found = find_route(terrain, start, end, preset)
     if out is not None:
@@ -150,208 +174,35 @@ def _route_on_terrain(
 @app.command(rich_help_panel=_PANEL)
 @spread
 def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Show who takes part in the running swarm and how the planners are doing."""
-    from launch_scripts.commands.run_frame import frame_of_members
-    from launch_scripts.launcher.watcher import ask_run
-    from launch_scripts.report.results.certified_gap import certified_gap, gaps_to
-    from launch_scripts.report.results.counts import Counts
-    from swarm.bus.bus import Heard
-    from swarm.bus.zenoh_bus import open_bus
-    from swarm.errors import BusError
-    from swarm.order_book import OrderBook
-    from swarm.runtime.inbox import Inbox
-    from swarm.wire.messages.orders import Orders
-    from swarm.wire.messages.planning import PlannerStatus
-    from swarm.wire.messages.processes import Beat, Stats
-    from swarm.wire.topics import LEAD, ORDERS, STATS, STATUS
+    """Show who takes part in the running swarm, how it is doing, and what is ordered.
 
-    inbox = Inbox()
-    book = OrderBook()
-    counts = Counts()
-    stats: dict[tuple[str, str], Stats] = {}
-    planners: dict[str, PlannerStatus] = {}
-    leads: dict[tuple[str, str], bool] = {}
-    with open_bus(where.network(tls)) as bus:
-        bus.subscribe(STATS, inbox.post)
-        bus.subscribe(STATUS, inbox.post)
-        bus.subscribe(LEAD, inbox.post)
-        bus.subscribe(ORDERS, inbox.post, role="keeper")
-        until_s = time.monotonic() + _STATUS_LISTEN_S
-        found = ask_run(bus, routers=True)
-        while (left_s := until_s - time.monotonic()) > 0:
-            match inbox.take(left_s):
-                case Heard(message=Stats() as message):
-                    stats[message.role, message.id] = message
-                    counts.count(message)
-                case Heard(message=PlannerStatus() as message):
-                    planners[message.target] = message
-                case Heard(message=Beat() as message):
-                    leads[message.role, message.id] = message.leads
-                case Heard(message=Orders() as message):
-                    book.merge(message.orders, time.time_ns())
-    if not found:
-        admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
-        raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
-    # The run is that of most; routers belong to none; whoever answers with another is a stranger.
-    runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
-    run = runs.most_common(1)[0][0] if runs else ("", "")
-    found.sort(key=lambda info: (not info.run_id, info.role, info.id))
-    strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
-    members = [info for info in found if info not in strangers]
-    frame = frame_of_members(members)
-    if as_json:
-        fields = _status_fields(members, stats, planners, leads, frame)
-        fields["certified_gap"] = certified_gap(counts).fields()
-        fields["certified_gap_to"] = {id: gap.fields() for id, gap in gaps_to(counts).items()}
-        fields["orders"] = book.standing
-        fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
-        typer.echo(json.dumps(fields, indent=2))
-    else:
-        _print_status(members, stats, planners, leads, frame, gaps_to(counts))
-        typer.echo(f"certified gap of the routes begun (above: mean per target): {certified_gap(counts)}")
-        for ordered in book.standing:
-            typer.secho(f"ordered: {ordered}", fg="yellow")
-        for info in strangers:
-            typer.secho(
-                f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}",
-                fg="yellow",
-            )
+    Without --connect it asks the newest run of this machine that runs, whatever its ports.
+    """
+    from launch_scripts.commands.running.status import status as show
 
-
-def _status_fields(
-    members: list[RunInfo],
-    stats: dict[tuple[str, str], Stats],
-    planners: dict[str, PlannerStatus],
-    leads: dict[tuple[str, str], bool],
-    frame: MapFrame | None,
-) -> dict[str, Any]:
-    import msgspec
-
-    def planner_fields(planner: PlannerStatus) -> dict[str, Any]:
-        cell = _target_cell(planner, frame)
-        return {
-            **msgspec.to_builtins(planner),
-            "target_at": None if frame is None or cell is None else fields_of(frame, cell),
-        }
-
-    return {
-        "run_id": members[0].run_id,
-        "scenario": members[0].scenario,
-        "terrain": members[0].terrain,
-        "processes": [
-            {
-                "role": info.role,
-                "id": info.id,
-                "incarnation": info.incarnation,
-                "leads": leads.get((info.role, info.id)),
-                "counts": stats[info.role, info.id].counts if (info.role, info.id) in stats else None,
-                "gauges": stats[info.role, info.id].gauges if (info.role, info.id) in stats else None,
-            }
-            for info in members
-        ],
-        "crs": None if frame is None else frame.grid.crs,
-        "planners": [planner_fields(planners[target]) for target in sorted(planners)],
-    }
-
-
-def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
-    """Where the planner's target is; None if that is not known, or not on this terrain."""
-    cell = planner.target_cell
-    return cell if frame is not None and cell is not None and 0 <= cell < frame.grid.cells else None
-
-
-def _throttled(stats: dict[tuple[str, str], Stats]) -> list[str]:
-    """Authors which a keeper throttles."""
-    from shared_map.keeper.service import THROTTLED
-
-    gauges = {name for each in stats.values() for name in each.gauges}
-    return sorted(name.removeprefix(THROTTLED) for name in gauges if name.startswith(THROTTLED))
-
-
-def _print_status(
-    members: list[RunInfo],
-    stats: dict[tuple[str, str], Stats],
-    planners: dict[str, PlannerStatus],
-    leads: dict[tuple[str, str], bool],
-    frame: MapFrame | None,
-    gaps: Mapping[str, CertifiedGap],
-) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from launch_scripts.report.results.certified_gap import percent
-
-    first = members[0]
-    console = Console()
-    if first.run_id:
-        run = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells"
-    else:
-        run = "no run yet: only routers answer"
-    console.print(run, highlight=False)
-    if frame is not None and frame.grid.crs != "local":
-        console.print(f"terrain: {extent_of(frame, 'latlon')}", highlight=False)
-    now_ns = time.time_ns()
-    crew = Table("process", "up s", "messages out", "in", "dropped", pad_edge=False)
-    for info in members:
-        counts = stats[info.role, info.id].counts if (info.role, info.id) in stats else {}
-        numbers = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
-        up_s = (now_ns - info.incarnation) / 1e9
-        leading = {True: ", leads", False: ", stands by", None: ""}[leads.get((info.role, info.id))]
-        told = ("-" if n is None else str(n) for n in numbers)
-        crew.add_row(f"{info.role}-{info.id}{leading}", f"{up_s:.0f}", *told)
-    console.print(crew)
-    for author in _throttled(stats):
-        console.print(f"author {author} exceeds its quota; its marks are delayed", style="yellow")
-    if planners:
-        trees = Table(
-            *("target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap"),
-            *("pose s", "tracker"),
-            pad_edge=False,
-        )
-        for id, planner in sorted(planners.items()):
-            gap = percent(gaps[id].mean) if id in gaps else "-"
-            trees.add_row(
-                id,
-                str(planner.following),
-                planner.strategy,
-                f"{planner.growth_ms:.1f}",
-                str(planner.growths),
-                str(planner.window_growths),
-                str(planner.routes_served),
-                gap,
-                "-" if planner.pose_age_s is None else f"{planner.pose_age_s:.1f}",
-                "lost" if planner.tracker_lost else planner.tracker or "-",
-                style="yellow" if planner.tracker_lost else None,
-            )
-        console.print(trees)
-        for id, planner in sorted(planners.items()):
-            cell = _target_cell(planner, frame)
-            if frame is not None and cell is not None:
-                was = "was" if planner.tracker_lost else "is"
-                console.print(f"{id} {was} at {written(frame, cell)}", highlight=False, soft_wrap=True)
+    show(where.network(tls), where, as_json=as_json)
 
 
 @app.command(rich_help_panel=_PANEL)
 @spread
-def metrics(
+def top(
     where: Where,
     tls: Tls,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="On loopback; 0 picks one.")] = 9464,
-    dashboard: Annotated[
-        bool, typer.Option("--dashboard", help="Print a dashboard for Grafana, as JSON, and exit.")
+    each: Annotated[bool, typer.Option("--each", help="A line for each process, not only for each role.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Show it once and end.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object a second, or one with --once.")
     ] = False,
 ) -> None:
-    """Serve the figures of a running swarm to Prometheus, until Ctrl-C. It only listens.
+    """Watch a running swarm: processes, vehicles and targets, once a second; `q` or Ctrl-C ends it.
 
-    swarm metrics --port 9464
+    Processes on other machines are shown, too: each tells what it takes up. CPU of 100 % is one core; late/s counts
+    ticks that came late or not at all, of a role the worst.
 
-    swarm metrics --dashboard > swarm.json
+    swarm top --each
 
-    `swarm up --metrics-port 9464` does the same for as long as the run lasts.
+    swarm top --json --once | jq .processes[0]
     """
-    from launch_scripts.commands import metrics as command
+    from launch_scripts.commands.running.top import top as show
 
-    if dashboard:
-        typer.echo(command.dashboard())
-    else:
-        command.serve_metrics(where.network(tls), port)
+    show(where.network(tls), where, each=each, once=once, as_json=as_json)

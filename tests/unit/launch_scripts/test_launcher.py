@@ -16,7 +16,8 @@ from support.processes import eventually, session_of
 
 from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm
-from launch_scripts.launcher.up import UpOptions, run_swarm
+from launch_scripts.launcher.up import run_swarm
+from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.process_table import NICENESS, ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
