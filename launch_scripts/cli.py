@@ -143,18 +143,20 @@ def _up(
     rank: int | None = None,
     run_id: str | None = None,
 ) -> None:
+    from launch_scripts.launcher.busy_line import busy_loading
     from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
     # Beside the imports below and the terrain, which take as long.
     start_forkserver(ROLES_AND_KERNELS if not only or "planner" in only else ROLES_ONLY)
 
-    import msgspec
+    with busy_loading(as_json=run.as_json, plain=run.plain):
+        import msgspec
 
-    from launch_scripts.launcher import options
-    from launch_scripts.launcher.up import run_swarm
-    from launch_scripts.launcher.up_options import UpOptions
-    from launch_scripts.process_table import ROLES
-    from swarm.errors import ConfigError
+        from launch_scripts.launcher import options
+        from launch_scripts.launcher.up import run_swarm
+        from launch_scripts.launcher.up_options import UpOptions
+        from launch_scripts.process_table import ROLES
+        from swarm.errors import ConfigError
 
     scenario = options.find_scenario(name)
     if run.port is not None:
@@ -190,6 +192,7 @@ def _up(
         plain=run.plain,
         metrics_port=run.metrics_port,
         began_s=_began_s(),
+        record_inputs=run.record_inputs,
     )
     raise typer.Exit(run_swarm(chosen))
 
@@ -333,6 +336,36 @@ MOUNTED: dict[str, str] = {}
 """Name -> module of each sub-command which has sub-commands of its own."""
 
 
+@app.command()
+def replay(
+    run: Annotated[
+        str, typer.Argument(metavar="RUN", help="A run's folder, its name in --runs, or LAST.")
+    ] = "LAST",
+    process: Annotated[str | None, typer.Option(help="Only this process, such as planner-t3.")] = None,
+    until: Annotated[
+        float | None, typer.Option(min=0, help="Only so many seconds from the start of the run, by its own clock.")
+    ] = None,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Copy what is replayed into a folder: a test case.")
+    ] = None,
+    runs: Runs = Path("runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Feed what the processes of a run heard to the services of this build, and say where their outputs first
+    differ.
+
+    swarm demo --record-inputs, then swarm replay
+
+    swarm replay LAST --process planner-t3 --until 34.5 --keep my-case
+
+    A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
+    """
+    from launch_scripts.commands.replay import replay_one
+
+    if not replay_one(run, runs, process, until, keep, as_json):
+        raise typer.Exit(1)
+
+
 def _mount(name: str, module: str, help: str) -> None:
     """Adds a sub-command whose own typer app is imported when it is called."""
 
@@ -384,6 +417,11 @@ def main() -> int:
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
+    except SystemExit as leaving:
+        # So typer leaves at a Ctrl-C, without a word.
+        if isinstance(getattr(leaving.__context__, "__cause__", None), KeyboardInterrupt):
+            print("swarm: stopped", file=sys.stderr)
+        raise
     except BrokenPipeError:
         _leave_output()
         return 0

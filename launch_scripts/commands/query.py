@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -174,13 +175,33 @@ def _route_on_terrain(
 @app.command(rich_help_panel=_PANEL)
 @spread
 def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Show who takes part in the running swarm, how it is doing, and what is ordered.
+    """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
 
     Without --connect it asks the newest run of this machine that runs, whatever its ports.
     """
-    from launch_scripts.commands.running.status import status as show
+    from rich.console import Console
 
-    show(where.network(tls), where, as_json=as_json)
+    from launch_scripts.commands.running.status import StatusWatch, print_status, status_fields
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.clock import MonotonicClock
+    from swarm.errors import BusError
+    from swarm.runtime.inbox import Inbox
+
+    inbox, clock = Inbox(), MonotonicClock()
+    with open_bus(where.network(tls)) as bus:
+        watch = StatusWatch(bus, inbox.post)
+        began_s = time.monotonic()
+        while (spent_s := time.monotonic() - began_s) < _STATUS_LISTEN_S or not watch.answered:
+            if (event := inbox.take(max(_STATUS_LISTEN_S - spent_s, 0.1))) is not None:
+                watch.take(event, clock.now_ns())
+        told = watch.status(clock.now_ns())
+    if told is None:
+        admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
+        raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
+    if as_json:
+        typer.echo(json.dumps(status_fields(told), indent=2))
+    else:
+        print_status(told, Console())
 
 
 @app.command(rich_help_panel=_PANEL)

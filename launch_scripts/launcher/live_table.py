@@ -18,7 +18,7 @@ def live_table(state: RunState, title: str, console: Console) -> Group:
     next, and of many targets the first are shown."""
     crew = Text("")
     for role, (alive, every) in state.crew.items():
-        crew.append(f"{role} {alive} of {every}  ", style="green" if alive == every else "bold red")
+        crew.append(f"{role} {alive}/{every}  ", style="green" if alive == every else "bold red")
     for role, alive in state.beside.items():
         crew.append(f"{role} {alive}  ", style="green")
     alarms = (Text(line, style="red") for line in facts.alarm_lines(state, SHOWN_ALARMS))

@@ -208,6 +208,7 @@ class _Run:
             incarnation=next_life(self._run_dir, spec.role, spec.id),
             started_ns=self._started_ns,
             run_dir=self._run_dir,
+            record_inputs=self._options.record_inputs,
             before=None if self._recorder is None else self._recorder.observed.newest_stats(spec.role, spec.id),
         )
 
@@ -294,7 +295,7 @@ class _Run:
         for note in watcher.take_notes():
             if note.kind == "live_view":
                 self._terminal.say(f"live view: {note.text}", "bold")
-                self._terminal.say(f"from another computer: {tunnel(note.text)}, then the same address there")
+                self._terminal.say(f"from elsewhere: {tunnel(note.text)}, then the same address")
             elif note.kind not in _QUIET_NOTES:
                 self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if self._terminal.due():

@@ -20,12 +20,13 @@ from swarm.wire.messages.processes import RunInfo
 class UpOptions:
     """Options of a run.
 
-    joins         there is a router elsewhere: none is started here
-    rank          of planners and the targets process, start only those of this rank; if None all
-    run_id        the run to take part in; if None it is made or found
-    began_s       time.monotonic() at which the command was given
-    table         other processes than the scenario's
-    metrics_port  where figures are served to Prometheus; 0 is any
+    joins          there is a router elsewhere: none is started here
+    rank           of planners and the targets process, start only those of this rank; if None all
+    run_id         the run to take part in; if None it is made or found
+    began_s        time.monotonic() at which the command was given
+    table          other processes than the scenario's
+    metrics_port   where figures are served to Prometheus; 0 is any
+    record_inputs  of every process, for `swarm replay`
     """
 
     scenario: Scenario
@@ -38,6 +39,7 @@ class UpOptions:
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
     table: tuple[ProcessSpec, ...] | None = None
+    record_inputs: bool = False
     metrics_port: int | None = None
 
 

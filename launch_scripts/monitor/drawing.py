@@ -1,4 +1,4 @@
-"""The only module that logs to rerun: takes the scene's arrays.
+"""Logs to rerun what moves, figures and notes: takes the scene's arrays. What lies still is logged in `ground/`.
 
 Few entities with many instances each, arrays instead of lists, style logged once: see what was measured in
 docs/decisions/0008-the-live-view.md.
@@ -12,18 +12,15 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
-from launch_scripts.monitor.movers.points import STATE_COLOURS, Points
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats
+from launch_scripts.monitor.movers.points import ROUTE_COLOUR, STATE_COLOURS, TRAIL_COLOUR, Points
 from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.report.pictures import palette
 from launch_scripts.report.samples import Sample
 from swarm.wire.messages.vehicles import VehicleState
 
 _NAMES_SHOWN = 40
-_ROUTE_COLOUR = (150, 235, 255)
-_TRAIL_COLOUR = (0, 148, 88)
 _TARGET_TRAIL_COLOUR = (255, 70, 70)
-_WINDOW_COLOUR = (255, 200, 60)
 _PLOT_COLOURS = [
     tuple(int(colour[n : n + 2], 16) for n in (1, 3, 5))
     for colour in (
@@ -36,9 +33,8 @@ _PLOT_COLOURS = [
 class Drawing:
     """Logs the scene to one recording stream."""
 
-    def __init__(self, rec: rr.RecordingStream | Streams, mesh: TerrainMesh, target_ids: Sequence[str]) -> None:
+    def __init__(self, rec: rr.RecordingStream | Streams, target_ids: Sequence[str]) -> None:
         self._rec = rec
-        self._mesh = mesh
         self._target_ids = list(target_ids)
         self._vehicle_ids: list[str] = []
         self._vehicle_colours: Bytes = np.empty((0, 3), np.uint8)
@@ -51,22 +47,18 @@ class Drawing:
         self._rec.set_time("sim_time", duration=seconds)
 
     def begin(self) -> None:
-        """Logs what never changes: the terrain's mesh and the styles."""
-        rec, mesh = self._rec, self._mesh
-        rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for tile in mesh.mesh_tiles():
-            self._tile(tile)
+        """Logs what never changes: the styles."""
+        rec = self._rec
         thin, line, thick = _screen_points(0.5), _screen_points(1.3), _screen_points(2.2)
-        rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [_TRAIL_COLOUR], [line]), static=True)
+        rec.log("world/trails/vehicles", _style(rr.LineStrips3D, [TRAIL_COLOUR], [line]), static=True)
         rec.log(
             "world/trails/targets",
             _style(rr.LineStrips3D, [_TARGET_TRAIL_COLOUR], [thick]),
             static=True,
         )
-        rec.log("world/windows", _style(rr.LineStrips3D, [_WINDOW_COLOUR], [line]), static=True)
         rec.log("world/targets/poles", _style(rr.LineStrips3D, [_TARGET_TRAIL_COLOUR], [line]), static=True)
         for id in self._target_ids:
-            rec.log(f"world/routes/{id}", _style(rr.LineStrips3D, [_ROUTE_COLOUR], [thin]), static=True)
+            rec.log(f"world/routes/{id}", _style(rr.LineStrips3D, [ROUTE_COLOUR], [thin]), static=True)
         states = [state.name.lower() for state in VehicleState]
         self._series("states", states, list(STATE_COLOURS.values()))
         self._series("captures_and_marks", ["captures", "marks / 100"], [(255, 210, 31), (170, 110, 240)])
@@ -77,32 +69,8 @@ class Drawing:
     def _colours(self) -> list[tuple[int, ...]]:
         return [_PLOT_COLOURS[n % len(_PLOT_COLOURS)] for n in range(len(self._target_ids))]
 
-    def _tile(self, tile: MeshTile) -> None:
-        self._rec.log(
-            f"world/ground/{tile.index}",
-            rr.Mesh3D.from_fields(
-                vertex_positions=tile.vertices,
-                triangle_indices=tile.triangles,
-                vertex_texcoords=tile.texcoords,
-            ),
-            static=True,
-        )
-
     def _series(self, chart: str, names: list[str], colours: Sequence[tuple[int, ...]]) -> None:
         self._rec.log(f"plots/{chart}", rr.SeriesLines(names=names, colors=colours, widths=1.5), static=True)
-
-    def texture(self, tile: int, image: Bytes) -> None:
-        """Logs the photo of a tile, with its marks. Not static: a viewer which joins late gets only recent data."""
-        height, width, _ = image.shape
-        self._rec.log(
-            f"world/ground/{tile}",
-            rr.Mesh3D.from_fields(
-                albedo_texture_buffer=np.ascontiguousarray(image).tobytes(),
-                albedo_texture_format=rr.components.ImageFormat(
-                    width=width, height=height, color_model="RGB", channel_datatype="U8"
-                ),
-            ),
-        )
 
     def vehicles(self, points: Points) -> None:
         """Logs places each time, colours and ids only when they have changed."""
@@ -154,9 +122,6 @@ class Drawing:
 
     def routes(self, target: str, strips: Floats) -> None:
         self._rec.log(f"world/routes/{target}", rr.LineStrips3D.from_fields(strips=strips))
-
-    def windows(self, strips: Floats) -> None:
-        self._rec.log("world/windows", rr.LineStrips3D.from_fields(strips=strips))
 
     def plots(self, sample: Sample, messages_per_s: float | None) -> None:
         log = self._scalars

@@ -6,14 +6,15 @@ It only listens. It may be late, stalled, killed or absent; no process waits for
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import rerun as rr
 
 from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.ground.windows import window_outlines
+from launch_scripts.monitor.ground.ground_view import GroundView
+from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
+from launch_scripts.monitor.ground.zones import Area
 from launch_scripts.monitor.movers.points import (
     RouteNow,
     body_points,
@@ -37,7 +38,6 @@ from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
-from swarm.grid import Window
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
@@ -59,12 +59,8 @@ _DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, S
 _TARGETS_NS = NS_PER_S // 5
 """Targets, each with its pole and its name, take as long to draw as all vehicles, which move faster."""
 _TRAILS_NS = NS_PER_S // 2
-_WINDOWS_NS = NS_PER_S
 _ROUTES_NS = 3 * NS_PER_S // 2
 """Period in which the routes to every target are drawn once."""
-_TEXTURES_NS, _TEXTURES_AT_ONCE = NS_PER_S, 80
-"""Marks come many times a second to the same tiles, and each of their photos is drawn once for all."""
-_REFRESH_NS = NS_PER_S
 _ROUTES_SHOWN = 400
 _ENDED_KEPT = 4096
 _ROUTES_KEPT = 1 << 15
@@ -80,6 +76,8 @@ class MonitorService:
     rec        a recording stream whose sinks are set
     live_url   address of the live view; published once
     recording  watches the file of the recording, if there is one
+    truth      the true ground, where this process knows it
+    zones      of the scenario
     """
 
     def __init__(
@@ -93,6 +91,8 @@ class MonitorService:
         mesh: TerrainMesh | None = None,
         live_url: str | None = None,
         recording: RecordingWatch | None = None,
+        truth: Floats | None = None,
+        zones: Sequence[Area] = (),
     ) -> None:
         self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
         self.over = False
@@ -104,31 +104,29 @@ class MonitorService:
         self._live_url = live_url
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self.counters: Counters = self._member.counters
-        self._cost_map = CostMap(terrain)
-        replica = MapReplica(terrain.grid, self._cost_map)
+        cost_map = CostMap(terrain)
+        replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role, at_ticks=True)
         self._mesh = mesh or TerrainMesh(terrain)
         self._target_ids = setup.scenario.target_ids
         self._rec = rec
         self._recording = recording
-        self._drawing = Drawing(rec, self._mesh, self._target_ids)
+        self._drawing = Drawing(rec, self._target_ids)
+        self._ground = GroundView(rec, self._mesh, terrain, cost_map, replica, truth, zones)
         scale = setup.scenario.time_scale
         quickest_m = 4 * scale * max(setup.scenario.cost.road_speed_m_per_s, 1.0)
         self._vehicle_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
         self._target_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
         self._routes: dict[str, RouteNow] = {}
-        self._stale_tiles: dict[int, None] = {}
         self._sightings = Sightings(replica.filter)
         self._sighted: Mapping[str, Sighted] = {}
         self._bodies = Bodies(terrain.grid)
         """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
         self._bodies_drawn: list[Body] = []
-        self._fleets_new = self._targets_new = self._windows_new = False
+        self._fleets_new = self._targets_new = False
         self._lost: set[str] = set()
         """Targets that were drawn as lost."""
-        self._windows: dict[str, tuple[int, ...]] = {}
-        """Target -> the window that its planner grew last."""
-        self._windows_due_ns = self._targets_due_ns = self._bodies_due_ns = 0
+        self._targets_due_ns = self._bodies_due_ns = 0
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
@@ -136,8 +134,8 @@ class MonitorService:
         """Processes that went and that nobody was told of yet, and when."""
         self._ended: set[Peer] = set()
         """Processes which said in their last figures that they end as they were asked to."""
-        self._trails_due_ns = self._routes_due_ns = self._refresh_due_ns = self._textures_due_ns = 0
-        self._next_route_target = self._next_refresh = 0
+        self._trails_due_ns = self._routes_due_ns = 0
+        self._next_route_target = 0
         self._last_sample_s = -1.0
 
     def start(self, now_ns: int) -> None:
@@ -170,10 +168,8 @@ class MonitorService:
                 self._sightings.hear(sighted, now_ns)
             case Body() as body:
                 self._bodies.hear(body, now_ns)
-            case PlannerStatus(target=target, window=window):
-                if self._windows.get(target) != tuple(window):
-                    self._windows[target] = tuple(window)
-                    self._windows_new = True
+            case PlannerStatus() as status:
+                self._ground.hear_status(status)
             case Followed() as followed:
                 self._follow(followed)
             case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
@@ -190,13 +186,7 @@ class MonitorService:
         self._frame += 1
         self._drawing.set_time(self._frame, self._seconds())
         self._watch_recording(now_ns)
-        for window in self._cost_map.take_dirty():
-            self._stale_tiles.update(dict.fromkeys(self._mesh.tiles_touching(window)))
-        if not self._stale_tiles and now_ns >= self._refresh_due_ns:
-            self._refresh(now_ns)
-        if now_ns >= self._textures_due_ns:
-            self._textures_due_ns = now_ns + _TEXTURES_NS
-            self._draw_textures(_TEXTURES_AT_ONCE)
+        self._ground.tick(now_ns)
         self._draw_movers(now_ns)
         self._draw_plots(now_ns)
 
@@ -250,7 +240,7 @@ class MonitorService:
             return
         sentence, begun = self._recording.look(now_ns)
         if begun:
-            self._drawing = Drawing(self._rec, self._mesh, self._target_ids)
+            self._drawing = Drawing(self._rec, self._target_ids)
             self._begin_drawing()
         if sentence is not None:
             log.warning("%s", sentence)
@@ -259,26 +249,12 @@ class MonitorService:
     def _begin_drawing(self) -> None:
         """Draws all that does not move."""
         self._drawing.begin()
-        self._stale_tiles = dict.fromkeys(range(self._mesh.tile_rows * self._mesh.tile_cols))
-        self._draw_textures(len(self._stale_tiles))
+        self._ground.begin()
 
     def _seconds(self) -> float:
         return max(self._newest_stamp_ns - self._setup.started_ns, 0) / NS_PER_S
 
     # --- out ----------------------------------------------------------------------------------------------------
-
-    def _refresh(self, now_ns: int) -> None:
-        """Sends one texture again: a viewer which joins late has only what the server still holds."""
-        self._refresh_due_ns = now_ns + _REFRESH_NS
-        self._stale_tiles[self._next_refresh] = None
-        self._next_refresh = (self._next_refresh + 1) % (self._mesh.tile_rows * self._mesh.tile_cols)
-
-    def _draw_textures(self, most: int) -> None:
-        for tile in list(self._stale_tiles)[:most]:
-            del self._stale_tiles[tile]
-            window = self._mesh.tile_window(tile)
-            image = self._mesh.texture(window, self._cost_map.ground_s_per_m, self._terrain.ground_s_per_m)
-            self._drawing.texture(tile, image)
 
     def _draw_movers(self, now_ns: int) -> None:
         trails_due = now_ns >= self._trails_due_ns
@@ -313,15 +289,6 @@ class MonitorService:
         if bodies != self._bodies_drawn and now_ns >= self._bodies_due_ns:
             self._bodies_drawn, self._bodies_due_ns = bodies, now_ns + _TARGETS_NS
             self._drawing.bodies(*body_points(self._mesh, bodies))
-        if self._windows_new and now_ns >= self._windows_due_ns:
-            self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
-            self._draw_windows()
-
-    def _draw_windows(self) -> None:
-        """Draws the window that each planner grew last, unless it is the whole terrain."""
-        told = (Window(*self._windows[target]) for target in sorted(self._windows) if self._windows[target])
-        parts = [window for window in told if not window.empty and window.cells < self._terrain.grid.cells]
-        self._drawing.windows(window_outlines(self._mesh, parts))
 
     def _draw_routes(self, now_ns: int, vehicles: VehicleColumns) -> None:
         """Draws what is left of the routes, one target after the other."""

@@ -1,4 +1,4 @@
-"""Watches a running swarm from outside, without its scenario: what `swarm top` and `swarm status` show."""
+"""Watches a running swarm from outside, without its scenario: what `swarm top` shows."""
 
 from __future__ import annotations
 
@@ -6,28 +6,21 @@ import time
 from collections.abc import Sequence
 
 from launch_scripts.commands.run_frame import frame_of_members
-from launch_scripts.report.latest_state import Observed
+from launch_scripts.report.run_state.model import HEARD, RunModel
 from launch_scripts.report.run_state.plan import plan_of_members
 from launch_scripts.report.run_state.process_load import ProcessLoad, ProcessLoads
-from launch_scripts.report.run_state.state import RunState, state_of
-from launch_scripts.report.tracked_targets import TrackedTargets
+from launch_scripts.report.run_state.state import RunState
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.grid import GridSpec
-from swarm.order_book import OrderBook
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.base import Nothing
-from swarm.wire.messages.orders import Orders
-from swarm.wire.messages.processes import Beat, RunInfo, Stats
-from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import FLEET, LEAD, ORDERS, POSE, RUN, STATS, STATUS, Topic
+from swarm.wire.messages.processes import RunInfo, Stats
+from swarm.wire.topics import RUN
 
 _TAG = "observer-run"
 _ASK_EVERY_S, _ASK_TIMEOUT_S = 5.0, 1.0
 _EVENTS_AT_ONCE = 5000
-_HEARD: dict[Topic, float] = {STATS: 0.0, STATUS: 0.0, POSE: 0.0, LEAD: 0.0, FLEET: 0.5}
-"""What is listened to, and how often the newest of each key is taken, in seconds."""
 
 
 class RunObserver:
@@ -48,15 +41,11 @@ class RunObserver:
         """The newest answer of each process."""
         self._ask_due_s = time.monotonic() + _ASK_EVERY_S
         frame = frame_of_members(list(members))
-        self.observed = Observed(GridSpec(1, 1, 1.0) if frame is None else frame.grid)
-        self._tracked = TrackedTargets(self.observed.grid, self.observed.status)
-        self.leads: dict[tuple[str, str], bool] = {}
-        """(role, id) of each process that has standbys, or is one -> whether it leads."""
+        grid = GridSpec(1, 1, 1.0) if frame is None else frame.grid
+        self._model = RunModel(plan_of_members(members), grid)
         self._loads = ProcessLoads()
-        self._book = OrderBook()
-        for topic, every_s in _HEARD.items():
+        for topic, every_s in HEARD.items():
             bus.subscribe(topic, self._inbox.post, every_s=every_s)
-        bus.subscribe(ORDERS, self._inbox.post, role="keeper")
         bus.watch_alive(self._inbox.post)
 
     def listen(self, until_s: float) -> None:
@@ -75,41 +64,32 @@ class RunObserver:
 
     def state(self) -> RunState:
         """The run now."""
-        plan = plan_of_members(self._members.values())
-        return state_of(self.observed, self._tracked, plan, self._book, self._clock.now_ns(), plan.started_ns)
+        return self._model.state(self._clock.now_ns())
 
     def processes(self) -> list[ProcessLoad]:
         """What each process takes up."""
-        return self._loads.lines(self.observed.up())
+        return self._loads.lines(self._model.observed.up())
 
     @property
     def answers(self) -> bool:
         """Whether any process but a router is alive."""
-        return any(role != "router" for role, _ in self.observed.up())
+        return any(role != "router" for role, _ in self._model.observed.up())
 
     def _take(self, event: Event) -> None:
         now_ns = self._clock.now_ns()
         match event:
-            case Heard(message=TargetPose() as pose):
-                if (counts := self._tracked.hear(pose, now_ns)) is not None:
-                    self.observed.heard(counts, now_ns)
-            case Heard(message=Orders() as orders):
-                self._book.merge(orders.orders, time.time_ns())
             case Heard(message=message):
                 if isinstance(message, Stats):
                     self._loads.hear(message)
-                elif isinstance(message, Beat):
-                    self.leads[message.role, message.id] = message.leads
-                elif isinstance(message, Fleet):
-                    self._tracked.something_moved(now_ns)
-                self.observed.heard(message, now_ns)
+                self._model.heard(message, now_ns)
             case Appeared(peer):
-                self.observed.alive(peer, True, now_ns)
+                self._model.alive(peer, True, now_ns)
             case Disappeared(peer):
-                self.observed.alive(peer, False, now_ns)
+                self._model.alive(peer, False, now_ns)
             case Replied(message=RunInfo() as info) if info.run_id:
                 self._answers.append(info)
             case AskEnded():
                 mine = [info for info in self._answers if info.run_id == self.run.run_id]
                 self._members.update({(info.role, info.id): info for info in mine})
+                self._model.plan = plan_of_members(self._members.values())
                 self.over = self.over or (bool(self._answers) and not mine)

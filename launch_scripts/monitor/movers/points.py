@@ -30,6 +30,8 @@ TARGET_COLOUR = (255, 46, 46)
 LOST_TARGET_COLOUR = (120, 120, 120)
 SIGHTED_COLOUR = (255, 170, 150)
 BODY_COLOUR = (110, 160, 255)
+ROUTE_COLOUR = (150, 235, 255)
+TRAIL_COLOUR = (0, 148, 88)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

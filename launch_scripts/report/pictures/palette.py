@@ -20,3 +20,9 @@ STATE_COLOURS = {
     VehicleState.LOST: BLACK,
     VehicleState.OUTDATED: YELLOW,
 }
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """`#rrggbb` as numbers from 0 to 255."""
+    red, green, blue = (int(colour[n : n + 2], 16) for n in (1, 3, 5))
+    return red, green, blue

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,7 @@ from launch_scripts.report.pictures.palette import (
 )
 from launch_scripts.report.pictures.plot_style import STYLE
 from launch_scripts.report.pictures.plots import draw_plots, duration, halo
+from launch_scripts.report.pictures.scale_bar import round_length, said_length
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.certified_gap import percent
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
@@ -237,21 +237,14 @@ def _label(axes: Axes, text: str, x: float, y: float, recorder: Recorder) -> Non
 
 
 def _draw_scale_bar(axes: Axes, width_km: float, height_km: float) -> None:
-    length_km = _round_length(width_km / 5)
+    length_km = round_length(width_km / 5)
     x0, y0 = 0.03 * width_km, height_km * 0.965
     for colour, width in (("white", 6.0), (INK, 3.0)):
         axes.plot([x0, x0 + length_km], [y0, y0], color=colour, linewidth=width, solid_capstyle="butt", zorder=11)
-    label = f"{length_km:g} km" if length_km >= 1 else f"{length_km * 1000:g} m"
     axes.annotate(
-        label, (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left", fontsize=9.5,
+        said_length(length_km * 1000), (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left", fontsize=9.5,
         fontweight="bold", zorder=11, path_effects=halo(),
     )  # fmt: skip
-
-
-def _round_length(value: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above the value."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= value * 1.0001))
 
 
 def _draw_legend(axes: Axes, knows_truth: bool) -> None:

@@ -83,8 +83,8 @@ def test_the_live_table_cuts_nothing_off_at_80_columns_and_24_lines() -> None:
     state, _, _ = large_run()
     title = "a long name: 12 of 60 s, live view http://127.0.0.1:39177/"
     told = (
-        "agent 36 of 36",
-        "keeper 0 of 1",
+        "agent 36/36",
+        "keeper 0/1",
         "restarts 0",
         "re-plans",
         "certified gap",

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
-from launch_scripts.monitor.ground.terrain_mesh import LETHAL_MARK, TerrainMesh
+from launch_scripts.monitor.ground.ground_colours import LETHAL_MARK, GroundColours
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.ground.windows import window_outlines
 from launch_scripts.monitor.movers.points import (
     LOST_TARGET_COLOUR,
@@ -32,6 +33,12 @@ def hill(rows: int, cols: int, resolution_m: float = 10.0, top_m: float = 50.0) 
     """Rises evenly to the east."""
     elevation_m = np.tile(np.linspace(0, top_m, cols, dtype=np.float32), (rows, 1))
     return terrain_of_pace(np.ones((rows, cols), np.float32), resolution_m, elevation_m)
+
+
+def photo(terrain: Terrain, window: Window, now: Floats | None = None) -> Bytes:
+    """Photo of a window, the ground being this."""
+    ground = terrain.ground_s_per_m if now is None else now
+    return GroundColours(TerrainMesh(terrain), terrain, ground, None).photo_of(window)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (64, 64), (65, 65), (100, 151), (424, 400)])
@@ -66,10 +73,7 @@ def test_a_huge_terrain_is_thinned_out_and_a_small_one_is_not() -> None:
     mesh = TerrainMesh(hill(2100, 2100))
     assert mesh.texel == 4
     assert sum(len(tile.vertices) for tile in mesh.mesh_tiles()) < 150_000
-    texture = mesh.texture(
-        mesh.tile_window(0), np.ones((2100, 2100), np.float32), np.ones((2100, 2100), np.float32)
-    )
-    assert texture.shape[0] <= 70
+    assert photo(hill(2100, 2100), mesh.tile_window(0)).shape[0] <= 70
 
 
 def test_a_mark_on_one_cell_shows_however_far_one_looks_from() -> None:
@@ -78,8 +82,7 @@ def test_a_mark_on_one_cell_shows_however_far_one_looks_from() -> None:
     pace[130, 70] = np.inf
     (tile,) = mesh.tiles_touching(Window(130, 70, 131, 71))
     window = mesh.tile_window(tile)
-    marked = mesh.texture(window, pace, terrain.pace_s_per_m)
-    plain = mesh.texture(window, terrain.pace_s_per_m, terrain.pace_s_per_m)
+    marked, plain = photo(terrain, window, pace), photo(terrain, window)
     rows, cols = np.nonzero((marked != plain).any(axis=2))
     assert (rows.tolist(), cols.tolist()) == ([(130 - window.row0) // 4], [(70 - window.col0) // 4])
 
@@ -112,23 +115,12 @@ def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_othe
     touched = mesh.tiles_touching(Window(64, 10, 65, 11))
     for tile in range(mesh.tile_rows * mesh.tile_cols):
         window = mesh.tile_window(tile)
-        before = mesh.texture(window, terrain.pace_s_per_m, terrain.pace_s_per_m)
-        after = mesh.texture(window, pace, terrain.pace_s_per_m)
+        before, after = photo(terrain, window), photo(terrain, window, pace)
         assert (tile in touched) == bool((before != after).any())
     window = mesh.tile_window(touched[-1])
-    texture = mesh.texture(window, pace, terrain.pace_s_per_m)
+    texture = photo(terrain, window, pace)
     mark = texture[64 - window.row0, 10 - window.col0].astype(int)
     assert np.abs(mark - np.array(LETHAL_MARK)).max() < 40
-
-
-def test_what_was_lethal_before_anybody_drove_is_no_mark() -> None:
-    pace = np.ones((20, 20), np.float32)
-    pace[5, 5] = np.inf
-    terrain = terrain_of_pace(pace)
-    mesh = TerrainMesh(terrain)
-    assert np.array_equal(
-        mesh.texture(mesh.tile_window(0), terrain.pace_s_per_m, terrain.pace_s_per_m), mesh.photo[:20, :20]
-    )
 
 
 def test_vehicles_are_shades_of_green_and_targets_red() -> None:
