@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch_scripts.command_line import complete, panels
 from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, spread
 from swarm.places import written
 
@@ -31,16 +32,26 @@ class Where:
     connect: Annotated[
         str | None,
         typer.Option(
-            help="The router's endpoint; if not given, that of the newest run here, or tcp/127.0.0.1:7447."
+            help="The router's endpoint; if not given, that of the newest run here, or tcp/127.0.0.1:7447.",
+            rich_help_panel=panels.NETWORK,
         ),
     ] = None
     namespace: Annotated[
-        str | None, typer.Option(help="Prefix of all keys; if not given, that of the run, or `swarm`.")
+        str | None,
+        typer.Option(
+            help="Prefix of all keys; if not given, that of the run, or `swarm`.", rich_help_panel=panels.NETWORK
+        ),
     ] = None
     run: Annotated[
-        str | None, typer.Option(help="The run to ask, where several run here: its name in --runs, or its folder.")
+        str | None,
+        typer.Option(
+            help="The run to ask, where several run here: its name in --runs, or its folder.",
+            rich_help_panel=panels.NETWORK,
+        ),
     ] = None
-    runs: Annotated[Path, typer.Option(help="Folder of the runs of this machine.")] = Path("runs")
+    runs: Annotated[
+        Path, typer.Option(help="Folder of the runs of this machine.", rich_help_panel=panels.NETWORK)
+    ] = Path("runs")
 
     @cached_property
     def _found(self) -> NetworkConfig:
@@ -82,7 +93,9 @@ class Where:
 def route(
     where: Where,
     tls: Tls,
-    target: Annotated[str | None, typer.Option(help="The target, such as t3.")] = None,
+    target: Annotated[
+        str | None, typer.Option(help="The target, such as t3.", autocompletion=complete.target_ids)
+    ] = None,
     row: Annotated[int | None, typer.Option(help="Row of the start, counted from the north.")] = None,
     col: Annotated[int | None, typer.Option(help="Column of the start, counted from the west.")] = None,
     steps: Annotated[int, typer.Option(min=0, help="Most steps to show; 1 is the next, 0 is all.")] = 0,
@@ -178,6 +191,10 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
 
     Without --connect it asks the newest run of this machine that runs, whatever its ports.
+
+    swarm status
+
+    swarm status --json | jq .planners
     """
     from rich.console import Console
 

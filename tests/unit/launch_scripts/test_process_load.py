@@ -60,12 +60,12 @@ def test_a_role_is_the_sum_of_its_living_processes_and_the_worst_of_their_latene
 
 def large_run() -> tuple[RunState, ProcessLoads, set[tuple[str, str]]]:
     """Many targets, long words, big numbers, an alarm."""
-    scenario = Scenario(targets=(TargetConfig(name="convoy-", count=14),), groups=(GroupConfig(vehicles=900),))
+    scenario = Scenario(targets=(TargetConfig(name="convoy-", count=20),), groups=(GroupConfig(vehicles=900),))
     recorder = Recorder(scenario, GridSpec(4000, 4000, 30.0), 0)
     loads = ProcessLoads()
     now_ns = 4000 * NS_PER_S
     up = set()
-    for role, id in [*recorder.plan.crew, ("monitor", "0"), ("router", "0")][1:]:
+    for role, id in [*recorder.model.plan.crew, ("monitor", "0"), ("router", "0")][1:]:
         recorder.alive(Peer(role, id, 1), True, now_ns)
         up.add((role, id))
         for at_s in (1.0, 2.0):
@@ -89,9 +89,9 @@ def test_the_live_table_cuts_nothing_off_at_80_columns_and_24_lines() -> None:
         "re-plans",
         "certified gap",
         "captures",
-        "processes 51 of 52",
+        "processes 57 of 58",
     )
-    for columns, lines, last in ((80, 24, "more"), (160, 50, "convoy-13")):
+    for columns, lines, last in ((80, 24, "more"), (160, 50, "convoy-19")):
         console = Console(file=io.StringIO(), width=columns, height=lines)
         shown = drawn(live_table(state, title, console), columns, lines)
         text = " ".join(" ".join(shown).split())
