@@ -43,7 +43,7 @@ def examine(runs: Path) -> Iterator[Finding]:
 
 
 def _python(about: str, runs: Path) -> Finding:
-    wanted = importlib.metadata.metadata(PACKAGE).get("Requires-Python") or ""
+    wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
     from packaging.specifiers import SpecifierSet
 
     here = platform.python_version()

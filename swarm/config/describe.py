@@ -6,11 +6,11 @@ import inspect
 import re
 import types
 import typing
+from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any, Literal
 
 import msgspec
-
-from swarm.config.scenario import Section
 
 _ROW = re.compile(r"(\w+) {2,}(\S.*)")
 _WORDS = {str: "text in quotes", int: "a whole number", float: "a number", bool: "true or false"}
@@ -18,7 +18,7 @@ _UNBOUNDED = 1e12
 """Limits beyond this keep numbers finite; they say nothing to a reader."""
 
 
-def meanings(section: type[Section]) -> dict[str, str]:
+def meanings(section: type[msgspec.Struct]) -> dict[str, str]:
     """Setting -> meaning, in the order of the rows of a section's docstring.
 
     A row is `key`, two or more spaces and the meaning; lines that begin with spaces continue it.
@@ -34,6 +34,12 @@ def meanings(section: type[Section]) -> dict[str, str]:
         else:
             key = ""
     return found
+
+
+@cache
+def hints_of(section: Any) -> Mapping[str, Any]:
+    """Setting -> its type, with its bounds."""
+    return typing.get_type_hints(section, include_extras=True)
 
 
 def expected(hint: Any) -> str:

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -178,7 +179,7 @@ def test_doctor_looks_at_everything_and_says_how_it_is(
         ("shared memory", "os.access", lambda path, mode: False, "warning", "mount a tmpfs"),
         ("clock", "_clock_state", lambda: 5, "warning", "not synchronised"),
         ("clock", "_clock_state", lambda: 0, "ok", "synchronised"),
-        ("disk", "shutil.disk_usage", lambda path: (1, 1, 1 << 20), "warning", "are free in"),
+        ("disk", "shutil.disk_usage", lambda path: SimpleNamespace(free=1 << 20), "warning", "are free in"),
     ],
 )
 def test_what_doctor_finds_says_what_to_do(
@@ -191,10 +192,6 @@ def test_what_doctor_finds_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     owner, _, name = replaced.rpartition(".")
-    if name == "disk_usage":
-        import collections
-
-        value = lambda path: collections.namedtuple("Usage", "free")(1 << 20)  # noqa: E731, PYI024
     monkeypatch.setattr(getattr(machine, owner) if owner else machine, name, value)
     found = machine.CHECKS[about](about, tmp_path)
     assert (found.level, found.about) == (level, about)
