@@ -232,6 +232,7 @@ def _up(
         plain=run.plain,
         metrics_port=run.metrics_port,
         began_s=_began_s(),
+        record_inputs=run.record_inputs,
     )
     raise typer.Exit(run_swarm(chosen))
 
@@ -305,6 +306,39 @@ def compare(
     from launch_scripts.commands.compare import compare_runs
 
     compare_runs(run, runs, as_json)
+
+
+@app.command(rich_help_panel=LEFT)
+def replay(
+    run: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN", help="A run's folder, its name in --runs, or LAST.", autocompletion=complete.runs
+        ),
+    ] = "LAST",
+    process: Annotated[str | None, typer.Option(help="Only this process, such as planner-t3.")] = None,
+    until: Annotated[
+        float | None, typer.Option(min=0, help="Only so many seconds from the start of the run, by its own clock.")
+    ] = None,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Copy what is replayed into a folder: a test case.")
+    ] = None,
+    runs: Runs = Path("runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Feed what the processes of a run heard to the services of this build, and say where their outputs first
+    differ.
+
+    swarm demo --record-inputs, then swarm replay
+
+    swarm replay LAST --process planner-t3 --until 34.5 --keep my-case
+
+    A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
+    """
+    from launch_scripts.commands.replay import replay_one
+
+    if not replay_one(run, runs, process, until, keep, as_json):
+        raise typer.Exit(1)
 
 
 app.add_typer(before.app)

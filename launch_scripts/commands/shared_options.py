@@ -112,6 +112,12 @@ class RunOptions:
     no_live: Annotated[
         bool, typer.Option("--no-live", help="Serve no live view. The run is recorded all the same.")
     ] = False
+    record_inputs: Annotated[
+        bool,
+        typer.Option(
+            "--record-inputs", help="Record what every process hears, so that `swarm replay` can repeat it."
+        ),
+    ] = False
     metrics_port: Annotated[
         int | None,
         typer.Option(min=0, max=65535, help="Serve figures to Prometheus on this port of loopback; 0 picks one."),

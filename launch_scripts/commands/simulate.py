@@ -48,7 +48,7 @@ def simulate_once(
         folder = make_run_dir(runs, f"{new_run_id()}-simulated")
         for sentence in begin_run(folder, scenario, folder.name):
             terminal.say(sentence, "yellow")
-        result = run_simulation(scenario, trace=log)
+        result = run_simulation(scenario, trace=log, record_to=folder)
     if as_json:
         numbers = {name: value for name, value in result.report.items() if name != "by_vehicle"}
         typer.echo(json.dumps(numbers, indent=2))

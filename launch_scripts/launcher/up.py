@@ -74,6 +74,7 @@ class UpOptions:
     began_s       time.monotonic() at which the command was given
     table         other processes than the scenario's
     metrics_port  where figures are served to Prometheus; 0 is any
+    record_inputs  of every process, for `swarm replay`
     """
 
     scenario: Scenario
@@ -86,6 +87,7 @@ class UpOptions:
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
     table: tuple[ProcessSpec, ...] | None = None
+    record_inputs: bool = False
     metrics_port: int | None = None
 
 
@@ -267,6 +269,7 @@ class _Run:
             incarnation=next_life(self._run_dir, spec.role, spec.id),
             started_ns=self._started_ns,
             run_dir=self._run_dir,
+            record_inputs=self._options.record_inputs,
             before=None if self._recorder is None else self._recorder.observed.newest_stats(spec.role, spec.id),
         )
 

@@ -21,6 +21,7 @@ from shared_map.replication.marks import base_seq, is_tombstone
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
+from swarm.runtime.recording.outside import Outside
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order
@@ -356,6 +357,23 @@ def _move_aside(path: Path) -> Path:
     for tail in ("-wal", "-shm"):
         Path(f"{path}{tail}").unlink(missing_ok=True)
     return aside
+
+
+KEEPER_STORE = Outside(
+    "store",
+    calls={
+        "bind": None,
+        "load": list[MarkSet],
+        "set_aside": dict[str, MarkSet],
+        "tiles_set_aside": list[int],
+        "save": None,
+        "save_sightings": None,
+        "save_orders": None,
+        "orders": list[Order],
+    },
+    facts={"path": Path},
+)
+"""What a keeper uses of its store."""
 
 
 class Keeper:

@@ -19,11 +19,11 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
-from launch_scripts.check import needs
+from launch_scripts.check import needs, ports
 from launch_scripts.cli import main
 from launch_scripts.commands import query
 from launch_scripts.deploy.certificates import issue
-from launch_scripts.launcher import options, preload
+from launch_scripts.launcher import preload
 from launch_scripts.launcher.local_swarm import LocalSwarm
 from launch_scripts.launcher.options import free_ports
 from launch_scripts.launcher.warm_up import WarmUp
@@ -143,7 +143,7 @@ def test_a_mistake_is_answered_with_what_to_do(
     monkeypatch.setattr(query, "_CONNECT_S", 0.3)
     # Neither who else listens here nor how large this machine is has a part in it.
     if mistake.get("given") != "port_taken":
-        monkeypatch.setattr(options, "_taken", lambda host, port: False)
+        monkeypatch.setattr(ports, "_taken", lambda host, port: False)
     monkeypatch.setattr(needs, "this_machine", lambda runs: needs.Machine(64, None, None))
     if "toml" in mistake:
         text = mistake["toml"].replace("\\n", "\n")

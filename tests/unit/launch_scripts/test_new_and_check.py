@@ -15,11 +15,10 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch_scripts.check import needs
+from launch_scripts.check import needs, ports
 from launch_scripts.check.ground import places
 from launch_scripts.cli import main
 from launch_scripts.commands.new import Choices, _asked
-from launch_scripts.launcher import options
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.commented import commented
 from swarm.config.describe import expected, meanings
@@ -35,7 +34,7 @@ ROOMY = needs.Machine(64, None, None)
 def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
-    monkeypatch.setattr(options, "_taken", lambda host, port: False)
+    monkeypatch.setattr(ports, "_taken", lambda host, port: False)
 
 
 def swarm(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
