@@ -18,7 +18,7 @@ from typer.exceptions import TyperException
 from launch_scripts.command_line import complete, usage
 from launch_scripts.command_line.families import CONTEXT, Family, rooted
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
-from launch_scripts.commands import before, chaos, query, roles
+from launch_scripts.commands import afterwards, before, chaos, query, roles
 from launch_scripts.commands.orders import orders
 from launch_scripts.commands.shared_options import (
     AsJson,
@@ -47,7 +47,6 @@ def _began_s() -> float:
 FAMILIES = [
     Family("terrain", "launch_scripts.commands.terrain.terrain", "Look at terrains, and find routes.", PREPARE),
     Family("plugins", "launch_scripts.commands.plugins", "Your own sensors, walks, and so on.", PREPARE),
-    Family("report", "launch_scripts.commands.report", "What runs have left, for other programs.", LEFT),
     Family("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store.", LEFT),
     Family("zone", "launch_scripts.commands.orders.zone", "Close areas while the swarm runs.", ORDER),
     Family("target", "launch_scripts.commands.orders.target", "Add, move and remove targets.", ORDER),
@@ -108,7 +107,7 @@ def demo(run: RunOptions) -> None:
     """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 18 processes.
 
     The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
-    report.json, report.png and a log file per process.
+    report.html, report.json, report.png and a log file per process.
 
     swarm demo --seconds 20 --port 0
     """
@@ -286,63 +285,9 @@ def simulate(
         raise typer.Exit(1)
 
 
-@app.command(rich_help_panel=LEFT)
-def compare(
-    run: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="RUN...", help="Folders of runs, or their names in --runs.", autocompletion=complete.runs
-        ),
-    ],
-    runs: Runs = Path("runs"),
-    as_json: AsJson = False,
-) -> None:
-    """Show what differs between runs: settings, versions and machines, and all figures beside each other.
-
-    Where a run listened is left out: free ports differ each time.
-
-    swarm compare 20261122-154115-44bb LAST
-    """
-    from launch_scripts.commands.compare import compare_runs
-
-    compare_runs(run, runs, as_json)
-
-
-@app.command(rich_help_panel=LEFT)
-def replay(
-    run: Annotated[
-        str,
-        typer.Argument(
-            metavar="RUN", help="A run's folder, its name in --runs, or LAST.", autocompletion=complete.runs
-        ),
-    ] = "LAST",
-    process: Annotated[str | None, typer.Option(help="Only this process, such as planner-t3.")] = None,
-    until: Annotated[
-        float | None, typer.Option(min=0, help="Only so many seconds from the start of the run, by its own clock.")
-    ] = None,
-    keep: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Copy what is replayed into a folder: a test case.")
-    ] = None,
-    runs: Runs = Path("runs"),
-    as_json: AsJson = False,
-) -> None:
-    """Feed what the processes of a run heard to the services of this build, and say where their outputs first
-    differ.
-
-    swarm demo --record-inputs, then swarm replay
-
-    swarm replay LAST --process planner-t3 --until 34.5 --keep my-case
-
-    A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
-    """
-    from launch_scripts.commands.replay import replay_one
-
-    if not replay_one(run, runs, process, until, keep, as_json):
-        raise typer.Exit(1)
-
-
 app.add_typer(before.app)
 app.add_typer(chaos.app)
+app.add_typer(afterwards.app)
 app.add_typer(roles.app)
 app.add_typer(query.app)
 app.add_typer(orders.app)

@@ -16,11 +16,10 @@ from typing import Any
 
 from launch_scripts.check.findings import Finding, failure, ok, warning
 from launch_scripts.check.needs import available_bytes
-from launch_scripts.check.ports import check_ports, free_ports
 from launch_scripts.report.disk_watch import can_write
 from swarm.config.input_files import size
 from swarm.config.scenario import NetworkConfig, Scenario
-from swarm.errors import BusError, SwarmError
+from swarm.errors import SwarmError
 
 PACKAGE = "terrain-swarm"
 _EXTRAS = ("all", "vectors")
@@ -44,7 +43,7 @@ def examine(runs: Path) -> Iterator[Finding]:
 
 
 def _python(about: str, runs: Path) -> Finding:
-    wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"]
+    wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"] or ""
     from packaging.specifiers import SpecifierSet
 
     here = platform.python_version()
@@ -123,6 +122,7 @@ def _shared_memory(about: str, runs: Path) -> Finding:
 
 
 def _zenoh(about: str, runs: Path) -> Finding:
+    from launch_scripts.ports import free_ports
     from swarm.bus.zenoh_bus import open_bus
 
     (port,) = free_ports(1)
@@ -138,6 +138,9 @@ def _zenoh(about: str, runs: Path) -> Finding:
 
 
 def _ports(about: str, runs: Path) -> Finding:
+    from launch_scripts.ports import check_ports
+    from swarm.errors import BusError
+
     try:
         check_ports(Scenario(), ("router", "monitor"))
     except BusError as error:

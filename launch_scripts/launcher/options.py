@@ -9,8 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from launch_scripts.check.ports import check_ports as check_ports
-from launch_scripts.check.ports import free_ports as free_ports
+from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_name
 from shared_map.terrain.importers.sources import is_terrain
 from swarm.config.cost_rules import cost_of_preset

@@ -16,13 +16,7 @@ from launch_scripts.check.settings import check_start
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import log_to
-from launch_scripts.launcher.options import (
-    as_process,
-    check_ports,
-    common_run_id,
-    make_run_dir,
-    new_run_id,
-)
+from launch_scripts.launcher.options import as_process, common_run_id, make_run_dir, new_run_id
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
@@ -31,6 +25,7 @@ from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
+from launch_scripts.ports import check_ports
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder

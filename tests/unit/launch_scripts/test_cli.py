@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from launch_scripts import ports
 from launch_scripts.cli import main
 from launch_scripts.launcher import options
 from swarm.config.load import load_scenario
@@ -122,7 +123,7 @@ def test_runs_where_nobody_may_write(run, tmp_path: Path) -> None:  # type: igno
 
 
 def test_nobody_there_to_ask(run) -> None:  # type: ignore[no-untyped-def]
-    (port,) = options.free_ports(1)
+    (port,) = ports.free_ports(1)
     code, _, err = run("status", "--connect", f"tcp/127.0.0.1:{port}")
     assert code == 4
     assert err.startswith(f"swarm: cannot reach a router at tcp/127.0.0.1:{port}")
@@ -159,7 +160,7 @@ def test_a_port_gives_the_live_view_the_two_after_it_and_0_picks_free_ones() -> 
     free = options.with_port(Scenario(), 0)
     ports = {free.network.listen[0].rpartition(":")[2], str(free.monitor.grpc_port), str(free.monitor.web_port)}
     assert len(ports) == 3
-    options.check_ports(free, ("router", "monitor"))
+    ports.check_ports(free, ("router", "monitor"))
 
 
 def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
@@ -173,8 +174,8 @@ def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
         monitor = msgspec.structs.replace(scenario.monitor, web_port=port)
         scenario = msgspec.structs.replace(scenario, monitor=monitor)
         with pytest.raises(BusError, match=f"port {port}, which the live view needs"):
-            options.check_ports(scenario, ("router", "monitor"))
-        options.check_ports(scenario, ("router", "agent"))
+            ports.check_ports(scenario, ("router", "monitor"))
+        ports.check_ports(scenario, ("router", "agent"))
 
 
 def test_a_run_has_one_folder_whenever_it_is_started_again(tmp_path: Path) -> None:

@@ -19,14 +19,15 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
-from launch_scripts.check import needs, ports
+from launch_scripts import ports
+from launch_scripts.check import needs
 from launch_scripts.cli import main
 from launch_scripts.commands import query
 from launch_scripts.deploy.certificates import issue
 from launch_scripts.launcher import preload
 from launch_scripts.launcher.local_swarm import LocalSwarm
-from launch_scripts.launcher.options import free_ports
 from launch_scripts.launcher.warm_up import WarmUp
+from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_names
 from swarm.config.load import load_scenario
 

@@ -15,7 +15,8 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from launch_scripts.check import needs, ports
+from launch_scripts import ports
+from launch_scripts.check import needs
 from launch_scripts.check.ground import places
 from launch_scripts.cli import main
 from launch_scripts.commands.new import Choices, _asked

@@ -1,4 +1,4 @@
-"""Ports of this machine: which are free, and whether those that a scenario names are."""
+"""Ports of this machine: which are free, and which are taken that a run needs."""
 
 from __future__ import annotations
 
