@@ -78,7 +78,7 @@ class MoversView:
     def summarised(self, summary: RunState) -> None:
         """Takes what the figures say of targets, so that all places say the same."""
         self._details = {line.id: target_details(line) for line in summary.targets}
-        plan = self._recorder.plan
+        plan = self._recorder.model.plan
         self._crew = frozenset(plan.crew_now(plan.targets_now(self._recorder.book)))
 
     def tick(self, now_ns: int) -> None:
