@@ -100,7 +100,7 @@ def test_values_are_completed_with_what_is_there(newest_run: Path) -> None:
     assert offered("up", "jacksboro", "--only", "p") == ["planner"]
     assert offered("compare", "2026") == ["20260102-000000-bbbb", "20260101-000000-aaaa"]
     assert "LAST" in offered("compare", "")
-    assert offered("report", "export", "L") == ["LAST"]
+    assert offered("export", "L") == ["LAST"]
     assert offered("new", "x.toml", "--walk", "w") == ["waypoints"]
     assert offered("new", "x.toml", "--terrain", "s") == ["synthetic"]
     assert offered("new", "x.toml", "--preset", "h") == ["hiker"]
@@ -108,6 +108,8 @@ def test_values_are_completed_with_what_is_there(newest_run: Path) -> None:
     assert offered("set", "pl") == ["planner.cpu_budget", "planner.push_s"]
     assert offered("plugins", "check", "se") == ["sensor"]
     assert offered("chaos", "--blow", "k") == ["kill"]
+    assert offered("export", "LAST", "--what", "ma") == ["marks"]
+    assert offered("export", "LAST", "--format", "g") == ["geojson", "gpkg"]
     assert offered("terrain", "info", "x.tif", "--elevation-encoding", "terra") == ["terrain-rgb", "terrarium"]
 
 

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 import typer
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from launch_scripts import ports
@@ -155,6 +155,10 @@ def test_who_breaks_off_gets_no_file(
     assert not (tmp_path / "my.toml").exists()
 
 
+FEW = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@FEW
 @given(
     st.text("abcXYZ09_.-", min_size=1, max_size=30).filter(lambda name: name[0] not in ".-"),
     st.sampled_from(typing.get_args(Walk)),
@@ -165,14 +169,14 @@ def test_who_breaks_off_gets_no_file(
 def test_a_commented_scenario_is_read_as_what_was_written(
     name: str, walk: str, preset: str | None, count: int, seconds: float
 ) -> None:
-    settings: dict[str, typing.Any] = {
+    chosen: dict[str, typing.Any] = {
         "name": name,
         "seconds": seconds,
         "cost": {} if preset is None else {"preset": preset},
         "targets": [{"count": count, "walk": walk}, {"name": "other"}],
         "groups": [{"vehicles": count}],
     }
-    read = parse_scenario(commented(settings, f"Made for {name}\nby hand"))
+    read = parse_scenario(commented(chosen, f"Made for {name}\nby hand"))
     assert (read.name, read.seconds, read.cost.preset) == (name, seconds, preset)
     assert (read.targets[0].count, read.targets[0].walk, read.targets[1].name) == (count, walk, "other")
     assert read.vehicle_count == count
@@ -235,6 +239,7 @@ start = "heap"
 CELLS = st.tuples(st.integers(-1, 6), st.integers(-1, 6))
 
 
+@FEW
 @given(
     st.lists(st.lists(st.booleans(), min_size=6, max_size=6), min_size=6, max_size=6).filter(
         lambda rows: any(map(any, rows))
@@ -260,6 +265,7 @@ def test_check_refuses_a_placement_exactly_if_the_agents_would(
     assert bool(found) == refused, found
 
 
+@FEW
 @given(CELLS, st.integers(0, 35))
 def test_a_target_may_start_where_vehicles_can_come_to_it(start: tuple[int, int], wall: int) -> None:
     pace = np.full((6, 6), 0.1, np.float32)
