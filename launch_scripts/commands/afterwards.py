@@ -63,11 +63,16 @@ def export(
     what: Annotated[
         list[str] | None,
         typer.Option(
-            help="tracks, targets, captures, routes or marks; may be given several times; all by default."
+            help="tracks, targets, captures, routes or marks; may be given several times; all by default.",
+            autocompletion=complete.words("launch_scripts.report.geo.run_export", "WHAT"),
         ),
     ] = None,
     format: Annotated[
-        str, typer.Option(help="geojson or csv, a file per layer; gpkg, one file with all layers.")
+        str,
+        typer.Option(
+            help="geojson or csv, a file per layer; gpkg, one file with all layers.",
+            autocompletion=complete.words("launch_scripts.report.geo.run_export", "FORMATS"),
+        ),
     ] = "geojson",
     out: Annotated[
         Path | None, typer.Option(help="Folder to write to; by default export/ in the run's folder.")
