@@ -309,6 +309,10 @@ def chaos(
 @app.command()
 def compare(
     run: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs, or their names in --runs.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Also write plots: .html, a page with plots and tables, or .png.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file of --out.")] = False,
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> None:
@@ -317,10 +321,12 @@ def compare(
     Where a run listened is left out: free ports differ each time.
 
     swarm compare 20261122-154115-44bb LAST
+
+    swarm compare RUN RUN RUN --out compared.html
     """
     from launch_scripts.commands.compare import compare_runs
 
-    compare_runs(run, runs, as_json)
+    compare_runs(run, runs, as_json, out, force)
 
 
 RunArgument = Annotated[str, typer.Argument(metavar="RUN", help="A run's folder, its name in --runs, or LAST.")]
