@@ -109,7 +109,7 @@ class AgentService:
             filter=MarkFilter(grid, readable_groups(scenario, group)),
         )
         near = scenario.map.interest == "near"
-        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
         pace, ground = self._cost_map.pace_s_per_m, self._cost_map.ground_s_per_m
         local = LocalMap(grid, pace, ground, terrain.ground_s_per_m, truth, terrain.climb)
         self._faults: list[str] = []
@@ -177,7 +177,7 @@ class AgentService:
             self._bus.collect(TRUE_POSE)
             for target in sorted(self._untracked.targets):
                 self._bus.subscribe(SIGHTED, self._post, target=target)
-        self._bus.subscribe(PUSHED_ROUTE, self._post, agent=self._setup.id)
+        self._bus.collect(PUSHED_ROUTE, agent=self._setup.id)
         self._right_of_way.start(now_ns)
         self._bus.serve(LEAVE, self._post, agent=self._setup.id)
 
@@ -195,9 +195,6 @@ class AgentService:
                 event.end()
             case Heard(message=Sighted() as sighted):
                 self._hear_sighted(sighted, now_ns)
-            case Heard(message=PushedRoute() as pushed):
-                self.counters.count("routes_pushed")
-                self._publish_followed(agent.route_pushed(pushed, now_ns))
             case Replied(tag=tag, message=RouteReply() as reply, took_s=took_s):
                 self.counters.observe("route_query_ms", took_s * 1e3)
                 self.counters.count("routes_received", len(reply.routes))
@@ -225,6 +222,7 @@ class AgentService:
         self._member.tick(now_ns)
         self._sync.tick(now_ns)
         agent = self._agent
+        self._hear_pushed(now_ns)
         self._right_of_way.hear_granted(now_ns)
         if self._entering is not None:
             self._entering.tick(self._right_of_way.core.informed, now_ns)
@@ -338,6 +336,12 @@ class AgentService:
             if counts is not None:  # for the simulated sensor of targets it is the truth
                 self._detector.set_truth(counts, now_ns)
                 self._hear_target_bodies(counts, now_ns)
+
+    def _hear_pushed(self, now_ns: int) -> None:
+        for heard in self._bus.collected(PUSHED_ROUTE):
+            assert isinstance(heard.message, PushedRoute)
+            self.counters.count("routes_pushed")
+            self._publish_followed(self._agent.route_pushed(heard.message, now_ns))
 
     def _hear_bodies(self, now_ns: int) -> None:
         bodies = self._agent.bodies

@@ -26,8 +26,13 @@ def simulate_once(
     from launch_scripts.report.results.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
     from launch_scripts.simulation.simulate import simulate as run_simulation
-    from swarm.errors import StoreError
+    from launch_scripts.simulation.worlds import WORLDS
+    from swarm.errors import ConfigError, StoreError
 
+    if name in WORLDS:
+        raise ConfigError(f"{name!r} is a small world, which goes with --seeds A:B; without it give a scenario")
+    if trace is not None and not trace.parent.is_dir():
+        raise StoreError(f"cannot write --trace {trace}: there is no folder {trace.parent}")
     scenario = find_scenario(name)
     terminal = Terminal(as_json, plain=True)
     with contextlib.ExitStack() as stack:
@@ -43,7 +48,7 @@ def simulate_once(
         folder = make_run_dir(runs, f"{new_run_id()}-simulated")
         for sentence in begin_run(folder, scenario, folder.name):
             terminal.say(sentence, "yellow")
-        result = run_simulation(scenario, trace=log)
+        result = run_simulation(scenario, trace=log, record_to=folder)
     if as_json:
         numbers = {name: value for name, value in result.report.items() if name != "by_vehicle"}
         typer.echo(json.dumps(numbers, indent=2))
@@ -55,7 +60,7 @@ def simulate_once(
         f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
         f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
     )
-    terminal.say(f"report: {folder / 'report.json'}, picture: {folder / 'report.png'}")
+    terminal.say(f"report: {folder / 'report.html'}, numbers: {folder / 'report.json'}")
     if result.trace_cut is not None:
         raise StoreError(f"the event log {trace} has no end: {result.trace_cut}")
 

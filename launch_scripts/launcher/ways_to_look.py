@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import getpass
+import os
 import shutil
 import socket
 import sys
@@ -33,7 +33,7 @@ def rerun_command() -> str:
 def tunnel(page: str) -> str:
     """How to reach a page of this machine from another one."""
     port = urllib.parse.urlsplit(page).port
-    return f"ssh -N -L {port}:127.0.0.1:{port} {getpass.getuser()}@{socket.gethostname()}"
+    return f"ssh -N -L {port}:127.0.0.1:{port} {os.environ.get('USER', 'USER')}@{socket.gethostname()}"
 
 
 def shown(path: Path) -> str:

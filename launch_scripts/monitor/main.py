@@ -33,7 +33,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_bus(setup.scenario.network, patient=True))
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
-        sinks = Sinks(recording_id, path, config, make_blueprint(mesh, knows_truth=knows_truth))
+        blueprint = make_blueprint(mesh, vehicles=setup.scenario.vehicle_count, knows_truth=knows_truth)
+        sinks = Sinks(recording_id, path, config, blueprint)
         stack.callback(sinks.close)
         service = MonitorService(
             setup,

@@ -14,37 +14,33 @@ from typing import Any
 import numpy as np
 
 from launch_scripts.report.begun_routes import BegunRoutes
-from launch_scripts.report.latest_state import MarkedCells, Observed
+from launch_scripts.report.latest_state import MarkedCells
 from launch_scripts.report.results.certified_gap import gaps_to, of_excess
 from launch_scripts.report.results.results import Driven, results
 from launch_scripts.report.run_state.facts import for_report
+from launch_scripts.report.run_state.model import HEARD, RunModel
 from launch_scripts.report.run_state.plan import plan_of
-from launch_scripts.report.run_state.state import RunState, state_of
+from launch_scripts.report.run_state.state import RunState
 from launch_scripts.report.samples import Sample, Samples, at_once, buckets_of, certified_gaps, messages_per_s
-from launch_scripts.report.tracked_targets import TrackedTargets
 from launch_scripts.report.tracks import TrackKey, Tracks
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.order_book import OrderBook
 from swarm.runtime.stats import MESSAGES_PER_S, Histogram
 from swarm.wire.messages.base import Message
-from swarm.wire.messages.orders import Orders
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
-from swarm.wire.topics import FLEET, FOLLOWED, LEAD, MARKS, NOTE, ORDERS, POSE, STATS, STATUS, Topic
+from swarm.wire.messages.vehicles import Followed, VehicleState
+from swarm.wire.topics import FOLLOWED, MARKS, NOTE, Topic
 
 TRACK_S = 0.5
 """Places are sampled so often."""
 ROUTES_S = 2.0
 """Of the routes that a vehicle begins within this time, the newest is kept."""
 RECORDED: dict[Topic, float] = {
-    STATS: 0.0, STATUS: 0.0, NOTE: 0.0, POSE: 0.0, LEAD: TRACK_S, ORDERS: TRACK_S, FLEET: TRACK_S, MARKS: TRACK_S,
-    FOLLOWED: ROUTES_S,
+    **HEARD, NOTE: 0.0, MARKS: TRACK_S, FOLLOWED: ROUTES_S
 }  # fmt: skip
 """What a recorder hears, and how often it takes the newest of each key, in seconds; 0 for all that comes."""
 
@@ -69,13 +65,9 @@ class Recorder:
     def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
         """started_ns  when the run began; None: with the first message"""
         self.scenario = scenario
-        self.plan = plan_of(scenario, started_ns)
-        self.book = OrderBook()
-        """What operators have ordered."""
         self.grid = grid
-        self.observed = Observed(grid)
-        self.tracked = TrackedTargets(grid, self.observed.status)
-        self.first_ns: int | None = None
+        self.model = RunModel(plan_of(scenario, started_ns), grid)
+        self.observed, self.tracked, self.book = self.model.observed, self.model.tracked, self.model.book
         self.last_ns: int | None = None
         self.ready_ns: int | None = None
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
@@ -97,14 +89,9 @@ class Recorder:
     def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
         """Records one message; `fields` are the chunks of its key."""
         self._touch(now_ns)
+        if self.model.heard(message, now_ns) is None:
+            return
         match message:
-            case TargetPose():
-                counts = self.tracked.hear(message, now_ns)
-                if counts is None:
-                    return
-                message = counts
-            case Fleet():
-                self.tracked.something_moved(now_ns)
             case Followed():
                 self.routes.add(now_ns, message)
             case PlannerStatus(gap_max=float(gap)):
@@ -113,37 +100,26 @@ class Recorder:
                 if message.kind == "capture":
                     self._capture(message, now_ns)
                 self.notes.append((self.seconds(now_ns), message))
-            case Orders():
-                self.book.merge(message.orders, now_ns)
-        self.observed.heard(message, now_ns)
         self._look(now_ns)
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
         self._touch(now_ns)
-        self.observed.alive(peer, up, now_ns)
+        self.model.alive(peer, up, now_ns)
         self._look(now_ns)
-
-    @property
-    def began_ns(self) -> int | None:
-        """When the run began; None before the first message of one whose beginning is not known."""
-        return self.first_ns if self.plan.started_ns is None else self.plan.started_ns
 
     def seconds(self, now_ns: int) -> float:
         """Time of the run."""
-        return 0.0 if self.began_ns is None else (now_ns - self.began_ns) / NS_PER_S
+        return 0.0 if self.model.began_ns is None else (now_ns - self.model.began_ns) / NS_PER_S
 
     def missing(self) -> list[str]:
-        """Processes that the run needs which are not alive now, as `role id`."""
-        crew = self.plan.crew_now(self.plan.targets_now(self.book))
-        return [f"{role} {id}" for role, id in crew if not self.observed.fills(role, id)]
+        """Processes that the run needs which are not alive, as `role id`."""
+        return self.model.missing()
 
     def marked(self) -> MarkedCells:
         return self.observed.marked()
 
     def _touch(self, now_ns: int) -> None:
-        if self.first_ns is None:
-            self.first_ns = now_ns
         self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
 
     def _capture(self, note: Note, now_ns: int) -> None:
@@ -202,7 +178,7 @@ class Recorder:
 
     def summary(self, now_ns: int) -> RunState:
         """What the run is at a time."""
-        return state_of(self.observed, self.tracked, self.plan, self.book, now_ns, self.began_ns)
+        return self.model.state(now_ns)
 
     def report(
         self,
@@ -212,8 +188,8 @@ class Recorder:
         startup_s: float | None = None,
     ) -> dict[str, Any]:
         """The numbers of the run, None where not measured. The caller gives what it knows better."""
-        if seconds is None and self.first_ns is not None and self.last_ns is not None:
-            seconds = (self.last_ns - self.first_ns) / NS_PER_S
+        if seconds is None and self.model.first_ns is not None and self.last_ns is not None:
+            seconds = (self.last_ns - self.model.first_ns) / NS_PER_S
         observed, total = self.observed, self.observed.total
         state = self.summary(self.last_ns or 0)
         rates = [rate for _, rate in messages_per_s(self.samples.all())]

@@ -36,8 +36,6 @@ _MAX_ASKS = 16
 _CHANGES_EVERY_NS = NS_PER_S // 2
 _CHANGES_FOR_NS = 2 * NS_PER_S
 _OFFERS_AT_ONCE = 256
-_MOST_HEARD = 4096
-"""Sets that wait for a tick; more are merged as they come."""
 _QUANTUM = 16_384
 """Statements of one author that are merged before its quota is looked at again."""
 _MANY = "-"
@@ -59,7 +57,8 @@ class MapSync:
     on_accepted  called with every set that is merged
     on_digest    called with the author of every digest that is heard, and when
     near         hold only regions that `enter` names, instead of the whole map
-    at_ticks     merge what others put at the next tick, all at once: for a service that uses the map at ticks only
+    at_ticks     merge what others put at the next tick, all at once, and wake nobody for it: for a service that
+                 uses the map at ticks only
     joined       the late join is over: an answer came, or every try failed
     """
 
@@ -95,8 +94,6 @@ class MapSync:
         self._join_due_ns: int | None = None  # ask again then
         self._join_tries = 0
         self._at_ticks = at_ticks
-        self._heard: list[tuple[str, Message]] = []
-        """Sets that were put and are merged at the next tick; always empty unless `at_ticks`."""
         self._digest_ns = int(config.digest_s * NS_PER_S)
         self._digest_due_ns = 0
         self._changes_due_ns = 0
@@ -112,7 +109,7 @@ class MapSync:
         """Subscribe, serve, and ask for all that was stated before."""
         self._started_ns = now_ns
         if self._regions is None:
-            self._bus.subscribe(MARKS, self._post, together=True)
+            self._listen()
             self._join()
         self._bus.collect(DIGEST)
         if self._serves_all:
@@ -129,7 +126,7 @@ class MapSync:
         self._regions = regions
         new, grid = sorted(regions - before), self.replica.grid
         for region in new:
-            self._bus.subscribe(MARKS, self._post, together=True, region=region)
+            self._listen(region=region)
         for region in sorted(before - regions):
             self._bus.unsubscribe(MARKS, region=region)
         self.replica.limit_to(regions)
@@ -137,14 +134,17 @@ class MapSync:
         if tiles:
             self._bus.ask(MARKS, MarksRequest(tiles=tiles, bulk=True), self._post, tag=_ENTER)
 
+    def _listen(self, **fields: int) -> None:
+        if self._at_ticks:
+            self._bus.collect(MARKS, **fields)
+        else:
+            self._bus.subscribe(MARKS, self._post, together=True, **fields)
+
     def handle(self, event: Event, now_ns: int) -> bool:
         """True if the event concerns the map only, so that no other part needs to handle it."""
         match event:
             case HeardMany(topic=topic, samples=samples) if topic is MARKS:
-                if self._at_ticks and len(self._heard) < _MOST_HEARD:
-                    self._heard.extend(samples)
-                else:
-                    self._hear(samples, now_ns)
+                self._hear(samples, now_ns)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag in (_JOIN, _ENTER):
                 self._merge(self._sets_in(event), measured=False)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag.startswith(_RESYNC):
@@ -171,9 +171,7 @@ class MapSync:
             assert isinstance(digest.message, Digest)
             self._on_digest(digest.message.author, now_ns)
             self._hear_digest(digest.message, now_ns)
-        if self._heard:
-            heard, self._heard = self._heard, []
-            self._hear(heard, now_ns)
+        self._take_in(now_ns)
         self._merge_waiting(now_ns)
         self.publish(self.replica.tick(now_ns))
         if self._join_due_ns is not None and now_ns >= self._join_due_ns:
@@ -190,8 +188,9 @@ class MapSync:
     def holds(self, author: str, rows: bytes, now_ns: int) -> bool:
         """Whether the map has what these rows of a digest name of an author, as far as it is of interest here, and
         it has not ended yet by our clock. What is missing is asked for."""
+        self._take_in(now_ns)
         lacking = self.replica.lacking(author, rows)
-        if lacking and not self._heard:  # else it may have come, and waits for the tick
+        if lacking:
             self._fetch(author, lacking, now_ns)
         return not lacking and not self.replica.has_ended(author)
 
@@ -207,6 +206,11 @@ class MapSync:
             self._changed.setdefault(mark_set.tile, None)
         region = self.replica.grid.region_of_tile(mark_set.tile)
         self._bus.publish(MARKS, mark_set, region=region, tile=mark_set.tile, author=mark_set.author)
+
+    def _take_in(self, now_ns: int) -> None:
+        """Merge what others put since the last tick."""
+        if self._at_ticks and (samples := self._bus.collected_together(MARKS)):
+            self._hear(samples, now_ns)
 
     def _hear(self, samples: Sequence[tuple[str, Message]], now_ns: int) -> None:
         """Sets that were put, each under the key of its tile and author: access is granted by key."""

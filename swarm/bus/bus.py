@@ -246,6 +246,11 @@ class Bus(Protocol):
         """What has been kept on a topic since the last call, as `newest_of` says."""
         ...
 
+    def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
+        """All that has been kept on a topic since the last call, in order, with keys as in a `HeardMany`: for a
+        topic of many small messages. The reader compares each key with its message."""
+        ...
+
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         """End every subscription that was made with exactly these fields, by `subscribe` or `collect`. Samples
         under way may be posted after it."""

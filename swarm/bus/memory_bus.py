@@ -18,6 +18,7 @@ from swarm.bus.bus import (
     Disappeared,
     Event,
     Heard,
+    HeardMany,
     LinkChanged,
     Post,
     check_subscription,
@@ -211,6 +212,12 @@ class MemoryBus:
 
         kept = self._kept.pop(topic.name, ())
         return newest_of(topic, ((sample.key, sample) for sample in kept), hear)
+
+    def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
+        together: list[Event] = []
+        for sample in self._kept.pop(topic.name, ()):
+            self.hear(sample, as_batches(together.append))
+        return [sample for event in together if isinstance(event, HeardMany) for sample in event.samples]
 
     def keep(self, sample: _Sample) -> None:
         """Keep a sample for `collected`."""

@@ -176,15 +176,7 @@ class ZenohBus:
                 post(heard)
 
         def arrive_together(samples: list[zenoh.Sample]) -> None:
-            keyed = list(self._packed(topic, samples))
-            keys = [key for key, _ in keyed]
-            decoded = decode_many([payload for _, payload in keyed], topic.message)
-            heard: list[tuple[str, Message]] = []
-            for key, message in zip(keys, decoded, strict=True):
-                if isinstance(message, ProtocolError):
-                    self._drop(key, message)
-                else:
-                    heard.append((key[len(self._namespace) + 1 :], message))
+            heard = self._together(topic, samples)
             if heard:
                 post(HeardMany(topic, heard))
 
@@ -210,6 +202,25 @@ class ZenohBus:
         heard: list[Heard] = []
         for subscriber in self._collecting.get(topic.name, ()):
             heard += self._newest(topic, taken_from(subscriber.handler, topic.buffer))
+        return heard
+
+    def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
+        samples: list[zenoh.Sample] = []
+        for subscriber in self._collecting.get(topic.name, ()):
+            samples += taken_from(subscriber.handler, topic.buffer)
+        return self._together(topic, samples) if samples else []
+
+    def _together(self, topic: Topic, samples: list[zenoh.Sample]) -> list[tuple[str, Message]]:
+        """Keys below the namespace and messages of samples, without those that are rejected."""
+        keyed = list(self._packed(topic, samples))
+        keys = [key for key, _ in keyed]
+        decoded = decode_many([payload for _, payload in keyed], topic.message)
+        heard: list[tuple[str, Message]] = []
+        for key, message in zip(keys, decoded, strict=True):
+            if isinstance(message, ProtocolError):
+                self._drop(key, message)
+            else:
+                heard.append((key[len(self._namespace) + 1 :], message))
         return heard
 
     def _newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:

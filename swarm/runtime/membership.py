@@ -131,9 +131,9 @@ class Member:
             id=self.info.id,
             incarnation=self.info.incarnation,
             stamp_ns=now_ns,
-            counts=counts,
-            gauges=dict(self.counters.gauges),
-            histograms={name: h.buckets for name, h in self.counters.histograms.items()},
+            counts=dict(sorted(counts.items())),  # when a figure was counted first must not show in the bytes
+            gauges=dict(sorted(self.counters.gauges.items())),
+            histograms={name: h.buckets for name, h in sorted(self.counters.histograms.items())},
             counts_by=self.counters.counts_by,
             histograms_by={
                 name: {id: h.buckets for id, h in each.items()}

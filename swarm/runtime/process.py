@@ -153,7 +153,7 @@ class Process:
         counters = self._service.counters
         counters.count("ticks_dropped", 0)
         counters.count("ticks_late", 0)
-        counters.counts.update(self._inbox.counts)
+        counters.set_counts(self._inbox.counts)
         self._service.start(self._clock.now_ns())
         try:
             with collected_rarely():
@@ -164,7 +164,7 @@ class Process:
             for number in self._signals:
                 signal.signal(number, signal.SIG_IGN)
             self._inbox.close()
-            counters.counts.update(self._inbox.counts)
+            counters.set_counts(self._inbox.counts)
             self._service.stop(self._clock.now_ns())
 
     def _loop(self, counters: Counters) -> None:
@@ -185,7 +185,7 @@ class Process:
                 events_until_ns = now_ns + 2 * took_ns
                 counters.observe("tick_ms", took_ns / 1e6)
                 counters.gauge("inbox", float(len(self._inbox)))
-                counters.counts.update(self._inbox.counts)
+                counters.set_counts(self._inbox.counts)
             # Bounded, because a signal handler does not interrupt a wait for a lock.
             wait_s = min((due_ns - self._clock.now_ns()) / NS_PER_S, 0.5)
             event = self._inbox.take(wait_s)

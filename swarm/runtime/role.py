@@ -22,6 +22,7 @@ class RoleSetup:
     added        of an agent that the scenario does not name: what it hosts
     restarts     how often it was started before in this run
     before       what its earlier lives have counted; None if that is not known
+    record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
     """
 
     scenario: Scenario
@@ -34,6 +35,7 @@ class RoleSetup:
     added: AddedAgent | None = None
     restarts: int = 0
     before: Stats | None = None
+    record_inputs: bool = False
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
         """What this process answers when others ask which run it belongs to."""

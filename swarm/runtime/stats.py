@@ -172,6 +172,10 @@ class Counters:
     def count(self, name: str, by: int = 1) -> None:
         self.counts[name] = self.counts.get(name, 0) + by
 
+    def set_counts(self, counts: Mapping[str, int]) -> None:
+        """Take over what somebody else counts, under its names."""
+        self.counts.update(counts)
+
     def gauge(self, name: str, value: float) -> None:
         """Set the present value; infinities and NaN remove it."""
         if math.isfinite(value):

@@ -1,4 +1,4 @@
-"""Messages to bytes and back: msgpack turns plain values into bytes, msgspec turns messages into plain values.
+"""Messages to bytes and back, by msgspec; msgpack reads what is long, and says what is wrong with the rest.
 
 `decode` raises nothing but ProtocolError, whatever bytes it is given, and takes a bounded amount of memory.
 Decision 5 says what each of the two libraries does and what that costs.
@@ -30,6 +30,8 @@ MAX_ITEMS = 1 << 18
 M = TypeVar("M", bound=Message)
 N = TypeVar("N", bound=Message)
 
+_ENCODER = msgspec.msgpack.Encoder()
+_SCHEMA = b"\xa6schema"
 _BYTES = (bytes,)
 """What msgspec leaves as it is, because msgpack has a type of its own for it (JSON, its default, has not)."""
 _LIMITS: dict[str, Any] = {
@@ -43,25 +45,48 @@ _STEPS = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 _MANY_SETS = 8
 """From so many sets of marks on, checking them as arrays is faster than one by one."""
 _STATEMENT_COLUMNS = ("cells", "kinds", "paces", "stamps_ns")
+_DECODERS: dict[type[Message], msgspec.msgpack.Decoder[Any]] = {}
+"""Of each message type that was decoded so far."""
 
 
 def encode(message: Message) -> bytes:
     """A message as MessagePack: a map of its fields in their order, its `schema` first."""
-    payload: bytes = msgpack.packb(msgspec.to_builtins(message, builtin_types=_BYTES))
-    return payload
+    return _ENCODER.encode(message)
 
 
 def decode(payload: bytes, message_type: type[M]) -> M:
     """The message in a payload. Raises ProtocolError, and nothing else, on what is not one."""
-    return _checked(_converted(_unpacked(payload), message_type))
+    return _checked(_read(payload, message_type))
 
 
 def decode_either(payload: bytes, usual: type[M], other: type[N] | None) -> M | N:
     """As `decode`, of a payload that is of type `other` if its schema says so, else of type `usual`."""
-    fields = _unpacked(payload)
-    if other is not None and fields["schema"] == schema_of_type(other):
-        return _checked(_converted(fields, other))
-    return _checked(_converted(fields, usual))
+    if other is not None and _unpacked(payload)["schema"] == schema_of_type(other):
+        return decode(payload, other)
+    return decode(payload, usual)
+
+
+def _read(payload: bytes, message_type: type[M]) -> M:
+    """The message in a payload, its types and ranges checked. Raises ProtocolError.
+
+    What a swarm sends is short and right, and msgspec reads it at once; `MAX_ITEMS` bytes cannot hold more items
+    than a payload may. A longer one goes the long way, so that its items are counted; one that msgspec refuses, so
+    that the error says which field is wrong and what was found; and one that does not begin with its schema, as
+    msgspec takes a tag that is missing for the right one.
+    """
+    if len(payload) <= MAX_ITEMS and _begins_with_schema(payload):
+        decoder = _DECODERS.get(message_type) or _DECODERS.setdefault(
+            message_type, msgspec.msgpack.Decoder(message_type)
+        )
+        with contextlib.suppress(Exception):  # its own errors, those of our rules, RecursionError
+            message: M = decoder.decode(payload)
+            return message
+    return _converted(_unpacked(payload), message_type)
+
+
+def _begins_with_schema(payload: bytes) -> bool:
+    """Whether it is a map whose first key is "schema", as `encode` writes it."""
+    return payload.startswith(_SCHEMA, 1 if payload[:1] < b"\x90" else 3)
 
 
 def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | ProtocolError]:
@@ -71,7 +96,7 @@ def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | Pr
     unchecked: list[tuple[int, MarkSet]] = []
     for payload in payloads:
         try:
-            message = _converted(_unpacked(payload), message_type)
+            message = _read(payload, message_type)
             if at_once and isinstance(message, MarkSet):
                 message.check_head()
                 unchecked.append((len(found), message))
@@ -102,6 +127,7 @@ def prime(message_type: type[Message]) -> None:
     """
     with contextlib.suppress(msgspec.ValidationError):
         msgspec.convert({}, message_type)
+    _DECODERS[message_type] = msgspec.msgpack.Decoder(message_type)
 
 
 def schema_of_type(message_type: type[Message]) -> str:

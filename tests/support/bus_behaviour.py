@@ -130,6 +130,33 @@ def test_what_is_collected_waits_and_of_each_key_the_newest_is_left(world: World
     assert b.counts["payloads_dropped"] == 6  # each that was heard; of those collected the one after the newest
 
 
+def test_what_is_collected_together_is_all_that_came_in_order_without_garbage(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    box = Box()
+    b.subscribe(MARKS, box, together=True)
+    b.collect(MARKS, region=0)
+    b.collect(MARKS, region=1)
+    world.settle()
+    assert b.collected_together(MARKS) == []
+    sent = [marks("a0.1", tile) for tile in (*range(12), 3, 3)]
+    for region in (0, 1, 2):
+        for each in sent:
+            a.publish(MARKS, each, region=region, tile=each.tile, author="a0.1")
+            world.put_bytes(a, MARKS, b"garbage", region=str(region), tile=str(each.tile), author="a0.1")
+    world.until(lambda: sum(len(event.samples) for event in box) == 3 * len(sent))
+    dropped = b.counts["payloads_dropped"]
+    collected = b.collected_together(MARKS)
+    assert collected == [(f"marks/{region}/{each.tile}/a0.1", each) for region in (0, 1) for each in sent]
+    assert b.counts["payloads_dropped"] == dropped + 2 * len(sent)
+    assert b.collected_together(MARKS) == []
+    b.unsubscribe(MARKS, region=0)
+    world.settle()
+    for region in (0, 1):
+        a.publish(MARKS, sent[0], region=region, tile=0, author="a0.1")
+    world.until(lambda: sum(len(event.samples) for event in box) == 3 * len(sent) + 2)
+    assert b.collected_together(MARKS) == [("marks/1/0/a0.1", sent[0])]
+
+
 def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: World):
     a, b = world.bus("a"), world.bus("b")
     b.collect(NOTE)

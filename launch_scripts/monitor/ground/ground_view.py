@@ -13,6 +13,7 @@ from launch_scripts.monitor.ground.ground_drawing import PHOTO, GroundDrawing
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.ground.windows import window_outlines
 from launch_scripts.monitor.ground.zones import Area, closed_cells, ordered_areas
+from launch_scripts.monitor.movers.looks import Look
 from launch_scripts.monitor.serving.sinks import Streams
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
@@ -51,6 +52,7 @@ class GroundView:
 
     truth  the true ground, where this process knows it
     zones  those of the scenario
+    movers  what the legends say of all that moves
     """
 
     def __init__(
@@ -62,8 +64,10 @@ class GroundView:
         replica: MapReplica,
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
+        movers: Sequence[Look] = (),
     ) -> None:
         self._mesh, self._cost_map, self._replica, self._zones = mesh, cost_map, replica, list(zones)
+        self._movers = movers
         self._cells = terrain.grid.cells
         self._drawing = GroundDrawing(rec, mesh)
         self._colours = colours = GroundColours(mesh, terrain, cost_map.ground_s_per_m, truth)
@@ -84,7 +88,7 @@ class GroundView:
     def begin(self) -> None:
         """Draws all of it."""
         entities = [each.entity for each in self._layers]
-        self._drawing.begin(entities[1:], layers.legends(self._colours, entities), self._zones)
+        self._drawing.begin(entities[1:], layers.legends(self._colours, entities, self._movers), self._zones)
         self._drawing.ordered(self._ordered)
         for layer in self._layers:
             layer.stale = dict.fromkeys(range(self._mesh.tiles))

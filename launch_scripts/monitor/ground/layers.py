@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,11 +14,11 @@ from launch_scripts.monitor.ground.legend import (
     FOUND,
     KNOWN_OR_NOT,
     LETHAL_COST,
-    LINES,
-    MOVERS,
+    WINDOW,
     Scale,
     legend_picture,
 )
+from launch_scripts.monitor.movers.looks import Look
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +40,14 @@ _ENTRIES = {
 }
 
 
-def legends(colours: GroundColours, entities: Collection[str]) -> dict[str, bytes]:
-    """Name -> PNG, of the layers with these entities."""
+def legends(colours: GroundColours, entities: Collection[str], movers: Sequence[Look] = ()) -> dict[str, bytes]:
+    """Name -> PNG, of the layers with these entities.
+
+    movers  what it says of all that moves
+    """
     scales = {COST.name: _cost_scale(colours)}
     return {
-        layer.name: legend_picture((*entries, *MOVERS, *LINES), scales.get(layer.name))
+        layer.name: legend_picture((*entries, WINDOW, *movers), scales.get(layer.name))
         for layer, entries in _ENTRIES.items()
         if layer.entity in entities
     }

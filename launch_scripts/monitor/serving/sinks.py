@@ -57,9 +57,9 @@ class Streams:
     def __init__(self, *streams: rr.RecordingStream) -> None:
         self.streams = streams
 
-    def log(self, path: str, what: Any, *, static: bool = False) -> None:
+    def log(self, path: str, *what: Any, static: bool = False) -> None:
         for stream in self.streams:
-            stream.log(path, what, static=static)
+            stream.log(path, *what, static=static)
 
     def set_time(self, timeline: str, **when: Any) -> None:
         for stream in self.streams:

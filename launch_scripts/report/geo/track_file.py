@@ -84,7 +84,7 @@ class RunTracks:
 def packed_tracks(recorder: Recorder) -> bytes:
     """The content of the file."""
     grid = recorder.grid
-    began_ns = recorder.first_ns or 0
+    began_ns = recorder.model.began_ns or 0
     arrays: dict[str, NDArray[Any]] = {"grid": np.array(json.dumps(asdict(grid)))}
     for name, tracks in (("vehicles", recorder.vehicle_tracks), ("targets", recorder.target_tracks)):
         arrays |= {f"{name}_{column}": array for column, array in _columns(tracks).items()}

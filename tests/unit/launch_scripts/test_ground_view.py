@@ -36,6 +36,7 @@ from launch_scripts.monitor.ground.zones import (
     scenario_areas,
     title_places,
 )
+from launch_scripts.monitor.movers.looks import Looks
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
@@ -197,8 +198,12 @@ def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
         assert said_heights(factor) in map_margin(mesh).texts
 
 
-def test_every_layer_has_a_legend() -> None:
-    pictures = legends(colours_of(flat()), [PHOTO.entity, COST.entity, KNOWN.entity])
+@pytest.mark.parametrize(
+    "groups", [["all"], ["reconnaissance", "haulage-trucks", "fire-fighters", "police-cars", "e"]]
+)
+def test_every_layer_has_a_legend(groups: list[str]) -> None:
+    layers = [PHOTO.entity, COST.entity, KNOWN.entity]
+    pictures = legends(colours_of(flat()), layers, Looks(groups, ["t0"]).legend())
     assert set(pictures) == {"photo", "cost", "known"}
     for picture in pictures.values():
         image = Image.open(io.BytesIO(picture)).convert("RGB")

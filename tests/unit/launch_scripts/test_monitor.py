@@ -124,7 +124,7 @@ def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
     rig.play([(NS_PER_S // 2, seen)])
     rig.run(3)
     rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 2
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 3, "none, one, none"
 
 
 def test_a_body_is_drawn_where_it_says_and_taken_away_when_its_lease_ends(
@@ -137,7 +137,7 @@ def test_a_body_is_drawn_where_it_says_and_taken_away_when_its_lease_ends(
     rig.play([(NS_PER_S // 2, body), (NS_PER_S, msgspec.structs.replace(body, seq=2, x_m=x_m + 30.0))])
     rig.run(3)
     rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/bodies"] == 3
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/bodies/discs"] == 4, "none, here, there, none"
 
 
 def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
