@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import closing
 
 from planner_service.kernel_build import KernelLoader
-from planner_service.prepared_costs import prepared_costs
+from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
 from planner_service.service import PlannerService
 from planner_service.target_tree import is_slow_to_grow
 from shared_map.terrain.kept import kept_key
@@ -19,6 +19,7 @@ from swarm.errors import ConfigError
 from swarm.ranks import job_of
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, ThreadWorker, end_with, tick_phase
+from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 
@@ -42,11 +43,19 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     with (
         open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
         closing(ThreadWorker("grow-tree", inbox)) as worker,
+        recorded(setup, terrain.digest) as boundary,
     ):
         service = PlannerService(
-            setup, terrain, bus, inbox.post, worker, time.thread_time_ns, lambda: kernels.complete, prepared
+            setup,
+            terrain,
+            boundary.bus(bus),
+            inbox.post,
+            boundary.worker(worker),
+            boundary.function("stopwatch", time.thread_time_ns, int),
+            boundary.function("all kernels", lambda: kernels.complete, bool),
+            boundary.outside(prepared, PREPARED_COSTS),
         )
-        process = Process(service, inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id))
+        process = Process(boundary.service(service), inbox, clock, scenario.planner.tick_hz, tick_phase(setup.id))
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

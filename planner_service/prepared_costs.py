@@ -25,8 +25,17 @@ from shared_map.source_digest import source_digest
 from shared_map.terrain.kept import keep_beside
 from shared_map.terrain.terrain import Terrain
 from swarm.config.scenario import PlannerConfig
+from swarm.runtime.recording.outside import Outside
 
 log = logging.getLogger(__name__)
+
+
+PREPARED_COSTS = Outside(
+    "prepared costs",
+    calls={"load": np.ndarray | None, "claim": bool, "leave": None},
+    fixed=("cell_cost",),
+)
+"""What a planner uses of them."""
 
 
 class PreparedCosts:

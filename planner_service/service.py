@@ -46,7 +46,7 @@ class PlannerService:
 
     stopwatch     the CPU time of this thread, ns, that growths on it are timed with; a simulation gives none, and a
                   model is used
-    all_kernels   whether all kernels may be called by now, not only those for whole trees
+    all_kernels   whether all kernels may be called by now, not only those for whole trees; if not given, they may
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class PlannerService:
         post: Post,
         worker: Worker,
         stopwatch: Callable[[], int] | None = None,
-        all_kernels: Callable[[], bool] = lambda: True,
+        all_kernels: Callable[[], bool] | None = None,
         prepared: PreparedCosts | None = None,
     ) -> None:
         scenario = setup.scenario
@@ -66,7 +66,7 @@ class PlannerService:
         self._bus = bus
         self._post = post
         self._worker = worker
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
         self.counters = self._member.counters
         self._cost_map = CostMap(terrain)
@@ -81,7 +81,12 @@ class PlannerService:
         world = StrategyWorld(self._target, terrain.grid, scenario.planner)
         chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
         tree = TargetTree(
-            terrain.grid, scenario.planner, terrain.climb, all_kernels, has_worker=True, chosen_by=chosen_by
+            terrain.grid,
+            scenario.planner,
+            terrain.climb,
+            all_kernels or (lambda: True),
+            has_worker=True,
+            chosen_by=chosen_by,
         )
         if prepared is not None:
             tree.share(prepared.cell_cost)

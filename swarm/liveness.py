@@ -47,6 +47,10 @@ class Roster:
         if not incarnations:
             self._alive.pop((peer.role, peer.id), None)
 
+    def up(self) -> list[tuple[str, str]]:
+        """(role, id) of all processes that are alive, in order."""
+        return sorted(self._alive)
+
     def alive(self, role: str) -> dict[str, int]:
         """Id -> newest incarnation of the live processes of a role, in order of id."""
         return {id: incarnations[-1] for (r, id), incarnations in sorted(self._alive.items()) if r == role}

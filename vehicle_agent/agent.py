@@ -26,6 +26,7 @@ from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.driving.vehicle import AskRoute, Follow, GivenRoute, Vehicle
 from vehicle_agent.local_map import LocalMap, meet
+from vehicle_agent.sensing.empty_places import EmptyPlaces
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.steering import Steering
@@ -109,6 +110,7 @@ class Agent:
         self._planners: dict[str, int] = {}
         self._poses: dict[str, TargetPose] = {}
         self._trackings = Trackings(local_map.grid)
+        self._empty = EmptyPlaces(self._trackings)
         self._requests = 0
         self._route_requests: dict[int, AskRoutes] = {}
         self._assignment = Assignment(self.targets, assigner or Spread(), config.reassign_s, chance.random())
@@ -255,7 +257,11 @@ class Agent:
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[AskRoute]] = {}
         self.blocked_ticks = 0
-        lost = self._trackings.lost(now_ns)
+        if self._empty.look(
+            (each.target for each in self.vehicles.values() if each.target and each.in_reach), now_ns
+        ):
+            self._assignment.ask_soon(now_ns)
+        lost = self._trackings.lost(now_ns) | self._empty.of
         self.detours.tick(self.vehicles.values(), self.holdings.path, now_ns)
         driven: list[Vehicle] = []
         for vehicle in self.vehicles.values():
@@ -326,12 +332,15 @@ class Agent:
         """Where a tracker of a target says it is; returns that, with its cell, if it counts."""
         counts = self._trackings.hear(pose, now_ns)
         if counts is not None:
+            self._empty.placed(pose.target, by_sight=False)
             self._moved(counts, now_ns)
         return counts
 
     def see_target(self, pose: TargetPose, now_ns: int) -> None:
         """Where a target without a tracker is, by the best sighting of it. A pose outside the grid is ignored."""
         if 0 <= pose.cell < self._map.grid.cells:
+            if pose != self._poses.get(pose.target):
+                self._empty.placed(pose.target, by_sight=True)
             self._trackings.place(pose, now_ns)
             self._moved(pose, now_ns)
 
@@ -428,4 +437,4 @@ class Agent:
 
     def costs_ended(self, request: int, now_ns: int) -> None:
         """No more answers to `AskCosts` will come."""
-        self._assignment.costs_ended(request, self.vehicles, self._planners, now_ns)
+        self._assignment.costs_ended(request, self.vehicles, self._planners, now_ns, self._empty.of)

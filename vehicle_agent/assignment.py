@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -248,15 +248,23 @@ class Assignment:
             self._costs_s[target] = costs_s
 
     def costs_ended(
-        self, request: int, vehicles: Mapping[str, Vehicle], planners: Mapping[str, int], now_ns: int
+        self,
+        request: int,
+        vehicles: Mapping[str, Vehicle],
+        planners: Mapping[str, int],
+        now_ns: int,
+        empty: Collection[str] = (),
     ) -> None:
-        """All planners that will answer have: each vehicle takes its target."""
+        """All planners that will answer have: each vehicle takes its target.
+
+        empty  targets that are not where their planners lead to: whoever has a way to another goes for that
+        """
         asked = self._open
         if asked is None or asked.request != request:
             return
         self._open = None
         stuck = not self._costs_s
-        told = self._spread(asked, vehicles)
+        told = self._spread(asked, vehicles, empty)
         for index, id in enumerate(asked.vehicles):
             vehicle = vehicles.get(id)
             if vehicle is None:
@@ -264,17 +272,21 @@ class Assignment:
             costs_s = {target: float(column[index]) for target, column in self._costs_s.items()}
             if id in told:
                 costs_s = {target: cost_s if target == told[id] else math.inf for target, cost_s in costs_s.items()}
-            self._assign(vehicle, costs_s, planners, now_ns)
+            there = {target: cost_s for target, cost_s in costs_s.items() if target not in empty}
+            leaves = any(map(math.isfinite, there.values()))
+            current = None if leaves and vehicle.target in empty else vehicle.target
+            self._assign(vehicle, there if leaves else costs_s, current, planners, now_ns)
             stuck = stuck or vehicle.state in (VehicleState.IDLE, VehicleState.STRANDED)
         if stuck:
             retry_ns = _STRANDED_RETRY_NS if self._costs_s else _RETRY_NS
             self._due_ns = min(self._due_ns, now_ns + retry_ns)
 
-    def _spread(self, asked: AskCosts, vehicles: Mapping[str, Vehicle]) -> dict[str, str]:
+    def _spread(self, asked: AskCosts, vehicles: Mapping[str, Vehicle], empty: Collection[str]) -> dict[str, str]:
         """The target of each vehicle that has a choice, so that not all go for the same."""
-        targets = [target for target in self._targets if target in self._costs_s]
+        targets = [target for target in self._targets if target in self._costs_s and target not in empty]
         # A vehicle whose planner is silent keeps to it, or is told that nothing is known.
-        now = {id: vehicles[id].target for id in asked.vehicles if id in vehicles}
+        held = {id: vehicles[id].target for id in asked.vehicles if id in vehicles}
+        now = {id: None if target in empty else target for id, target in held.items()}
         free = [n for n, id in enumerate(asked.vehicles) if id in now and now[id] in (None, *targets)]
         if not free or not targets:
             return {}
@@ -287,11 +299,16 @@ class Assignment:
         }
 
     def _assign(
-        self, vehicle: Vehicle, costs_s: Mapping[str, float], planners: Mapping[str, int], now_ns: int
+        self,
+        vehicle: Vehicle,
+        costs_s: Mapping[str, float],
+        current: str | None,
+        planners: Mapping[str, int],
+        now_ns: int,
     ) -> None:
         given_up = vehicle.planner_gone and not vehicle.route.left
         given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
-        choice = choose(costs_s, self._targets, planners, vehicle.target, not given_up)
+        choice = choose(costs_s, self._targets, planners, current, not given_up)
         if choice.target is not None:
             vehicle.assign(choice.target, now_ns)
             if vehicle.target not in planners and not vehicle.planner_gone:

@@ -10,9 +10,10 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with, tick_phase
+from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
-from vehicle_agent.promise_store import FilePromiseStore, MemoryPromiseStore, PromiseStore
+from vehicle_agent.promise_store import PROMISE_STORE, FilePromiseStore, MemoryPromiseStore, PromiseStore
 from vehicle_agent.service import AgentService
 
 
@@ -29,10 +30,15 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
         else FilePromiseStore(setup.run_dir / f"promises-{setup.id}")
     )
     network = setup.scenario.network
-    with open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus:
+    with (
+        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
+        recorded(setup, terrain.digest) as boundary,
+    ):
         inbox = Inbox()
-        service = AgentService(setup, terrain, truth, bus, inbox.post, store)
-        process = Process(service, inbox, MonotonicClock(), setup.scenario.vehicles.tick_hz, tick_phase(setup.id))
+        kept = boundary.outside(store, PROMISE_STORE)
+        service = AgentService(setup, terrain, truth, boundary.bus(bus), inbox.post, kept)
+        tick_hz = setup.scenario.vehicles.tick_hz
+        process = Process(boundary.service(service), inbox, MonotonicClock(), tick_hz, tick_phase(setup.id))
         service.when_over = process.stop
         process.stop_on_signals()
         if stop_when is not None:

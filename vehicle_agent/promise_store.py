@@ -14,6 +14,7 @@ import msgspec
 
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
+from swarm.runtime.recording.outside import Outside
 from swarm.wire.messages.traffic import Table
 from vehicle_agent.traffic.right_of_way import OwnRecord
 
@@ -49,6 +50,14 @@ class PromiseStore(Protocol):
     def save_own(self, own: OwnRecord) -> None: ...
 
     def save(self, promised: int, table: Table) -> None: ...
+
+
+PROMISE_STORE = Outside(
+    "store",
+    calls={"reserve": str | None, "save_own": None, "save": None},
+    facts={"own": OwnRecord, "saved": dict[int, tuple[int, Table]], "ready": bool},
+)
+"""What an agent uses of its store."""
 
 
 class MemoryPromiseStore:

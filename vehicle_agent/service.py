@@ -91,7 +91,7 @@ class AgentService:
         grid = terrain.grid
         homes = load_homes(setup, terrain, truth)
         spawns = spawn_cells(scenario, grid, terrain.pace_s_per_m, truth, homes)
-        self._member = Member(setup.info(grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(grid, terrain.digest), bus, post, setup.before)
         self.counters = self._member.counters
         for name in ("reroute_requests", "routes_received", "marks", "blocked_ticks"):
             self.counters.count(name, 0)

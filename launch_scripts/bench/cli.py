@@ -220,7 +220,10 @@ def directed(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Trees, windows and repairs where uphill is not downhill (cost.directional), beside those where it is."""
+    """Trees, windows and repairs where uphill is not downhill (cost.directional), beside those where it is.
+
+    swarm bench directed --json
+    """
     from launch_scripts.bench.planning.directed import run
 
     show(run(numbers_of(sizes, "sizes", 16), repeats, seed), as_json)
@@ -255,7 +258,10 @@ def terrain(
     degrees: Annotated[bool, typer.Option("--degrees", help="Files in degrees, which have to be warped.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Elevation and photo to cost: seconds and memory, beside a plain pass."""
+    """Elevation and photo to cost: seconds and memory, beside a plain pass.
+
+    swarm bench terrain --json
+    """
     from launch_scripts.bench.terrain import run
 
     with progress_of("terrain") as progress:
@@ -383,6 +389,37 @@ def presence(
     with progress_of("presence") as progress:
         report = run(numbers_of(vehicles, "vehicles", 25), rounds, progress)
     show(report, as_json)
+
+
+@app.command()
+def view(
+    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles, several with commas.")] = "100,1000",
+    targets: Annotated[int, typer.Option(min=1, max=200, help="Targets.")] = 10,
+    groups: Annotated[int, typer.Option(min=1, max=20, help="Groups of vehicles.")] = 1,
+    seconds: Annotated[float, typer.Option(min=1, max=3600, help="How long to draw, after the first frames.")] = 20,
+    seed: Seed = 5,
+    out: Annotated[Path | None, typer.Option(help="Keep the recording here (.rrd), to look at it.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """The live view: CPU time of a frame and size of a recording, by number of vehicles.
+
+    \b
+    swarm bench view --vehicles 1000 --json
+    swarm bench view --vehicles 1000 --groups 3 --out view.rrd      then: rerun view.rrd
+
+    Made-up vehicles drive along real routes and say so ten times a second; the monitor's own service draws them to
+    a file. No network and no viewer is part of it.
+    """
+    from launch_scripts.bench.view import run_view, tables
+
+    counts = numbers_of(vehicles, "vehicles")
+    if out is not None and (out.suffix != ".rrd" or len(counts) > 1 or not out.absolute().parent.is_dir()):
+        raise ConfigError(
+            f"--out {out}: expected a name that ends in .rrd, in a folder that is there, and one number"
+        )
+    with progress_of("view") as progress:
+        report = run_view(counts, targets, groups, seconds, seed, out, progress)
+    show(report, as_json, tables)
 
 
 app.add_typer(whole_swarm.app)

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import json
 import time
-from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch_scripts.command_line import complete, panels
 from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, spread
-from swarm.places import extent_of, fields_of, written
 
 if TYPE_CHECKING:
-    from launch_scripts.report.results.certified_gap import CertifiedGap
-    from shared_map.terrain.places import MapFrame
     from swarm.config.scenario import NetworkConfig
-    from swarm.wire.messages.planning import PlannerStatus
-    from swarm.wire.messages.processes import RunInfo, Stats
 
 app = typer.Typer()
 
@@ -33,8 +27,10 @@ _STATUS_LISTEN_S = 1.5
 class Where:
     """Router and namespace of the swarm that a command asks."""
 
-    connect: Annotated[str, typer.Option(help="The router's endpoint.")] = "tcp/127.0.0.1:7447"
-    namespace: Annotated[str, typer.Option(help="Prefix of all keys.")] = "swarm"
+    connect: Annotated[str, typer.Option(help="The router's endpoint.", rich_help_panel=panels.NETWORK)] = (
+        "tcp/127.0.0.1:7447"
+    )
+    namespace: Annotated[str, typer.Option(help="Prefix of all keys.", rich_help_panel=panels.NETWORK)] = "swarm"
 
     def network(self, tls: Tls) -> NetworkConfig:
         import msgspec
@@ -56,7 +52,9 @@ class Where:
 def route(
     where: Where,
     tls: Tls,
-    target: Annotated[str | None, typer.Option(help="The target, such as t3.")] = None,
+    target: Annotated[
+        str | None, typer.Option(help="The target, such as t3.", autocompletion=complete.target_ids)
+    ] = None,
     row: Annotated[int | None, typer.Option(help="Row of the start, counted from the north.")] = None,
     col: Annotated[int | None, typer.Option(help="Column of the start, counted from the west.")] = None,
     steps: Annotated[int, typer.Option(min=0, help="Most steps to show; 1 is the next, 0 is all.")] = 0,
@@ -150,182 +148,58 @@ def _route_on_terrain(
 @app.command(rich_help_panel=_PANEL)
 @spread
 def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Show who takes part in the running swarm and how the planners are doing."""
-    from launch_scripts.commands.run_frame import frame_of_members
-    from launch_scripts.launcher.watcher import ask_run
-    from launch_scripts.report.results.certified_gap import certified_gap, gaps_to
-    from launch_scripts.report.results.counts import Counts
-    from swarm.bus.bus import Heard
-    from swarm.bus.zenoh_bus import open_bus
-    from swarm.errors import BusError
-    from swarm.order_book import OrderBook
-    from swarm.runtime.inbox import Inbox
-    from swarm.wire.messages.orders import Orders
-    from swarm.wire.messages.planning import PlannerStatus
-    from swarm.wire.messages.processes import Beat, Stats
-    from swarm.wire.topics import LEAD, ORDERS, STATS, STATUS
+    """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
 
-    inbox = Inbox()
-    book = OrderBook()
-    counts = Counts()
-    stats: dict[tuple[str, str], Stats] = {}
-    planners: dict[str, PlannerStatus] = {}
-    leads: dict[tuple[str, str], bool] = {}
+    swarm status
+
+    swarm status --json | jq .planners
+    """
+    from rich.console import Console
+
+    from launch_scripts.commands.running.status import StatusWatch, print_status, status_fields
+    from swarm.bus.zenoh_bus import open_bus
+    from swarm.clock import MonotonicClock
+    from swarm.errors import BusError
+    from swarm.runtime.inbox import Inbox
+
+    inbox, clock = Inbox(), MonotonicClock()
     with open_bus(where.network(tls)) as bus:
-        bus.subscribe(STATS, inbox.post)
-        bus.subscribe(STATUS, inbox.post)
-        bus.subscribe(LEAD, inbox.post)
-        bus.subscribe(ORDERS, inbox.post, role="keeper")
-        until_s = time.monotonic() + _STATUS_LISTEN_S
-        found = ask_run(bus, routers=True)
-        while (left_s := until_s - time.monotonic()) > 0:
-            match inbox.take(left_s):
-                case Heard(message=Stats() as message):
-                    stats[message.role, message.id] = message
-                    counts.count(message)
-                case Heard(message=PlannerStatus() as message):
-                    planners[message.target] = message
-                case Heard(message=Beat() as message):
-                    leads[message.role, message.id] = message.leads
-                case Heard(message=Orders() as message):
-                    book.merge(message.orders, time.time_ns())
-    if not found:
+        watch = StatusWatch(bus, inbox.post)
+        began_s = time.monotonic()
+        while (spent_s := time.monotonic() - began_s) < _STATUS_LISTEN_S or not watch.answered:
+            if (event := inbox.take(max(_STATUS_LISTEN_S - spent_s, 0.1))) is not None:
+                watch.take(event, clock.now_ns())
+        told = watch.status(clock.now_ns())
+    if told is None:
         admitted = "" if tls.tls_ca is None else ", and does the router admit this certificate"
         raise BusError(f"nobody answers {where}: is the swarm running{admitted}?")
-    # The run is that of most; routers belong to none; whoever answers with another is a stranger.
-    runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
-    run = runs.most_common(1)[0][0] if runs else ("", "")
-    found.sort(key=lambda info: (not info.run_id, info.role, info.id))
-    strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
-    members = [info for info in found if info not in strangers]
-    frame = frame_of_members(members)
     if as_json:
-        fields = _status_fields(members, stats, planners, leads, frame)
-        fields["certified_gap"] = certified_gap(counts).fields()
-        fields["certified_gap_to"] = {id: gap.fields() for id, gap in gaps_to(counts).items()}
-        fields["orders"] = book.standing
-        fields["strangers"] = [f"{info.role}-{info.id}" for info in strangers]
-        typer.echo(json.dumps(fields, indent=2))
+        typer.echo(json.dumps(status_fields(told), indent=2))
     else:
-        _print_status(members, stats, planners, leads, frame, gaps_to(counts))
-        typer.echo(f"certified gap of the routes begun (above: mean per target): {certified_gap(counts)}")
-        for ordered in book.standing:
-            typer.secho(f"ordered: {ordered}", fg="yellow")
-        for info in strangers:
-            typer.secho(
-                f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}",
-                fg="yellow",
-            )
+        print_status(told, Console())
 
 
-def _status_fields(
-    members: list[RunInfo],
-    stats: dict[tuple[str, str], Stats],
-    planners: dict[str, PlannerStatus],
-    leads: dict[tuple[str, str], bool],
-    frame: MapFrame | None,
-) -> dict[str, Any]:
-    import msgspec
-
-    def planner_fields(planner: PlannerStatus) -> dict[str, Any]:
-        cell = _target_cell(planner, frame)
-        return {
-            **msgspec.to_builtins(planner),
-            "target_at": None if frame is None or cell is None else fields_of(frame, cell),
-        }
-
-    return {
-        "run_id": members[0].run_id,
-        "scenario": members[0].scenario,
-        "terrain": members[0].terrain,
-        "processes": [
-            {
-                "role": info.role,
-                "id": info.id,
-                "incarnation": info.incarnation,
-                "leads": leads.get((info.role, info.id)),
-                "counts": stats[info.role, info.id].counts if (info.role, info.id) in stats else None,
-                "gauges": stats[info.role, info.id].gauges if (info.role, info.id) in stats else None,
-            }
-            for info in members
-        ],
-        "crs": None if frame is None else frame.grid.crs,
-        "planners": [planner_fields(planners[target]) for target in sorted(planners)],
-    }
-
-
-def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
-    """Where the planner's target is; None if that is not known, or not on this terrain."""
-    cell = planner.target_cell
-    return cell if frame is not None and cell is not None and 0 <= cell < frame.grid.cells else None
-
-
-def _throttled(stats: dict[tuple[str, str], Stats]) -> list[str]:
-    """Authors which a keeper throttles."""
-    from shared_map.keeper.service import THROTTLED
-
-    gauges = {name for each in stats.values() for name in each.gauges}
-    return sorted(name.removeprefix(THROTTLED) for name in gauges if name.startswith(THROTTLED))
-
-
-def _print_status(
-    members: list[RunInfo],
-    stats: dict[tuple[str, str], Stats],
-    planners: dict[str, PlannerStatus],
-    leads: dict[tuple[str, str], bool],
-    frame: MapFrame | None,
-    gaps: Mapping[str, CertifiedGap],
+@app.command(rich_help_panel=_PANEL)
+@spread
+def metrics(
+    where: Where,
+    tls: Tls,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="On loopback; 0 picks one.")] = 9464,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Print a dashboard for Grafana, as JSON, and exit.")
+    ] = False,
 ) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    """Serve the figures of a running swarm to Prometheus, until Ctrl-C. It only listens.
 
-    from launch_scripts.report.results.certified_gap import percent
+    swarm metrics --port 9464
 
-    first = members[0]
-    console = Console()
-    if first.run_id:
-        run = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells"
+    swarm metrics --dashboard > swarm.json
+
+    `swarm up --metrics-port 9464` does the same for as long as the run lasts.
+    """
+    from launch_scripts.commands import metrics as command
+
+    if dashboard:
+        typer.echo(command.dashboard())
     else:
-        run = "no run yet: only routers answer"
-    console.print(run, highlight=False)
-    if frame is not None and frame.grid.crs != "local":
-        console.print(f"terrain: {extent_of(frame, 'latlon')}", highlight=False)
-    now_ns = time.time_ns()
-    crew = Table("process", "up s", "messages out", "in", "dropped", pad_edge=False)
-    for info in members:
-        counts = stats[info.role, info.id].counts if (info.role, info.id) in stats else {}
-        numbers = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
-        up_s = (now_ns - info.incarnation) / 1e9
-        leading = {True: ", leads", False: ", stands by", None: ""}[leads.get((info.role, info.id))]
-        told = ("-" if n is None else str(n) for n in numbers)
-        crew.add_row(f"{info.role}-{info.id}{leading}", f"{up_s:.0f}", *told)
-    console.print(crew)
-    for author in _throttled(stats):
-        console.print(f"author {author} exceeds its quota; its marks are delayed", style="yellow")
-    if planners:
-        trees = Table(
-            *("target", "following", "strategy", "tree ms", "growths", "windows", "served", "gap"),
-            *("pose s", "tracker"),
-            pad_edge=False,
-        )
-        for id, planner in sorted(planners.items()):
-            gap = percent(gaps[id].mean) if id in gaps else "-"
-            trees.add_row(
-                id,
-                str(planner.following),
-                planner.strategy,
-                f"{planner.growth_ms:.1f}",
-                str(planner.growths),
-                str(planner.window_growths),
-                str(planner.routes_served),
-                gap,
-                "-" if planner.pose_age_s is None else f"{planner.pose_age_s:.1f}",
-                "lost" if planner.tracker_lost else planner.tracker or "-",
-                style="yellow" if planner.tracker_lost else None,
-            )
-        console.print(trees)
-        for id, planner in sorted(planners.items()):
-            cell = _target_cell(planner, frame)
-            if frame is not None and cell is not None:
-                was = "was" if planner.tracker_lost else "is"
-                console.print(f"{id} {was} at {written(frame, cell)}", highlight=False, soft_wrap=True)
+        command.serve_metrics(where.network(tls), port)

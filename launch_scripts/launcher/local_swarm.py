@@ -11,7 +11,7 @@ import sys
 import time
 import types
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -29,6 +29,8 @@ LONGEST_WAIT_S = 5.0
 SETTLED_S = 10.0
 """After a run of so many seconds the wait starts at its shortest again."""
 STOP_GRACE_S = 5.0
+FORCED_GRACE_S = 1.0
+"""For all that still run, at once, when the end is asked for a second time."""
 REFUSALS_ALLOWED = 5
 """So many refusals within `REFUSALS_WITHIN_S` are taken for final."""
 REFUSALS_WITHIN_S = 60.0
@@ -94,6 +96,8 @@ class LocalSwarm:
         self, specs: list[ProcessSpec], setup_of: Callable[[ProcessSpec], RoleSetup], log_dir: Path
     ) -> None:
         self.running = [Running(spec) for spec in specs]
+        self.cut_short: list[str] = []
+        """Names of processes that were killed because the end was asked for twice."""
         self._setup_of = setup_of
         self._log_dir = log_dir
         self._context = multiprocessing.get_context("forkserver")
@@ -156,7 +160,7 @@ class LocalSwarm:
                 endings.append(self._ended(running, process))
             elif running.due_s is not None and time.monotonic() >= running.due_s:
                 try:
-                    self._start(running)
+                    self._start(running, running.restarts + 1)
                     running.restarts += 1
                 except SwarmError as error:  # its folder cannot be written
                     wait_s = running.backoff.crashed(0.0)
@@ -172,17 +176,23 @@ class LocalSwarm:
         before_role: Callable[[str], None] = lambda _: None,
         force: Callable[[], bool] = lambda: False,
     ) -> list[str]:
-        """Ends all processes, role by role: after `STOP_GRACE_S`, or once `force` says so, by SIGKILL. Returns a
-        sentence for each that did not end as asked."""
+        """Ends all processes, role by role: by SIGKILL what runs `STOP_GRACE_S` later. Returns a sentence for each
+        that did not end as asked.
+
+        Once `force` says so, all are asked at once and get `FORCED_GRACE_S`. What is killed then is in `cut_short`,
+        and nobody's failure.
+        """
         for running in self.running:
             running.due_s = None
         roles = [*STOP_ORDER, *sorted({r.spec.role for r in self.running} - set(STOP_ORDER))]
         failures = []
         for role in roles:
             of_role = [running for running in self.running if running.spec.role == role and running.alive]
-            if of_role:
+            if of_role and not force():
                 before_role(role)
                 failures += self._stop(of_role, while_waiting, force)
+        if left := [running for running in self.running if running.alive]:
+            self._stop_at_once(left, while_waiting)
         return failures
 
     def kill(self) -> None:
@@ -194,12 +204,17 @@ class LocalSwarm:
                 running.process.join(1.0)
                 self._forget(running)
 
-    def _start(self, running: Running) -> None:
+    def _start(self, running: Running, restarts: int = 0) -> None:
         listen, tell = self._context.Pipe(duplex=False)
         spec = running.spec
         process = self._context.Process(
             target=run_child,
-            args=(spec.entry, self._setup_of(spec), self._log_dir / f"{spec.name}.log", tell),
+            args=(
+                spec.entry,
+                replace(self._setup_of(spec), restarts=restarts),
+                self._log_dir / f"{spec.name}.log",
+                tell,
+            ),
             name=spec.name,
             daemon=True,  # should the launcher itself fail, multiprocessing ends them
         )
@@ -254,28 +269,31 @@ class LocalSwarm:
     def _stop(
         self, of_role: list[Running], while_waiting: Callable[[], None], force: Callable[[], bool]
     ) -> list[str]:
-        for running in of_role:
-            assert running.process is not None
-            running.process.terminate()
-        deadline_s = time.monotonic() + STOP_GRACE_S
-        waiting = list(of_role)
-        while waiting and time.monotonic() < deadline_s and not force():
-            while_waiting()
-            waiting = [running for running in waiting if running.process and running.process.exitcode is None]
+        _ask(of_role, while_waiting, STOP_GRACE_S, force)
         failures = []
         for running in of_role:
             process = running.process
             assert process is not None
             if process.exitcode is None:
+                if force():
+                    continue
                 process.kill()
                 process.join(1.0)
-                how = "was asked twice to end" if force() else f"did not end within {STOP_GRACE_S:g} s"
-                failures.append(f"{running.spec.name} {how} and was killed")
+                failures.append(f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed")
             elif process.exitcode not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
                 reason = self._exit_reason(running, process)
                 failures.append(f"{running.spec.name} was asked to end, but {reason.sentence}")
             self._forget(running)
         return failures
+
+    def _stop_at_once(self, left: list[Running], while_waiting: Callable[[], None]) -> None:
+        _ask(left, while_waiting, FORCED_GRACE_S)
+        for running in left:
+            assert running.process is not None
+            if running.process.exitcode is None:
+                running.process.kill()
+                self.cut_short.append(running.spec.name)
+            self._forget(running)
 
     def _forget(self, running: Running) -> None:
         if running.pipe is not None:
@@ -283,6 +301,23 @@ class LocalSwarm:
         if running.process is not None:
             running.process.join(1.0)
         running.process = running.pipe = None
+
+
+def _ask(
+    processes: list[Running],
+    while_waiting: Callable[[], None],
+    within_s: float,
+    force: Callable[[], bool] = lambda: False,
+) -> None:
+    """Ask processes to end, and wait until all have, the time is over, or `force` says so."""
+    for running in processes:
+        assert running.process is not None
+        running.process.terminate()
+    deadline_s = time.monotonic() + within_s
+    while time.monotonic() < deadline_s and not force():
+        while_waiting()
+        if all(running.process is None or running.process.exitcode is not None for running in processes):
+            return
 
 
 @contextlib.contextmanager

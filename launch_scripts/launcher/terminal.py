@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rich.console import Console
@@ -13,9 +13,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from launch_scripts.launcher.busy_line import busy_line
+from launch_scripts.launcher.lasting_output import make_output_last
 from launch_scripts.launcher.live_table import live_table, plain_line
-from launch_scripts.report.recorder import LiveSummary
 from launch_scripts.report.results.certified_gap import gap_text
+from launch_scripts.report.run_state.state import RunState
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +54,7 @@ class Terminal:
     """Shows the progress of a run. With `as_json`, standard output stays free for the report."""
 
     def __init__(self, as_json: bool, plain: bool) -> None:
+        make_output_last()
         self._console = Console(stderr=as_json, highlight=False, soft_wrap=True)
         self._table = self._console.is_terminal and not plain
         self._live: Live | None = None
@@ -63,12 +66,17 @@ class Terminal:
         self.print(Text(text, style=style or ""))
 
     def print(self, what: Any) -> None:
-        """Prints, if that is possible: a full disk or a reader who has left ends no run."""
+        """Prints, if that is possible: a full disk ends no run. For a reader who has left see `LastingOutput`."""
         try:
             self._console.print(what)
             self._console.file.flush()
         except OSError as error:
             log.warning("cannot write the output: %s", error.strerror or error)
+
+    def busy(self, text: Callable[[], str] | str) -> contextlib.AbstractContextManager[None]:
+        """Shows what goes on in this block, and for how long, once it has taken a second."""
+        now = (lambda: text) if isinstance(text, str) else text
+        return busy_line(self._console, self.say, now, changes=self._table and self._live is None)
 
     def print_json(self, text: str) -> None:
         """Prints the report on standard output."""
@@ -81,14 +89,12 @@ class Terminal:
         """Whether it is time to show the next summary."""
         return time.monotonic() >= self._due_s
 
-    def show(
-        self, title: str, summary: LiveSummary, processes: Mapping[str, tuple[int, int]], restarts: int
-    ) -> None:
+    def show(self, title: str, state: RunState) -> None:
         self._due_s = time.monotonic() + (_DRAW_EVERY_S if self._table else _PLAIN_EVERY_S)
         if not self._table:
-            self.say(plain_line(summary, processes, restarts))
+            self.say(plain_line(state))
             return
-        table = live_table(summary, processes, restarts, title)
+        table = live_table(state, title)
         with contextlib.suppress(OSError):  # of a terminal that is gone
             if self._live is None:
                 self._live = Live(table, console=self._console, auto_refresh=False, transient=False)

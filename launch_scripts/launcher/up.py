@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
 import math
-import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from launch_scripts.check.ground import check_places
+from launch_scripts.check.settings import check_start
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import log_to
-from launch_scripts.launcher.options import (
-    as_process,
-    check_ports,
-    common_run_id,
-    make_run_dir,
-    new_run_id,
-)
+from launch_scripts.launcher.options import as_process, common_run_id, make_run_dir, new_run_id
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
-from launch_scripts.launcher.progress import progress
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
+from launch_scripts.launcher.stop_signals import StopAsked
 from launch_scripts.launcher.terminal import Terminal
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
+from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
+from launch_scripts.ports import check_ports
 from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.run_folder import begin_run
+from launch_scripts.report.run_state.plan import plan_of_members
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
@@ -50,12 +48,14 @@ from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.processes import RunInfo
 
+if TYPE_CHECKING:
+    from launch_scripts.metrics.of_launcher import LauncherMetrics
+
 log = logging.getLogger(__name__)
 
 _TURN_S = 0.05
 _LISTEN_WITHIN_S = 20.0
 _UP_WITHIN_S = 60.0
-_PATIENCE_S = 1.5
 _QUIET_NOTES = frozenset({"live_view"})
 
 
@@ -63,11 +63,13 @@ _QUIET_NOTES = frozenset({"live_view"})
 class UpOptions:
     """Options of a run.
 
-    joins      there is a router elsewhere: none is started here
-    rank       of planners and the targets process, start only those of this rank; if None all
-    run_id     the run to take part in; if None it is made or found
-    began_s    time.monotonic() at which the command was given
-    table      other processes than the scenario's
+    joins         there is a router elsewhere: none is started here
+    rank          of planners and the targets process, start only those of this rank; if None all
+    run_id        the run to take part in; if None it is made or found
+    began_s       time.monotonic() at which the command was given
+    table         other processes than the scenario's
+    metrics_port  where figures are served to Prometheus; 0 is any
+    record_inputs  of every process, for `swarm replay`
     """
 
     scenario: Scenario
@@ -80,6 +82,8 @@ class UpOptions:
     plain: bool = False
     began_s: float = field(default_factory=time.monotonic)
     table: tuple[ProcessSpec, ...] | None = None
+    record_inputs: bool = False
+    metrics_port: int | None = None
 
 
 class _RefusedError(SwarmError):
@@ -90,50 +94,19 @@ class _RefusedError(SwarmError):
         self.exit_code = ending.exit_code
 
 
-class _StopAsked:
-    """Counts the signals that ask for the end: the first ends the run in order, the second at once."""
-
-    def __init__(self) -> None:
-        self.times = 0
-        self._interrupts = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, self._asked)
-
-    def _asked(self, number: int, frame: object) -> None:
-        self.times += 1
-        if self._interrupts:
-            raise KeyboardInterrupt
-
-    def __bool__(self) -> bool:
-        return self.times > 0
-
-    def force(self) -> bool:
-        return self.times > 1
-
-    @contextlib.contextmanager
-    def interrupting(self) -> Iterator[None]:
-        """A signal leaves this block at once: for work that takes long while there is no process to be ended."""
-        self._interrupts = True
-        try:
-            yield
-        except KeyboardInterrupt:
-            log.info("stopped while preparing")
-        finally:
-            self._interrupts = False
-
-
 def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
+    check_start(options.scenario, joins=options.joins)
     for spec in _table(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
     if not options.joins:
         check_ports(options.scenario, options.roles)
-    run_id = _run_id(options)
+    run_id, started_ns = _run_id(options)
     run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / "launcher.log")
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
-    return _Run(options, run_id, run_dir).run()
+    return _Run(options, run_id, run_dir, started_ns).run()
 
 
 def _table(options: UpOptions) -> list[ProcessSpec]:
@@ -147,37 +120,59 @@ def _table(options: UpOptions) -> list[ProcessSpec]:
     return table
 
 
-def _run_id(options: UpOptions) -> str:
-    """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario."""
+def _run_id(options: UpOptions) -> tuple[str, int | None]:
+    """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario. With
+    the id comes when the run began, if it runs already."""
     found: list[RunInfo] = []
     if options.joins:
         log_to(None)  # it may have to wait, and says so
         found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
-    if options.run_id is not None:
-        return options.run_id
-    if set(ROLES[1:]) <= set(options.roles) and options.rank is None:
-        return new_run_id()
-    return found[0].run_id if found else common_run_id(options.scenario)
+    whole = set(ROLES[1:]) <= set(options.roles) and options.rank is None
+    run_id = options.run_id
+    if run_id is None and whole:
+        run_id = new_run_id()
+    elif run_id is None:
+        run_id = found[0].run_id if found else common_run_id(options.scenario)
+    return run_id, plan_of_members(info for info in found if info.run_id == run_id).started_ns
+
+
+def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
+    """The processes that are started here, in words."""
+    return ", ".join(f"{every} {role}" for role, (_, every) in processes.items())
 
 
 class _Run:
     """A run in progress; all of it happens on the main thread."""
 
-    def __init__(self, options: UpOptions, run_id: str, run_dir: Path) -> None:
+    def __init__(self, options: UpOptions, run_id: str, run_dir: Path, started_ns: int | None) -> None:
         self._options = options
         self._scenario = as_process(options.scenario, LAUNCHER, "0")
         self._run_dir = run_dir
         self._run_id = run_id
-        self._started_ns = time.time_ns()
+        self._joined_ns = started_ns
+        """When the run began that this is a part of; None if it begins here."""
+        self._started_ns = started_ns or time.time_ns()
         self._book = OrderBook()
         """What operators have ordered, once somebody watches the swarm."""
         self._terminal = Terminal(options.as_json, options.plain)
-        self._stop_asked = _StopAsked()
+        self._stop_asked = StopAsked()
+        self._preparing = "preparing the terrain"
         self._swarm = LocalSwarm(_table(options), self._setup_of, run_dir)
         self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
+        self._recorder: Recorder | None = None
+        self._metrics = self._open_metrics()
         for sentence in begin_run(run_dir, options.scenario, run_id):
             self._terminal.say(sentence, "yellow")
+
+    def _open_metrics(self) -> LauncherMetrics | None:
+        if self._options.metrics_port is None:
+            return None
+        from launch_scripts.metrics.of_launcher import LauncherMetrics  # takes time to import
+
+        metrics = LauncherMetrics(self._options.metrics_port, self._run_id, self._scenario.name)
+        self._terminal.say(f"metrics at {metrics.url}")
+        return metrics
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
@@ -189,30 +184,38 @@ class _Run:
             return self._run()
         finally:
             self._warm_up.close()
+            if self._metrics is not None:
+                self._metrics.close()
 
     def _run(self) -> int:
-        with self._stop_asked.interrupting():
-            self._terrain, self._truth = self._prepared()
-            log.info("terrain is ready")
+        with self._terminal.busy(lambda: self._preparing):
+            prepared = self._stop_asked.interruptible(self._prepared)
+        if prepared is None:
+            return self._stopped_early()
+        self._terrain, self._truth = prepared
+        check_places(self._scenario, self._terrain, self._truth)
+        log.info("terrain is ready")
+        self._wait(lambda: self._warm_up.progress, self._warm_up.done)
         if self._stop_asked:
-            return 0
-        self._wait(lambda: self._warm_up.progress, self._warm_up.done, again_s=2.0)
+            return self._stopped_early()
         log.info("kernels are loaded")
-        if self._stop_asked:
-            return 0
         failures: list[str] = []
+        self._started_ns = self._joined_ns or time.time_ns()
         try:
             if not self._options.joins and "router" in self._options.roles:
                 self._swarm.start("router")
             within_s = math.inf if self._options.joins else _LISTEN_WITHIN_S
             self._wait(lambda: "waiting for the router to listen", self._router_listens, within_s)
-            log.info("the router listens")
             if self._stop_asked:
-                return 0 if not self._swarm.stop() else 1
+                self._swarm.stop(lambda: time.sleep(_TURN_S), force=self._stop_asked.force)
+                return self._stopped_early()
+            log.info("the router listens")
             with open_bus(self._scenario.network) as bus:
                 self._join(bus)
                 self._say_begin()
-                watcher = Watcher(bus, Recorder(self._scenario, self._terrain.grid), MonotonicClock())
+                recorder = Recorder(self._scenario, self._terrain.grid, self._started_ns)
+                self._recorder = recorder
+                watcher = Watcher(bus, recorder, MonotonicClock())
                 watcher.begin()
                 try:
                     self._swarm.start()
@@ -223,28 +226,31 @@ class _Run:
         finally:
             self._terminal.close()
             self._swarm.kill()
-        code = 0
-        try:
-            self._report(watcher.recorder, seconds)
-        except StoreError as error:
-            self._terminal.say(str(error), "red")
-            code = error.exit_code
+        code = self._end(watcher.recorder, seconds)
         if self._startup_s is None and not self._stop_asked:
             failures.append(f"the swarm was never whole: missing {', '.join(self._missing(watcher)) or 'routes'}")
         for failure in failures:
             self._terminal.say(failure, "red")
         return 1 if failures else code
 
+    def _stopped_early(self) -> int:
+        self._terminal.say("stopped before the swarm was up: there is nothing to report", "yellow")
+        return self._stop_asked.exit_code
+
     def _prepared(self) -> tuple[Terrain, Floats]:
         """Builds the terrain from its files, or fetches it from a keeper where one is missing and a swarm runs."""
         if self._options.joins and missing_files(self._scenario):
             found = [info for info in find_members(self._scenario) if info.run_id]
-            with progress() as tell:
-                fetch_if_missing(self._scenario, self._run_dir, found, roles=self._options.roles, progress=tell)
+            fetch_if_missing(
+                self._scenario, self._run_dir, found, roles=self._options.roles, progress=self._prepares
+            )
             setup = self._setup_of(ProcessSpec(LAUNCHER, "0", ""))
             terrain = load_terrain(setup)
             return terrain, load_truth(setup, terrain)
-        return prepare(self._run_dir, self._scenario)
+        return prepare(self._run_dir, self._scenario, self._prepares)
+
+    def _prepares(self, what: str, share: float) -> None:
+        self._preparing = f"preparing the terrain: {what}, {share:.0%}"
 
     def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
         scenario = as_process(self._options.scenario, spec.role, spec.id)
@@ -258,25 +264,17 @@ class _Run:
             incarnation=next_life(self._run_dir, spec.role, spec.id),
             started_ns=self._started_ns,
             run_dir=self._run_dir,
+            record_inputs=self._options.record_inputs,
+            before=None if self._recorder is None else self._recorder.observed.newest_stats(spec.role, spec.id),
         )
 
-    def _wait(
-        self,
-        text: Callable[[], str],
-        done: Callable[[float], bool],
-        within_s: float = 600.0,
-        again_s: float = math.inf,
-    ) -> None:
-        """Waits for `done(timeout_s)` or a signal, and says so if it takes long: once, or every `again_s`."""
+    def _wait(self, text: Callable[[], str], done: Callable[[float], bool], within_s: float = 600.0) -> None:
+        """Waits for `done(timeout_s)` or a signal, and shows so if it takes long."""
         began_s = time.monotonic()
-        say_s = _PATIENCE_S
-        while not self._stop_asked and not done(_TURN_S):
-            waited_s = time.monotonic() - began_s
-            if waited_s > within_s:
-                raise BusError(f"gave up {text()} after {within_s:g} s; see {self._run_dir}")
-            if waited_s > say_s:
-                say_s += again_s
-                self._terminal.say(f"{text()} ...")
+        with self._terminal.busy(text):
+            while not self._stop_asked and not done(_TURN_S):
+                if time.monotonic() - began_s > within_s:
+                    raise BusError(f"gave up {text()} after {within_s:g} s; see {self._run_dir}")
 
     def _router_listens(self, timeout_s: float) -> bool:
         self._raise_refusals(self._swarm.poll())
@@ -298,10 +296,10 @@ class _Run:
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = time.monotonic()
-        self._book = watcher.book
+        self._book = watcher.recorder.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
-            ordered.look(watcher.book, watcher.alive, time.monotonic())
+            ordered.look(watcher.recorder.book, watcher.alive, time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S)
             self._tell(watcher)
@@ -343,6 +341,8 @@ class _Run:
         return [spec.name for spec in specs if (spec.role, spec.id) not in watcher.ever_up]
 
     def _tell(self, watcher: Watcher) -> None:
+        if self._metrics is not None:
+            self._metrics.answer(watcher.recorder.observed, self._started_ns)
         if (sentence := self._disk.look(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
         if (compiled := self._warm_up.news()) is not None:
@@ -350,6 +350,7 @@ class _Run:
         for note in watcher.take_notes():
             if note.kind == "live_view":
                 self._terminal.say(f"live view: {note.text}", "bold")
+                self._terminal.say(f"from another computer: {tunnel(note.text)}, then the same address there")
             elif note.kind not in _QUIET_NOTES:
                 self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if self._terminal.due():
@@ -357,7 +358,7 @@ class _Run:
             title = f"{self._scenario.name}, {summary.elapsed_s:.0f} s" + (
                 f", live view {watcher.live_view}" if watcher.live_view else ""
             )
-            self._terminal.show(title, summary, self._swarm.by_role(), self._swarm.restarts)
+            self._terminal.show(title, summary)
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:
@@ -371,28 +372,50 @@ class _Run:
 
     def _stop(self, watcher: Watcher) -> list[str]:
         """Stops all roles in order, and records their last messages."""
+        self._terminal.close()
         asked = "; once more, and what still runs is killed" if self._stop_asked else ""
         self._terminal.say(f"stopping{asked}")
-        return self._swarm.stop(while_waiting=lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
+        with self._terminal.busy(self._stopping):
+            failures = self._swarm.stop(lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
+        if names := self._swarm.cut_short:
+            self._terminal.say(f"killed, as asked: {', '.join(names)}", "yellow")
+        return failures
+
+    def _stopping(self) -> str:
+        alive = sum(running.alive for running in self._swarm.running)
+        return f"stopping: {alive} of {len(self._swarm.running)} processes still run"
+
+    def _end(self, recorder: Recorder, seconds: float) -> int:
+        """Writes what the run leaves, and says where it is. Returns 0 if it is whole and nothing was cut short."""
+        try:
+            with self._terminal.busy("writing the report and its picture"):
+                whole = self._stop_asked.interruptible_once_more(lambda: self._report(recorder, seconds))
+        except StoreError as error:
+            self._terminal.say(str(error), "red")
+            return error.exit_code
+        if whole is None:
+            self._terminal.say("what was not written yet of the report is left, as asked", "yellow")
+        if not self._options.as_json:
+            for line in what_is_left(self._run_dir):
+                self._terminal.say(line)
+        return 0 if whole and not self._swarm.cut_short else self._stop_asked.exit_code
 
     def _say_begin(self) -> None:
         self._terminal.say(
             f"run {self._run_id}: scenario {self._scenario.name}, seed {self._scenario.seed}, "
-            f"{len(self._swarm.running)} processes"
+            f"{_counted(self._swarm.by_role())}"
         )
         for line in said_of(self._terrain):
             self._terminal.say(line)
         router = self._scenario.network.connect[0]
         self._terminal.say(f"router at {router}; logs, recording and report in {self._run_dir}")
 
-    def _report(self, recorder: Recorder, seconds: float) -> None:
+    def _report(self, recorder: Recorder, seconds: float) -> bool:
         report = make_report(
             recorder,
             self._terrain,
             run_id=self._run_id,
             seconds=seconds,
-            processes=len(self._swarm.running),
-            restarts=self._swarm.restarts,
             startup_s=self._startup_s,
         )
         numbers = {name: value for name, value in report.items() if name not in ("series", "by_vehicle")}
@@ -402,5 +425,4 @@ class _Run:
             self._terminal.report(numbers)
         # The figures come first: a full disk keeps nobody from them.
         write_report(self._run_dir, report, recorder, self._terrain, truth=self._truth)
-        if not self._options.as_json:
-            self._terminal.say(f"report: {self._run_dir / 'report.json'}, picture: {self._run_dir / 'report.png'}")
+        return True

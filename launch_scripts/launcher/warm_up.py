@@ -44,6 +44,8 @@ class WarmUp:
         self._closed = False
         """Set for good by `close`: no builder is started any more. The lock guards both."""
         self._began_s = time.monotonic()
+        self._took_s = 0.0
+        """How long it took to load and compile everything, once it has."""
         self._told = False
         self._thread = threading.Thread(target=self._run, name="warm-up", daemon=True)
 
@@ -59,21 +61,18 @@ class WarmUp:
 
     @property
     def progress(self) -> str:
-        """How far it is, in a sentence."""
-        took_s = time.monotonic() - self._began_s
+        """How far it is."""
         if not self._all:
-            return f"loading kernels, {took_s:.0f} s"
-        return (
-            f"compiling kernels, once: {len(self._all) - len(self._left)} of {len(self._all)}, "
-            f"{len(self._first)} to go before the first route, {took_s:.0f} s"
-        )
+            return "loading kernels"
+        first = f" ({len(self._first)} to go before the first route)" if self._first else ""
+        return f"compiling kernels, once: {len(self._all) - len(self._left)} of {len(self._all)}{first}"
 
     def news(self) -> str | None:
         """A sentence once the last kernel is compiled, if any had to be."""
         if self._told or not self._all or self._left:
             return None
         self._told = True
-        return f"all {len(self._all)} kernels are compiled"
+        return f"all {len(self._all)} kernels are compiled, {self._took_s:.0f} s"
 
     def close(self) -> None:
         """End what still compiles. They hear no other signal, and at the launcher's exit Python waits for them."""
@@ -125,6 +124,7 @@ class WarmUp:
                     continue
                 self._first.discard(name)
                 self._left.discard(name)
+                self._took_s = time.monotonic() - self._began_s
                 self._ready_if_first()
 
     def _start(self, target: object, *arguments: object) -> ForkServerProcess:

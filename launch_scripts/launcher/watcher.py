@@ -8,15 +8,13 @@ from launch_scripts.report.recorder import RECORDED, Recorder
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
-from swarm.order_book import OrderBook
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN
 from swarm.wire.messages.base import Nothing
-from swarm.wire.messages.orders import Orders
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.messages.vehicles import Followed
-from swarm.wire.topics import FOLLOWED, ORDERS, RUN
+from swarm.wire.topics import FOLLOWED, RUN
 
 _TAG = "launcher-run"
 _ASK_TIMEOUT_S = 1.0
@@ -34,8 +32,6 @@ class Watcher:
         self.ever_up: set[tuple[str, str]] = set()
         """(role, id) of processes whose liveliness token has been seen."""
         self.routes_served = False
-        self.book = OrderBook()
-        """What operators have ordered."""
         self.alive: set[tuple[str, str]] = set()
         """(role, id) of processes whose liveliness token is up."""
         self._bus = bus
@@ -47,7 +43,6 @@ class Watcher:
             self._bus.subscribe(topic, self._inbox.post, every_s=every_s)
         # The first tells that routes are served, sooner than any figures do.
         self._bus.subscribe(FOLLOWED, self._inbox.post)
-        self._bus.subscribe(ORDERS, self._inbox.post, role="keeper")
         self._bus.watch_alive(self._inbox.post)
 
     def listen(self, for_s: float) -> None:
@@ -70,8 +65,6 @@ class Watcher:
     def _take(self, event: Event) -> None:
         now_ns = self._clock.now_ns()
         match event:
-            case Heard(message=Orders() as orders):
-                self.book.merge(orders.orders, time.time_ns())
             case Heard(message=message, fields=fields):
                 match message:
                     case Note():

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn
 
+from launch_scripts.monitor.ground import layers
+from launch_scripts.monitor.ground.layers import Layer
+from launch_scripts.monitor.ground.legend import BACKGROUND, HEIGHT_PX, WIDTH_PX
+from launch_scripts.monitor.ground.map_margin import said_heights
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.levels import level_for
+from launch_scripts.monitor.movers.looks import HINT
+from launch_scripts.monitor.movers.mover_drawing import mover_overrides
 
-BACKGROUND = (17, 22, 28)
-TRAIL_S = 25.0
 
+def make_blueprint(mesh: TerrainMesh, *, vehicles: int = 100, knows_truth: bool = False) -> rrb.Blueprint:
+    """Layers of the 3D view on the left, each with its legend; figures, plots and the log on the right.
 
-def make_blueprint(mesh: TerrainMesh) -> rrb.Blueprint:
-    """The 3D view on the left; figures, plots and the log on the right."""
+    vehicles  how many there are, which decides how much is drawn of each
+    """
+    shown = [layers.PHOTO, layers.COST, *([layers.KNOWN] if knows_truth else [])]
     return rrb.Blueprint(
         rrb.Horizontal(
-            _view_3d(mesh),
+            rrb.Tabs(*(_layer(mesh, layer, vehicles) for layer in shown), active_tab=0),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/summary", name="Now"),
                 _plot("captures_and_marks", "Captures and marks"),
@@ -40,29 +47,36 @@ def make_blueprint(mesh: TerrainMesh) -> rrb.Blueprint:
     )
 
 
-def _view_3d(mesh: TerrainMesh) -> rrb.Spatial3DView:
+def _layer(mesh: TerrainMesh, layer: Layer, vehicles: int) -> rrb.Vertical:
+    """A tab: the swarm on the ground of one layer, and the legend beneath it."""
+    legend = rrb.Spatial2DView(
+        origin=f"/legend/{layer.name}",
+        name="Legend",
+        background=rrb.Background(color=BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=(0, WIDTH_PX), y_range=(0, HEIGHT_PX)),
+    )
+    return rrb.Vertical(_view_3d(mesh, layer, vehicles), legend, row_shares=[5.4, 1], name=layer.title)
+
+
+def _view_3d(mesh: TerrainMesh, layer: Layer, vehicles: int) -> rrb.Spatial3DView:
     middle = (mesh.width_m / 2, -mesh.depth_m / 2, float(mesh.heights_m.mean()))
     far = max(mesh.width_m, mesh.depth_m)
-    trail = rr.VisibleTimeRange(
-        "sim_time",
-        start=rr.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
-        end=rr.TimeRangeBoundary.cursor_relative(),
-    )
+    contents = ["+ $origin/**", "- $origin/layers/**"]
+    if layer is not layers.PHOTO:
+        contents += [f"- /{layers.PHOTO.entity}/**", f"+ /{layer.entity}/**"]
     return rrb.Spatial3DView(
         origin="/world",
-        name="Swarm",
+        contents=contents,
+        name=f"{layer.title}, {said_heights(mesh.stretch)}; {HINT}",
         background=rrb.Background(color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=(middle[0] - 0.06 * far, middle[1] - 0.84 * far, middle[2] + 0.7 * far),
-            look_target=(middle[0], middle[1] - 0.125 * far, middle[2]),
+            position=(middle[0] - 0.05 * far, middle[1] - 0.84 * far, middle[2] + 0.62 * far),
+            look_target=(middle[0], middle[1] - 0.19 * far, middle[2]),
             eye_up=(0, 0, 1),
         ),
-        overrides={
-            "/world/trails/vehicles": rrb.VisibleTimeRanges([trail]),
-            "/world/trails/targets": rrb.VisibleTimeRanges([trail]),
-        },
+        overrides=mover_overrides(level_for(vehicles)),
     )
 
 

@@ -6,49 +6,34 @@ It only listens. It may be late, stalled, killed or absent; no process waits for
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import rerun as rr
 
 from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
-from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
-from launch_scripts.monitor.ground.windows import window_outlines
-from launch_scripts.monitor.movers.points import (
-    RouteNow,
-    body_points,
-    cell_at,
-    cells_along,
-    label_places,
-    sighting_points,
-    target_points,
-    vehicle_points,
-)
-from launch_scripts.monitor.movers.strips import Trails, poles, route_strips
+from launch_scripts.monitor.ground.ground_view import GroundView
+from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
+from launch_scripts.monitor.ground.zones import Area
+from launch_scripts.monitor.movers.movers_view import MoversView
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.report.recorder import RECORDED, Recorder
 from launch_scripts.report.samples import messages_per_s
-from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
-from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
-from swarm.grid import Window
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
-from swarm.runtime.stats import Counters
-from swarm.wire.messages.bodies import Body
+from swarm.runtime.stats import ENDED, Counters
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Note
-from swarm.wire.messages.targets import Sighted, TargetPose
-from swarm.wire.messages.vehicles import Fleet, Followed
+from swarm.wire.messages.processes import Note, Stats
+from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
-from vehicle_agent.bodies import Bodies
 
 log = logging.getLogger(__name__)
 
@@ -56,19 +41,10 @@ FRAME_HZ = 10.0
 """How often the view is drawn."""
 _DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0}
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
-_TARGETS_NS = NS_PER_S // 5
-"""Targets, each with its pole and its name, take as long to draw as all vehicles, which move faster."""
-_TRAILS_NS = NS_PER_S // 2
-_WINDOWS_NS = NS_PER_S
-_ROUTES_NS = 3 * NS_PER_S // 2
-"""Period in which the routes to every target are drawn once."""
-_TEXTURES_NS, _TEXTURES_AT_ONCE = NS_PER_S, 80
-"""Marks come many times a second to the same tiles, and each of their photos is drawn once for all."""
-_REFRESH_NS = NS_PER_S
-_ROUTES_SHOWN = 400
-_ROUTES_KEPT = 1 << 15
-"""Vehicles whose routes are remembered. Beyond that all are forgotten: their agents never had so many."""
+_ENDED_KEPT = 4096
 _ANNOUNCE_NS = NS_PER_S // 2
+_LAST_WORD_NS = NS_PER_S // 2
+"""So long after a process went its last figures are waited for, which say whether it was asked to end."""
 
 
 class MonitorService:
@@ -77,6 +53,8 @@ class MonitorService:
     rec        a recording stream whose sinks are set
     live_url   address of the live view; published once
     recording  watches the file of the recording, if there is one
+    truth      the true ground, where this process knows it
+    zones      of the scenario
     """
 
     def __init__(
@@ -90,45 +68,37 @@ class MonitorService:
         mesh: TerrainMesh | None = None,
         live_url: str | None = None,
         recording: RecordingWatch | None = None,
+        truth: Floats | None = None,
+        zones: Sequence[Area] = (),
     ) -> None:
-        self.recorder = Recorder(setup.scenario, terrain.grid)
+        self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
+        self.over = False
+        """Set for good by `stop`. Read by other threads, too."""
         self._setup = setup
         self._terrain = terrain
         self._bus = bus
         self._post = post
         self._live_url = live_url
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self.counters: Counters = self._member.counters
-        self._cost_map = CostMap(terrain)
-        replica = MapReplica(terrain.grid, self._cost_map)
+        cost_map = CostMap(terrain)
+        replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, setup.scenario.map, setup.role, at_ticks=True)
         self._mesh = mesh or TerrainMesh(terrain)
         self._target_ids = setup.scenario.target_ids
         self._rec = rec
         self._recording = recording
-        self._drawing = Drawing(rec, self._mesh, self._target_ids)
-        scale = setup.scenario.time_scale
-        quickest_m = 4 * scale * max(setup.scenario.cost.road_speed_m_per_s, 1.0)
-        self._vehicle_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
-        self._target_trails = Trails(max(quickest_m, 4 * terrain.grid.resolution_m))
-        self._routes: dict[str, RouteNow] = {}
-        self._stale_tiles: dict[int, None] = {}
-        self._sightings = Sightings(replica.filter)
-        self._sighted: Mapping[str, Sighted] = {}
-        self._bodies = Bodies(terrain.grid)
-        """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
-        self._bodies_drawn: list[Body] = []
-        self._fleets_new = self._targets_new = self._windows_new = False
-        self._lost: set[str] = set()
-        """Targets that were drawn as lost."""
-        self._windows: dict[str, tuple[int, ...]] = {}
-        """Target -> the window that its planner grew last."""
-        self._windows_due_ns = self._targets_due_ns = self._bodies_due_ns = 0
+        self._drawing = Drawing(rec, self._target_ids)
+        self._movers = MoversView(rec, self._mesh, setup.scenario, self.recorder, self.counters, replica.filter)
+        legend = self._movers.looks.legend()
+        self._ground = GroundView(rec, self._mesh, terrain, cost_map, replica, truth, zones, legend)
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
-        self._trails_due_ns = self._routes_due_ns = self._refresh_due_ns = self._textures_due_ns = 0
-        self._next_route_target = self._next_refresh = 0
+        self._gone: dict[Peer, int] = {}
+        """Processes that went and that nobody was told of yet, and when."""
+        self._ended: set[Peer] = set()
+        """Processes which said in their last figures that they end as they were asked to."""
         self._last_sample_s = -1.0
 
     def start(self, now_ns: int) -> None:
@@ -151,22 +121,14 @@ class MonitorService:
         if not isinstance(event, Heard):
             return
         self.recorder.heard(event.message, event.fields, now_ns)
+        self._movers.hear(event.message, now_ns)
         match event.message:
-            case Fleet(stamp_ns=stamp_ns):
-                self._fleets_new = True
+            case Fleet(stamp_ns=stamp_ns):  # not by poses: a tracker's clock may be wrong
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
-            case TargetPose():  # a tracker's clock may be wrong, by which the view's must not be set
-                self._targets_new = True
-            case Sighted() as sighted:
-                self._sightings.hear(sighted, now_ns)
-            case Body() as body:
-                self._bodies.hear(body, now_ns)
-            case PlannerStatus(target=target, window=window):
-                if self._windows.get(target) != tuple(window):
-                    self._windows[target] = tuple(window)
-                    self._windows_new = True
-            case Followed() as followed:
-                self._follow(followed)
+            case PlannerStatus() as status:
+                self._ground.hear_status(status)
+            case Stats() as stats if ENDED in stats.gauges and len(self._ended) < _ENDED_KEPT:
+                self._ended.add(Peer(stats.role, stats.id, stats.incarnation))
             case Note() as note:
                 self._drawing.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
 
@@ -175,38 +137,43 @@ class MonitorService:
         self._sync.tick(now_ns)
         self._member.tick(now_ns)
         self._announce(now_ns)
+        self._tell_gone(now_ns - _LAST_WORD_NS)
         self._frame += 1
         self._drawing.set_time(self._frame, self._seconds())
         self._watch_recording(now_ns)
-        for window in self._cost_map.take_dirty():
-            self._stale_tiles.update(dict.fromkeys(self._mesh.tiles_touching(window)))
-        if not self._stale_tiles and now_ns >= self._refresh_due_ns:
-            self._refresh(now_ns)
-        if now_ns >= self._textures_due_ns:
-            self._textures_due_ns = now_ns + _TEXTURES_NS
-            self._draw_textures(_TEXTURES_AT_ONCE)
-        self._draw_movers(now_ns)
+        self._ground.tick(now_ns)
+        self._movers.tick(now_ns)
         self._draw_plots(now_ns)
 
     def stop(self, now_ns: int) -> None:
+        self._tell_gone(now_ns)
+        self.over = True
         self._member.publish_stats(now_ns)
+
+    @property
+    def at_s(self) -> float:
+        """Seconds since launch that the view has come to. Read by other threads, too."""
+        return self._seconds()
 
     # --- in -----------------------------------------------------------------------------------------------------
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         self.recorder.alive(peer, up, now_ns)
-        if now_ns - self._started_ns > 2 * NS_PER_S:  # those that were there before are not news
-            text = f"{peer.role} {peer.id} is {'up' if up else 'gone'}"
-            self._drawing.note(text, "INFO" if up else "WARN")
-
-    def _follow(self, followed: Followed) -> None:
-        cells = cells_along(self._terrain.grid, followed.start, followed.directions)
-        if cells is None:  # a route that leaves the grid is its sender's bug: skip it, and go on drawing
-            self.counters.count("routes_unreadable")
+        if now_ns - self._started_ns <= 2 * NS_PER_S:  # those that were there before are not news
             return
-        if len(self._routes) >= _ROUTES_KEPT:
-            self._routes.clear()
-        self._routes[followed.vehicle] = RouteNow(followed.target, cells)
+        if up:
+            self._gone.pop(peer, None)
+            self._drawing.note(f"{peer.role} {peer.id} is up", "INFO")
+        else:
+            self._gone[peer] = now_ns
+
+    def _tell_gone(self, until_ns: int) -> None:
+        """Tells who went: a moment later, as a process's last word may come after it."""
+        for peer in [peer for peer, at_ns in self._gone.items() if at_ns <= until_ns]:
+            del self._gone[peer]
+            ended = peer in self._ended
+            text = f"{peer.role} {peer.id} {'has ended as asked' if ended else 'is gone'}"
+            self._drawing.note(text, "INFO" if ended else "WARN")
 
     def _announce(self, now_ns: int) -> None:
         """Publishes the live view's address, once links have had time to learn of subscribers."""
@@ -219,7 +186,7 @@ class MonitorService:
             return
         sentence, begun = self._recording.look(now_ns)
         if begun:
-            self._drawing = Drawing(self._rec, self._mesh, self._target_ids)
+            self._drawing = Drawing(self._rec, self._target_ids)
             self._begin_drawing()
         if sentence is not None:
             log.warning("%s", sentence)
@@ -228,87 +195,13 @@ class MonitorService:
     def _begin_drawing(self) -> None:
         """Draws all that does not move."""
         self._drawing.begin()
-        self._stale_tiles = dict.fromkeys(range(self._mesh.tile_rows * self._mesh.tile_cols))
-        self._draw_textures(len(self._stale_tiles))
+        self._ground.begin()
+        self._movers.begin()
 
     def _seconds(self) -> float:
         return max(self._newest_stamp_ns - self._setup.started_ns, 0) / NS_PER_S
 
     # --- out ----------------------------------------------------------------------------------------------------
-
-    def _refresh(self, now_ns: int) -> None:
-        """Sends one texture again: a viewer which joins late has only what the server still holds."""
-        self._refresh_due_ns = now_ns + _REFRESH_NS
-        self._stale_tiles[self._next_refresh] = None
-        self._next_refresh = (self._next_refresh + 1) % (self._mesh.tile_rows * self._mesh.tile_cols)
-
-    def _draw_textures(self, most: int) -> None:
-        for tile in list(self._stale_tiles)[:most]:
-            del self._stale_tiles[tile]
-            window = self._mesh.tile_window(tile)
-            image = self._mesh.texture(window, self._cost_map.ground_s_per_m, self._terrain.ground_s_per_m)
-            self._drawing.texture(tile, image)
-
-    def _draw_movers(self, now_ns: int) -> None:
-        trails_due = now_ns >= self._trails_due_ns
-        if trails_due:
-            self._trails_due_ns = now_ns + _TRAILS_NS
-        if self._fleets_new:
-            self._fleets_new = False
-            vehicles = self.recorder.observed.vehicles()
-            points = vehicle_points(self._mesh, vehicles)
-            self._drawing.vehicles(points)
-            if trails_due:
-                self._drawing.trails("vehicles", self._vehicle_trails.advance(points.ids, points.positions))
-            self._draw_routes(now_ns, vehicles)
-        if now_ns >= self._targets_due_ns and (lost := self.recorder.tracked.lost(now_ns)) != self._lost:
-            self._lost, self._targets_new = lost, True
-        if self._targets_new and (trails_due or now_ns >= self._targets_due_ns):
-            self._targets_new, self._targets_due_ns = False, now_ns + _TARGETS_NS
-            targets = target_points(self._mesh, self.recorder.observed.targets(), self._lost)
-            feet = poles(self._mesh, targets)
-            self._drawing.targets(targets, feet, label_places(self._mesh, targets))
-            if trails_due:
-                self._drawing.trails("targets", self._target_trails.advance(targets.ids, feet[:, 0]))
-        self._sightings.expire(now_ns)
-        sighted = self._sightings.best(now_ns)
-        if sighted != self._sighted:  # a new sighting, or one that expired
-            self._sighted = sighted
-            self._drawing.sightings(*sighting_points(self._mesh, sighted))
-        self._bodies.tick(now_ns)
-        self._bodies.take_changed()
-        self._bodies.complaints.clear()
-        bodies = self._bodies.reports
-        if bodies != self._bodies_drawn and now_ns >= self._bodies_due_ns:
-            self._bodies_drawn, self._bodies_due_ns = bodies, now_ns + _TARGETS_NS
-            self._drawing.bodies(*body_points(self._mesh, bodies))
-        if self._windows_new and now_ns >= self._windows_due_ns:
-            self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
-            self._draw_windows()
-
-    def _draw_windows(self) -> None:
-        """Draws the window that each planner grew last, unless it is the whole terrain."""
-        told = (Window(*self._windows[target]) for target in sorted(self._windows) if self._windows[target])
-        parts = [window for window in told if not window.empty and window.cells < self._terrain.grid.cells]
-        self._drawing.windows(window_outlines(self._mesh, parts))
-
-    def _draw_routes(self, now_ns: int, vehicles: VehicleColumns) -> None:
-        """Draws what is left of the routes, one target after the other."""
-        if now_ns < self._routes_due_ns or not self._target_ids:
-            return
-        self._routes_due_ns = now_ns + _ROUTES_NS // len(self._target_ids)
-        target = self._target_ids[self._next_route_target % len(self._target_ids)]
-        self._next_route_target += 1
-        strips = []
-        for n in vehicles.chasing(target)[:_ROUTES_SHOWN].tolist():
-            route = self._routes.get(vehicles.ids[n])
-            if route is None or route.target != target:
-                continue
-            place = float(vehicles.east_m[n]), float(vehicles.south_m[n])
-            ahead = route.ahead_of(cell_at(self._terrain.grid, *place))
-            if len(ahead) > 1:
-                strips.append(ahead)
-        self._drawing.routes(target, route_strips(self._mesh, strips))
 
     def _draw_plots(self, now_ns: int) -> None:
         samples = self.recorder.samples.newest
@@ -317,4 +210,6 @@ class MonitorService:
         self._last_sample_s = samples[-1].time_s
         rates = messages_per_s(samples)
         self._drawing.plots(samples[-1], rates[-1][1] if rates else None)
-        self._drawing.summary(summary_markdown(self._setup, self.recorder.summary(now_ns)))
+        summary = self.recorder.summary(now_ns)
+        self._movers.summarised(summary)
+        self._drawing.summary(summary_markdown(self._setup, summary))

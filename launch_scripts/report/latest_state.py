@@ -5,6 +5,7 @@ Pure: the launcher, the monitor and the simulation pass it what they heard on `R
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +13,12 @@ from numpy.typing import NDArray
 
 from launch_scripts.report.results.counts import Counts
 from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
+from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.liveness import Peer
 from swarm.ranks import HIGHEST_RANK, ranked_id, split_rank
+from swarm.runtime.stats import ENDED
 from swarm.wire.fields import column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
@@ -24,6 +28,9 @@ from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.statements import MarkKind
 
+_VEHICLES_LAST_NS = 3 * NS_PER_S
+"""Vehicles of whoever raises no liveliness token are there for so long after the last word."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkedCells:
@@ -32,6 +39,7 @@ class MarkedCells:
     cells: NDArray[np.int64]
     kinds: NDArray[np.uint8]
     paces: NDArray[np.float32]
+    stamps_ns: NDArray[np.int64]
 
 
 class Observed(Counts):
@@ -42,7 +50,6 @@ class Observed(Counts):
         self.grid = grid
         self.status: dict[str, PlannerStatus] = {}
         self.poses: dict[str, TargetPose] = {}
-        self._messages_before: dict[tuple[str, str, int], int] = {}
         self._fleets: dict[tuple[str, int], Fleet] = {}
         self._vehicles: VehicleColumns | None = None
         """What `_fleets` say, once somebody has asked; None since the last that was new."""
@@ -51,13 +58,18 @@ class Observed(Counts):
         """(role, job) -> rank of the process that leads, where there are standbys."""
         self._alive: dict[tuple[str, str], set[int]] = {}
         self._incarnations: dict[tuple[str, str], set[int]] = {}
+        self._told_ns: dict[tuple[str, str], int] = {}
+        """(role, id) -> when the process told its counts last, or appeared."""
+        self._fleet_told_ns: dict[str, int] = {}
+        """Agent -> when it told of vehicles last."""
+        self._was_up: set[tuple[str, str]] = set()
 
-    def heard(self, message: Message) -> None:
+    def heard(self, message: Message, now_ns: int) -> None:
         """Take in a message; of poses those only that count."""
         match message:
             case Stats():
-                key = self.count(message)
-                self._messages_before.setdefault(key, message.counts.get("messages_out", 0))
+                self.count(message)
+                self._told_ns[message.role, message.id] = now_ns
                 self._seen(message.role, message.id, message.incarnation)
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
@@ -70,6 +82,8 @@ class Observed(Counts):
                 if fleet is None or message.seq >= fleet.seq:
                     self._fleets[message.author, message.region] = message
                     self._vehicles = None
+                if message.ids:
+                    self._fleet_told_ns[agent_of(message.ids[0])] = now_ns
             case TargetPose():
                 self.poses[message.target] = message
             case MarkSet():
@@ -77,11 +91,13 @@ class Observed(Counts):
                 if marks is None or (message.epoch, message.seq) > (marks.epoch, marks.seq):
                     self._marks[message.author, message.tile] = message
 
-    def alive(self, peer: Peer, up: bool) -> None:
+    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
         incarnations = self._alive.setdefault((peer.role, peer.id), set())
         if up:
             incarnations.add(peer.incarnation)
+            self._was_up.add((peer.role, peer.id))
+            self._told_ns[peer.role, peer.id] = now_ns
             self._seen(peer.role, peer.id, peer.incarnation)
         else:
             incarnations.discard(peer.incarnation)
@@ -98,6 +114,47 @@ class Observed(Counts):
     def is_up(self, role: str, job: str) -> bool:
         """Whether the process with this job or one of its standbys is alive."""
         return any(self._alive.get((role, ranked_id(job, rank))) for rank in range(HIGHEST_RANK + 1))
+
+    def was_up(self, role: str, id: str) -> bool:
+        """Whether the process has ever been seen alive."""
+        return (role, id) in self._was_up
+
+    def ids_up(self, role: str) -> list[str]:
+        """Ids of the processes of a role which are alive."""
+        return [id for each, id in self.up() if each == role]
+
+    def is_well(self, role: str, id: str) -> bool:
+        """Whether a process is as it should be: alive, or ended because it was asked to."""
+        if self._alive.get((role, id)):
+            return True
+        stats = self.newest_stats(role, id)
+        return stats is not None and stats.gauges.get(ENDED, 0.0) > 0
+
+    def fills(self, role: str, id: str) -> bool:
+        """Whether somebody does what this process is for, as it should: itself, or a keeper or a targets process of
+        another name, as when it was started by hand."""
+        if self.is_well(role, id) or role not in ("keeper", "targets") or split_rank(id)[1]:
+            return self.is_well(role, id)
+        known = {each for each_role, each in (*self._alive, *self._newest) if each_role == role}
+        return any(self.is_well(role, each) for each in known if not split_rank(each)[1])
+
+    def silent(self, before_ns: int) -> list[tuple[str, str, int]]:
+        """(role, id, when) of processes that are alive and have not told their counts since then, though they did
+        before."""
+        return [
+            (*key, told_ns)
+            for key, told_ns in sorted(self._told_ns.items())
+            if told_ns < before_ns and self._alive.get(key) and key in self._newest
+        ]
+
+    def now_of(self, name: str) -> float | None:
+        """A gauge, summed over the processes which are alive; None if none of them has published it."""
+        told = [
+            stats.gauges[name]
+            for key, stats in self.newest().items()
+            if name in stats.gauges and self._alive.get(key)
+        ]
+        return sum(told) if told else None
 
     def rank(self, role: str, job: str) -> int:
         """Rank of the process that leads."""
@@ -121,6 +178,24 @@ class Observed(Counts):
             self._vehicles = gathered(self._fleets.values())
         return self._vehicles
 
+    def driven(self, crew: Collection[tuple[str, str]], now_ns: int) -> VehicleColumns:
+        """The vehicles that somebody drives: not those that have left, or whose agent is gone. An agent of the crew
+        which ended because it was asked to has said its last words, and they stand."""
+        vehicles = self.vehicles()
+        drives = {
+            agent: self._drives(agent, ("agent", agent) in crew, now_ns) for agent in map(agent_of, vehicles.ids)
+        }
+        if all(drives.values()):
+            return vehicles
+        return vehicles.only(np.array([drives[agent_of(id)] for id in vehicles.ids], bool))
+
+    def _drives(self, agent: str, of_crew: bool, now_ns: int) -> bool:
+        if self._alive.get(("agent", agent)):
+            return True
+        if self.newest_stats("agent", agent) is not None or self.was_up("agent", agent):
+            return of_crew and self.is_well("agent", agent)
+        return now_ns - self._fleet_told_ns.get(agent, 0) <= _VEHICLES_LAST_NS  # it raises no token
+
     def groups(self) -> dict[str, str]:
         """Vehicle -> its group."""
         return {id: fleet.group for fleet in self._fleets.values() for id in fleet.ids}
@@ -132,6 +207,10 @@ class Observed(Counts):
     def place_m(self, pose: TargetPose) -> tuple[float, float]:
         """(east, south) from the north-west corner of the grid."""
         return pose.x_m - self.grid.west_m, self.grid.north_m - pose.y_m
+
+    @property
+    def any_vehicles(self) -> bool:
+        return bool(self._fleets)
 
     @property
     def any_marks(self) -> bool:
@@ -153,16 +232,10 @@ class Observed(Counts):
                 cell = row * self.grid.cols + col
                 if cell not in newest or (stamp_ns, author) > newest[cell][:2]:
                     newest[cell] = (stamp_ns, author, kind, pace)
-        kept = [(cell, kind, pace) for cell, (_, _, kind, pace) in sorted(newest.items()) if kind != MarkKind.CLEAR]
+        kept = [(cell, *told) for cell, told in sorted(newest.items()) if told[2] != MarkKind.CLEAR]
         return MarkedCells(
-            np.array([cell for cell, _, _ in kept], np.int64),
-            np.array([kind for _, kind, _ in kept], np.uint8),
-            np.array([pace for _, _, pace in kept], np.float32),
-        )
-
-    @property
-    def messages(self) -> int:
-        """Messages sent by all processes since each was first heard: grows evenly, even for a late observer."""
-        return sum(
-            stats.counts.get("messages_out", 0) - self._messages_before[key] for key, stats in self._stats.items()
+            np.array([cell for cell, _, _, _, _ in kept], np.int64),
+            np.array([kind for _, _, _, kind, _ in kept], np.uint8),
+            np.array([pace for _, _, _, _, pace in kept], np.float32),
+            np.array([stamp_ns for _, stamp_ns, _, _, _ in kept], np.int64),
         )

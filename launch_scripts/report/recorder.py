@@ -8,36 +8,39 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from launch_scripts.report.latest_state import MarkedCells, Observed
-from launch_scripts.report.results.certified_gap import CertifiedGap, certified_gap, gaps_to, of_excess
+from launch_scripts.report.begun_routes import BegunRoutes
+from launch_scripts.report.latest_state import MarkedCells
+from launch_scripts.report.results.certified_gap import gaps_to, of_excess
 from launch_scripts.report.results.results import Driven, results
-from launch_scripts.report.samples import Sample, Samples, messages_per_s
-from launch_scripts.report.tracked_targets import TrackedTargets
+from launch_scripts.report.run_state.facts import for_report
+from launch_scripts.report.run_state.model import HEARD, RunModel
+from launch_scripts.report.run_state.plan import plan_of
+from launch_scripts.report.run_state.state import RunState
+from launch_scripts.report.samples import Sample, Samples, at_once, buckets_of, certified_gaps, messages_per_s
 from launch_scripts.report.tracks import TrackKey, Tracks
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
-from swarm.config.agents import plan_agents
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.ranks import ranked_id
-from swarm.runtime.stats import CAPTURES_OF, Histogram
+from swarm.runtime.stats import MESSAGES_PER_S, Histogram
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.targets import TargetPose
-from swarm.wire.messages.vehicles import Fleet, VehicleState
-from swarm.wire.topics import FLEET, LEAD, MARKS, NOTE, POSE, STATS, STATUS, Topic
+from swarm.wire.messages.vehicles import Followed, VehicleState
+from swarm.wire.topics import FOLLOWED, MARKS, NOTE, Topic
 
 TRACK_S = 0.5
 """Places are sampled so often."""
+ROUTES_S = 2.0
+"""Of the routes that a vehicle begins within this time, the newest is kept."""
 RECORDED: dict[Topic, float] = {
-    STATS: 0.0, STATUS: 0.0, NOTE: 0.0, POSE: 0.0, LEAD: TRACK_S, FLEET: TRACK_S, MARKS: TRACK_S
+    **HEARD, NOTE: 0.0, MARKS: TRACK_S, FOLLOWED: ROUTES_S
 }  # fmt: skip
 """What a recorder hears, and how often it takes the newest of each key, in seconds; 0 for all that comes."""
 
@@ -56,74 +59,22 @@ class Capture:
     south_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class TargetLine:
-    """One row of the live table.
-
-    planner_up  whether its planner or one of its standbys is alive
-    rank        of the planner that leads; 0 unless a standby does
-    nearest_m   distance of the nearest vehicle
-    pose_age_s  time since its last pose; None before the first
-    lost        whether nobody tracks it: it was where that says, and may be anywhere
-    """
-
-    id: str
-    planner_up: bool
-    rank: int
-    following: int
-    nearest_m: float | None
-    growths: int | None
-    growth_ms: float | None
-    captures: int = 0
-    gap: CertifiedGap | None = None
-    pose_age_s: float | None = None
-    lost: bool = False
-
-    @property
-    def title(self) -> str:
-        """The id, and what is unusual about its tracker and its planner."""
-        unusual = []
-        if self.lost:
-            unusual.append("lost" if self.pose_age_s is None else f"lost {self.pose_age_s:.0f} s")
-        if not self.planner_up:
-            unusual.append("planner down")
-        elif self.rank:
-            unusual.append(f"standby {self.rank}")
-        return f"{self.id} ({', '.join(unusual)})" if unusual else self.id
-
-
-@dataclass(frozen=True, slots=True)
-class LiveSummary:
-    """The figures of the live table."""
-
-    elapsed_s: float
-    targets: tuple[TargetLine, ...]
-    states: dict[str, int]
-    captures: int | None
-    reroute_requests: int | None
-    marks: int | None
-    messages_per_s: float | None
-    alive: int
-    expected: int
-    restarts: int
-    certified_gap: CertifiedGap
-
-
 class Recorder:
     """Samples, tracks, captures and notes of a run, in memory which does not grow with the rate of messages."""
 
-    def __init__(self, scenario: Scenario, grid: GridSpec) -> None:
+    def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
+        """started_ns  when the run began; None: with the first message"""
         self.scenario = scenario
         self.grid = grid
-        self.observed = Observed(grid)
-        self.tracked = TrackedTargets(grid, self.observed.status)
-        self.first_ns: int | None = None
+        self.model = RunModel(plan_of(scenario, started_ns), grid)
+        self.observed, self.tracked, self.book = self.model.observed, self.model.tracked, self.model.book
         self.last_ns: int | None = None
         self.ready_ns: int | None = None
         """When all processes of the scenario were alive and the first vehicle had begun a route."""
         self.samples = Samples()
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Where and when targets were captured; how often, `Observed` counts."""
+        self.routes = BegunRoutes()
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
         self.vehicle_tracks = Tracks(_TRACK_NS)
@@ -132,56 +83,43 @@ class Recorder:
         self._track_ids: list[str] = []
         self._track_keys: list[TrackKey] = []
         """Of the vehicles heard of last."""
-        self._expected = _expected(scenario)
         self._sample_due_ns: int | None = None
         self._gap_max: float | None = None
 
     def heard(self, message: Message, fields: Mapping[str, str], now_ns: int) -> None:
         """Records one message; `fields` are the chunks of its key."""
         self._touch(now_ns)
+        if self.model.heard(message, now_ns) is None:
+            return
         match message:
-            case TargetPose():
-                counts = self.tracked.hear(message, now_ns)
-                if counts is None:
-                    return
-                message = counts
-            case Fleet():
-                self.tracked.something_moved(now_ns)
+            case Followed():
+                self.routes.add(now_ns, message)
             case PlannerStatus(gap_max=float(gap)):
                 self._gap_max = max(gap, self._gap_max or 0.0)
             case Note():
                 if message.kind == "capture":
                     self._capture(message, now_ns)
                 self.notes.append((self.seconds(now_ns), message))
-        self.observed.heard(message)
         self._look(now_ns)
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
         self._touch(now_ns)
-        self.observed.alive(peer, up)
+        self.model.alive(peer, up, now_ns)
         self._look(now_ns)
 
     def seconds(self, now_ns: int) -> float:
-        """Seconds since the first message."""
-        return 0.0 if self.first_ns is None else (now_ns - self.first_ns) / NS_PER_S
+        """Time of the run."""
+        return 0.0 if self.model.began_ns is None else (now_ns - self.model.began_ns) / NS_PER_S
 
     def missing(self) -> list[str]:
-        """Processes of the scenario which are not alive now, as `role id`."""
-        up = self.observed.up()
-        roles = {role for role, _ in up}
-        return [
-            f"{role} {id}" if id else role
-            for role, id in self._expected
-            if (role, id) not in up and not (id == "" and role in roles)
-        ]
+        """Processes that the run needs which are not alive, as `role id`."""
+        return self.model.missing()
 
     def marked(self) -> MarkedCells:
         return self.observed.marked()
 
     def _touch(self, now_ns: int) -> None:
-        if self.first_ns is None:
-            self.first_ns = now_ns
         self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
 
     def _capture(self, note: Note, now_ns: int) -> None:
@@ -229,69 +167,31 @@ class Recorder:
             marks=observed.total("marks"),
             reroute_requests=observed.total("reroute_requests"),
             routes_served=observed.total("routes_served"),
-            messages=observed.messages,
+            messages_per_s=observed.now_of(MESSAGES_PER_S),
             alive=len(observed.up()),
-            gaps={id: s.gap_mean for id, s in status if s.gap_mean is not None},
+            gaps={id: gap.mean for id, gap in gaps_to(observed).items() if gap.mean is not None},
             growth_ms={id: s.growth_ms for id, s in status},
+            gap_excess=buckets_of(observed.histogram("followed_gap_excess").buckets),
+            waiting_s=float(self.driven.waiting_s.sum()),
+            standing_s=float(self.driven.standing_s.sum()),
         )
 
-    def summary(self, now_ns: int) -> LiveSummary:
-        """The figures of the live table at a time."""
-        observed = self.observed
-        vehicles = observed.vehicles()
-        rates = messages_per_s(self.samples.newest)
-        lost = self.tracked.lost(now_ns)
-        captures = observed.counts_by(CAPTURES_OF)
-        gaps = gaps_to(observed)
-        lines = (
-            replace(self._target_line(id, vehicles, now_ns), captures=captures.get(id, 0), gap=gaps.get(id))
-            for id in self.scenario.target_ids
-        )
-        return LiveSummary(
-            elapsed_s=self.seconds(now_ns),
-            targets=tuple(replace(line, lost=line.id in lost) for line in lines),
-            states=_by_state(vehicles.count_states()),
-            captures=observed.total("captures"),
-            reroute_requests=observed.total("reroute_requests"),
-            marks=observed.total("marks"),
-            messages_per_s=rates[-1][1] if rates else None,
-            alive=len(self._expected) - len(self.missing()),
-            expected=len(self._expected),
-            restarts=observed.restarts,
-            certified_gap=certified_gap(observed),
-        )
-
-    def _target_line(self, id: str, vehicles: VehicleColumns, now_ns: int) -> TargetLine:
-        observed = self.observed
-        pose, status = observed.poses.get(id), observed.status.get(id)
-        nearest_m = None
-        if pose is not None and len(vehicles):
-            east_m, south_m = observed.place_m(pose)
-            nearest_m = float(np.hypot(vehicles.east_m - east_m, vehicles.south_m - south_m).min())
-        return TargetLine(
-            id=id,
-            planner_up=observed.is_up("planner", id),
-            rank=observed.rank("planner", id),
-            following=len(vehicles.chasing(id)),
-            nearest_m=nearest_m,
-            growths=None if status is None else status.growths + status.window_growths,
-            growth_ms=None if status is None else status.growth_ms,
-            pose_age_s=self.tracked.age_s(id, now_ns),
-        )
+    def summary(self, now_ns: int) -> RunState:
+        """What the run is at a time."""
+        return self.model.state(now_ns)
 
     def report(
         self,
         *,
         run_id: str | None = None,
         seconds: float | None = None,
-        processes: int | None = None,
-        restarts: int | None = None,
         startup_s: float | None = None,
     ) -> dict[str, Any]:
         """The numbers of the run, None where not measured. The caller gives what it knows better."""
-        if seconds is None and self.first_ns is not None and self.last_ns is not None:
-            seconds = (self.last_ns - self.first_ns) / NS_PER_S
+        if seconds is None and self.model.first_ns is not None and self.last_ns is not None:
+            seconds = (self.last_ns - self.model.first_ns) / NS_PER_S
         observed, total = self.observed, self.observed.total
+        state = self.summary(self.last_ns or 0)
         rates = [rate for _, rate in messages_per_s(self.samples.all())]
         fields = {
             "scenario": self.scenario.name,
@@ -301,35 +201,24 @@ class Recorder:
             "time_scale": self.scenario.time_scale,
             "vehicles": self.scenario.vehicle_count,
             "targets": len(self.scenario.target_ids),
-            "processes": observed.processes if processes is None else processes,
-            "restarts": observed.restarts if restarts is None else restarts,
+            "processes": state.expected,
             "startup_s": startup_s,
             "vehicles_routed": len(self.routed),
-            "captures": total("captures"),
-            "collisions": total("collisions"),
-            "lethal_entries": total("lethal_entries"),
+            **for_report(state),
             "tracking": self.tracked.report(observed),
-            "driven_into": total("driven_into"),
-            "hit_by_bodies": total("hit_by_bodies"),
-            "stranded": _whole(observed.gauge("stranded")),
-            "lost": _whole(observed.gauge("lost")),
-            "states_at_end": _by_state(observed.vehicles().count_states()),
-            "reroute_requests": total("reroute_requests"),
-            "marks": total("marks"),
+            "stranded": state.states["stranded"] if observed.any_vehicles else None,
+            "lost": state.states["lost"] if observed.any_vehicles else None,
             "marked_cells": len(self.marked().cells) if observed.any_marks else None,
-            "routes_served": total("routes_served"),
             "routes_received": total("routes_received"),
             "growths": total("growths"),
             "window_growths": total("window_growths"),
             "gap": self._gap(),
-            "certified_gap": certified_gap(observed).fields(),
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
             "messages_out": total("messages_out"),
             "messages_in": total("messages_in"),
             "bytes_out": total("bytes_out"),
             "bytes_in": total("bytes_in"),
             "messages_per_s": _mean(rates),
-            "payloads_dropped": total("payloads_dropped"),
             "ticks_late": total("ticks_late"),
             "ticks_dropped": total("ticks_dropped"),
             **results(observed, self.driven, self.scenario),
@@ -342,15 +231,33 @@ class Recorder:
         samples = samples[:: max(1, -(-len(samples) // points))]
         names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
         rates = {round(time_s, 6): rate for time_s, rate in messages_per_s(samples)}
+        gaps = certified_gaps(samples)
         fields: dict[str, list[Any]] = {
             "t_s": [sample.time_s for sample in samples],
             **{name: [getattr(sample, name) for sample in samples] for name in names},
             **{state.name.lower(): [sample.states[state] for sample in samples] for state in VehicleState},
-            "gap_mean": [_mean(sample.gaps.values()) for sample in samples],
+            **{f"certified_gap_{name}": [gap[name] for gap in gaps] for name in ("mean", "p95", "max")},
+            "routes_begun": [gap["routes"] for gap in gaps],
+            "waiting_at_once": at_once(samples, lambda sample: sample.waiting_s),
+            "standing_at_once": at_once(samples, lambda sample: sample.standing_s),
             "growth_ms_mean": [_mean(sample.growth_ms.values()) for sample in samples],
             "messages_per_s": [rates.get(round(sample.time_s, 6)) for sample in samples],
         }
         return {name: [_rounded(value) for value in values] for name, values in fields.items()}
+
+    def distributions(self) -> dict[str, list[list[float]]]:
+        """Histograms as [value, count], in order of value: logarithmic buckets 4 % wide."""
+        return {
+            name: [[_rounded(value), count] for value, count in self.observed.histogram(name).values()]
+            for name in DISTRIBUTIONS
+        }
+
+    def notes_told(self) -> list[dict[str, Any]]:
+        """The newest events for people, in order of time."""
+        return [
+            {"t_s": round(time_s, 3), "from": f"{note.role} {note.id}", "kind": note.kind, "text": note.text}
+            for time_s, note in self.notes
+        ]
 
     def _gap(self) -> dict[str, float | None]:
         """Driven cost over optimum, as the planners measured it.
@@ -365,6 +272,8 @@ class Recorder:
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
 
 
+DISTRIBUTIONS = ("followed_gap_excess", "growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms")
+"""Histograms that are reported whole."""
 TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 
@@ -373,28 +282,9 @@ def quantiles(histogram: Histogram) -> dict[str, float | None]:
     return {"p50": histogram.quantile(0.5), "p99": histogram.quantile(0.99)}
 
 
-def _expected(scenario: Scenario) -> list[tuple[str, str]]:
-    """(role, id) of the processes that a complete run has; "" stands for any id."""
-    targets = scenario.target_ids
-    return [
-        ("keeper", ""),
-        ("targets", ""),
-        *(("planner", ranked_id(id, rank)) for rank in range(scenario.standbys.planner + 1) for id in targets),
-        *(("agent", plan.id) for plan in plan_agents(scenario)),
-    ]
-
-
 def _mean(values: Iterable[float]) -> float | None:
     kept = list(values)
     return sum(kept) / len(kept) if kept else None
-
-
-def _by_state(counts: Iterable[int]) -> dict[str, int]:
-    return {state.name.lower(): n for state, n in zip(VehicleState, counts, strict=True)}
-
-
-def _whole(value: float | None) -> int | None:
-    return None if value is None else round(value)
 
 
 def _rounded(value: Any) -> Any:

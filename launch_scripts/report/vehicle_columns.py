@@ -37,6 +37,13 @@ class VehicleColumns:
             return np.empty(0, np.intp)
         return np.flatnonzero(self.targets == self.target_ids.index(target))
 
+    def only(self, kept: NDArray[np.bool_]) -> VehicleColumns:
+        """Some of them."""
+        ids = [self.ids[n] for n in np.flatnonzero(kept).tolist()]
+        return VehicleColumns(
+            ids, self.east_m[kept], self.south_m[kept], self.states[kept], self.targets[kept], self.target_ids
+        )
+
     def count_states(self) -> tuple[int, ...]:
         """Number of vehicles in each VehicleState, in its order."""
         return tuple(np.bincount(self.states, minlength=len(VehicleState)).tolist())

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.world.service import TargetsService
+from planner_service.prepared_costs import PREPARED_COSTS
 from planner_service.service import PlannerService
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
-from swarm.bus.bus import Event, Post
+from shared_map.keeper.store import KEEPER_STORE, KeeperStore
+from swarm.bus.bus import Bus, Event, Post, Worker
 from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AddedAgent
 from swarm.config.scenario import Scenario
 from swarm.runtime.process import Service
+from swarm.runtime.recording.boundary import Boundary
+from swarm.runtime.recording.recording import Recording
 from swarm.runtime.role import RoleSetup
-from vehicle_agent.promise_store import MemoryPromiseStore
+from swarm.runtime.stats import ENDED
+from vehicle_agent.promise_store import PROMISE_STORE, MemoryPromiseStore
 from vehicle_agent.service import AgentService
 
 if TYPE_CHECKING:
@@ -49,6 +54,10 @@ class Node:
         self.ticking = True
         self.crashes = 0
         self.service: Service | None = None
+        self._shell: Service | None = None
+        """The service, or what records its calls."""
+        self._recording: Recording | None = None
+        """Of this life."""
         self.bus: MemoryBus | None = None
         self.store: KeeperStore | None = None
         self.promises: MemoryPromiseStore | None = None
@@ -90,12 +99,12 @@ class Node:
         worker = self._worker = InlineWorker(simulation.scheduler)
 
         def post(event: Event) -> None:
-            if self.bus is not bus or self.service is None:
+            if self.bus is not bus or self._shell is None:
                 return
             if self._waiting is not None:
                 self._waiting.append(event)
             else:
-                self.service.handle(event, self.now_ns())
+                self._shell.handle(event, self.now_ns())
 
         setup = RoleSetup(
             scenario=simulation.scenario,
@@ -105,33 +114,43 @@ class Node:
             incarnation=self._life,
             started_ns=EPOCH_NS,
             added=self.added,
+            restarts=self.crashes,
+            before=simulation.recorder.observed.newest_stats(self.spec.role, self.spec.id),
         )
-        self.service = self._build(setup, bus, post, worker)
-        self.service.start(self.now_ns())
+        boundary = Boundary()
+        if simulation.record_to is not None:
+            boundary = self._recording = Recording(setup, simulation.terrain.digest, simulation.record_to)
+        self.service = self._build(setup, boundary, boundary.bus(bus), post, boundary.worker(worker))
+        self._shell = boundary.service(self.service)
+        self._shell.start(self.now_ns())
         for look in simulation.after_boot:
             look(self)
         simulation.scheduler.after(self._phase_ns, lambda: self._tick(bus))
 
-    def _build(self, setup: RoleSetup, bus: MemoryBus, post: Post, worker: InlineWorker) -> Service:
+    def _build(self, setup: RoleSetup, boundary: Boundary, bus: Bus, post: Post, worker: Worker) -> Service:
         terrain, truth = self._simulation.terrain, self._simulation.truth
         match self.spec.role:
             case "keeper":
                 self.store = self.store or KeeperStore(":memory:")
-                return KeeperService(setup, terrain, bus, post, self.store)
+                return KeeperService(setup, terrain, bus, post, boundary.outside(self.store, KEEPER_STORE))
             case "planner":
-                return PlannerService(setup, terrain, bus, post, worker)
+                stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
+                kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
+                prepared = boundary.outside(None, PREPARED_COSTS)
+                return PlannerService(setup, terrain, bus, post, worker, stopwatch, kernels, prepared)
             case "targets":
                 return TargetsService(setup, terrain, truth, bus, post)
             case "agent":
                 self.promises = self.promises or MemoryPromiseStore(self._phase_ns + setup.incarnation)
-                return AgentService(setup, terrain, truth, bus, post, self.promises)
+                promises = boundary.outside(self.promises, PROMISE_STORE)
+                return AgentService(setup, terrain, truth, bus, post, promises)
         raise ValueError(f"no simulation of role {self.spec.role}")
 
     def _tick(self, bus: MemoryBus) -> None:
-        if self.bus is not bus or self.service is None:
+        if self.bus is not bus or self._shell is None:
             return
         if self.ticking and self._waiting is None:
-            self.service.tick(self.now_ns())
+            self._shell.tick(self.now_ns())
             for look in self._simulation.after_tick:
                 look(self)
         self._simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
@@ -142,7 +161,8 @@ class Node:
             return
         self._simulation.log.event(self._clock.now_ns(), "crash", self.name)
         self.crashes += 1
-        self.service = None
+        self.service = self._shell = None
+        self.end_recording(ended=False)
         self._leave()
 
     def hang(self) -> None:
@@ -158,12 +178,19 @@ class Node:
         if waiting:
             self._simulation.log.event(self._clock.now_ns(), "wake", self.name)
         for event in waiting:
-            if self.bus is bus and self.service is not None:
-                self.service.handle(event, self.now_ns())
+            if self.bus is bus and self._shell is not None:
+                self._shell.handle(event, self.now_ns())
 
     def stop(self) -> None:
-        if self.service is not None:
-            self.service.stop(self.now_ns())
+        if self._shell is not None:
+            self._shell.counters.gauge(ENDED, 1.0)
+            self._shell.stop(self.now_ns())
+
+    def end_recording(self, *, ended: bool = True) -> None:
+        """Nothing of this life is recorded any more. `ended`: the process has ended in order."""
+        if self._recording is not None:
+            self._recording.close(ended=ended)
+            self._recording = None
 
     def _leave(self) -> None:
         if self.bus is not None and self._worker is not None:

@@ -10,6 +10,7 @@ import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TextIO
 
 import msgspec
@@ -73,6 +74,7 @@ class SimulationResult:
 class Simulation:
     """A run that tests advance, inspect and disturb. `simulate` runs one to its end.
 
+    record_to   folder in which the inputs of every process are recorded; None: they are not
     after_tick  called with a node after each of its ticks
     after_boot  called with a node after each of its starts
     book        what operators ordered and a keeper acknowledged
@@ -86,14 +88,16 @@ class Simulation:
         faults: FaultPlan | None = None,
         trace: TextIO | None = None,
         terrain: Terrain | None = None,
+        record_to: Path | None = None,
     ) -> None:
         self.scenario = scenario
+        self.record_to = record_to
         self.faults = faults or FaultPlan()
         self.run_id = f"simulated-{scenario.seed}"
         self.authenticator = Authenticator(b"simulated", self.run_id)
         self.terrain = terrain or build_terrain(scenario)
         self.truth = build_truth(scenario, self.terrain)
-        self.recorder = Recorder(scenario, self.terrain.grid)
+        self.recorder = Recorder(scenario, self.terrain.grid, EPOCH_NS)
         self.scheduler = Scheduler(ManualClock(EPOCH_NS))
         self.log = EventLog(EPOCH_NS, trace)
         chance = random.Random(f"simulation/{scenario.seed}")
@@ -154,6 +158,8 @@ class Simulation:
                     node.stop()
                     node.ticking = False
         self.run_until(self.now_s + _STOP_S)
+        for node in self.nodes.values():
+            node.end_recording()
 
     def report(self, seconds: float) -> dict[str, Any]:
         recorder = self.recorder
@@ -198,7 +204,7 @@ class Simulation:
 
     def _watch(self) -> None:
         """Subscribes the recorder to its topics."""
-        bus = self.network.bus(OBSERVER, self.scenario.network.namespace)
+        bus = self.network.bus(OBSERVER, self.scenario.network.namespace, self.authenticator)
         clock, recorder = self.scheduler.clock, self.recorder
 
         def post(event: Event) -> None:
@@ -264,18 +270,20 @@ def simulate(
     faults: FaultPlan | None = None,
     trace: TextIO | None = None,
     progress: Callable[[float], None] | None = None,
+    record_to: Path | None = None,
 ) -> SimulationResult:
     """Runs a scenario to its end.
 
     seed      instead of the scenario's own
     trace     where the event log is written
     progress  called after each simulated second with the seconds that have passed
+    record_to as of `Simulation`
     """
     if seed is not None:
         scenario = msgspec.structs.replace(scenario, seed=seed)
     seconds = scenario.seconds if seconds is None else seconds
     scenario = msgspec.structs.replace(scenario, seconds=seconds)
-    simulation = Simulation(scenario, faults=faults, trace=trace)
+    simulation = Simulation(scenario, faults=faults, trace=trace, record_to=record_to)
     began_s = time.perf_counter()
     with collected_rarely():
         while simulation.now_s < seconds:

@@ -10,6 +10,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
+from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 
@@ -20,9 +21,12 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     truth = load_truth(setup, terrain)
     inbox = Inbox()
     network = setup.scenario.network
-    with open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus:
-        service = TargetsService(setup, terrain, truth, bus, inbox.post)
-        process = Process(service, inbox, MonotonicClock(), TICK_HZ)
+    with (
+        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
+        recorded(setup, terrain.digest) as boundary,
+    ):
+        service = TargetsService(setup, terrain, truth, boundary.bus(bus), inbox.post)
+        process = Process(boundary.service(service), inbox, MonotonicClock(), TICK_HZ)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

@@ -38,7 +38,7 @@ class TargetsService:
     def __init__(
         self, setup: RoleSetup, terrain: Terrain, truth: NDArray[np.float32], bus: Bus, post: Post
     ) -> None:
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._scenario = setup.scenario
         self._bus = bus
         self._post = post
@@ -153,12 +153,17 @@ class TargetsService:
                     self._member.note(now_ns, "capture", f"{vehicle} captured {target}", cell, target=target)
                 case Collision(first, second, cell):
                     self.counters.count("collisions")
-                    self._member.note(now_ns, "collision", f"{first} and {second} on one cell", cell)
+                    self._alarm("collision", f"{first} {second}", f"{first} and {second} on one cell", cell, now_ns)
                 case Body():
                     self._bus.publish(BODY, action, id=action.id)
                 case BodyHit(cell=cell, by_vehicle=by_vehicle):
                     self.counters.count("driven_into" if by_vehicle else "hit_by_bodies")
-                    self._member.note(now_ns, "body-collision", action.sentence, cell)
+                    self._alarm("body-collision", action.vehicle, action.sentence, cell, now_ns)
                 case LethalEntry(vehicle, cell):
                     self.counters.count("lethal_entries")
-                    self._member.note(now_ns, "lethal-entry", f"{vehicle} entered a lethal cell", cell)
+                    self._alarm("lethal-entry", vehicle, f"{vehicle} entered a lethal cell", cell, now_ns)
+
+    def _alarm(self, kind: str, about: str, text: str, cell: int, now_ns: int) -> None:
+        """Something happened that must not: to the log of who watches now, and to those who come late."""
+        self._member.note(now_ns, kind, text, cell)
+        self._member.alarms.happened(kind, about, text, now_ns, cell)

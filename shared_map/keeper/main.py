@@ -6,12 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from shared_map.keeper.service import KeeperService
-from shared_map.keeper.store import KeeperStore
+from shared_map.keeper.store import KEEPER_STORE, KeeperStore
 from shared_map.terrain.terrain import load_terrain
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
+from swarm.runtime.recording.recording import recorded
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 
@@ -37,10 +38,12 @@ def run(
     with (
         KeeperStore(store_path or ":memory:", rebuild=rebuild) as store,
         open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
+        recorded(setup, terrain.digest) as boundary,
     ):
         inbox = Inbox()
-        service = KeeperService(setup, terrain, bus, inbox.post, store)
-        process = Process(service, inbox, MonotonicClock(), TICK_HZ)
+        kept = boundary.outside(store, KEEPER_STORE)
+        service = KeeperService(setup, terrain, boundary.bus(bus), inbox.post, kept)
+        process = Process(boundary.service(service), inbox, MonotonicClock(), TICK_HZ)
         process.stop_on_signals()
         if stop_when is not None:
             end_with(stop_when, process.stop)

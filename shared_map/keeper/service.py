@@ -49,7 +49,7 @@ class KeeperService:
     """
 
     def __init__(self, setup: RoleSetup, terrain: Terrain, bus: Bus, post: Post, store: KeeperStore) -> None:
-        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post)
+        self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self.counters = self._member.counters
         self._bus = bus
         self._post = post
@@ -159,7 +159,9 @@ class KeeperService:
                 self._named.append(author)
                 text = f"author {author} exceeds its quota; its marks are delayed"
                 self._member.note(now_ns, "quota", text)
+                self._member.alarms.begin("quota", author, text, now_ns)
         self._named = [author for author in self._named if author in throttled]
+        self._member.alarms.last_of("quota", self._named, now_ns)
 
     def _accepted(self, mark_set: MarkSet) -> None:
         self._keeper.accept(mark_set)
@@ -242,8 +244,10 @@ class KeeperService:
                 text = f"{error}; {self._keeper.waiting} sets wait, serving goes on"
                 log.error("%s", text)
                 self._member.note(now_ns, "store", text)
+                self._member.alarms.begin("keeper-behind", f"keeper-{self._id}", text, now_ns)
             return
         if self._noted_ns is not None:
             self._noted_ns = None
             log.info("the store can be written again")
+            self._member.alarms.end("keeper-behind", f"keeper-{self._id}", now_ns)
             self._member.note(now_ns, "store", f"the store {self._store.path} can be written again")

@@ -21,6 +21,7 @@ from shared_map.replication.marks import base_seq, is_tombstone
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import ProtocolError, StoreError
 from swarm.grid import GridSpec
+from swarm.runtime.recording.outside import Outside
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.marks import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order
@@ -316,12 +317,13 @@ def _open(path: str) -> sqlite3.Connection:
 
 def _open_to_read(path: Path) -> sqlite3.Connection:
     if not path.is_file():
-        raise StoreError(f"there is no store {path}")
+        raise StoreError(f"there is no store {path}: no such file; a run leaves one as runs/RUN/map.sqlite")
     try:
         db = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True, timeout=2.0)
         db.execute("SELECT count(*) FROM meta").fetchone()
     except sqlite3.Error as error:
-        raise StoreError(f"cannot read the store {path}: {error}") from error
+        why = "it is not a keeper's store" if "not a database" in str(error) else str(error)
+        raise StoreError(f"cannot read the store {path}: {why}") from error
     return db
 
 
@@ -355,6 +357,23 @@ def _move_aside(path: Path) -> Path:
     for tail in ("-wal", "-shm"):
         Path(f"{path}{tail}").unlink(missing_ok=True)
     return aside
+
+
+KEEPER_STORE = Outside(
+    "store",
+    calls={
+        "bind": None,
+        "load": list[MarkSet],
+        "set_aside": dict[str, MarkSet],
+        "tiles_set_aside": list[int],
+        "save": None,
+        "save_sightings": None,
+        "save_orders": None,
+        "orders": list[Order],
+    },
+    facts={"path": Path},
+)
+"""What a keeper uses of its store."""
 
 
 class Keeper:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from shared_map.replication.marks import (
     zone_author,
 )
 from shared_map.replication.replica import MapReplica
-from shared_map.replication.tiles import tile_cells
+from shared_map.replication.tiles import grid_cells, tile_cells, tile_corners
 from shared_map.terrain.layers import polygon_mask
 from shared_map.terrain.places import MapFrame
 from shared_map.terrain.terrain import Terrain
@@ -89,31 +90,50 @@ def free_name(replica: MapReplica) -> str:
     return next(name for n in itertools.count(1) if zone_author(name := f"z{n}") not in taken)
 
 
-def zones_of(replica: MapReplica, now_ns: int) -> list[Zone]:
-    """The zones that stand, in order of name."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ZoneCells:
+    """Cells of a zone that stands, int64 (n,), and the rule that all of them have."""
+
+    cells: NDArray[np.int64]
+    kind: MarkKind
+    pace_s_per_m: float
+    until_ns: int
+
+
+def cells_of_zones(replica: MapReplica, now_ns: int) -> dict[str, ZoneCells]:
+    """Name -> the cells of each zone that stands, in order of name."""
     cells: dict[str, list[NDArray[np.int64]]] = {}
     rules: dict[str, tuple[int, float, int]] = {}
     for each in _zone_sets(replica):
         stated = standing(each, now_ns)
         if not len(stated.cells):
             continue
-        window = replica.grid.tile_window(each.tile)
-        rows, cols = np.divmod(stated.cells.astype(np.int64), 32)
-        cells.setdefault(each.author, []).append(np.stack((rows + window.row0, cols + window.col0)))
+        inside = grid_cells(replica.grid, tile_corners(replica.grid, each.tile), stated.cells)
+        cells.setdefault(each.author, []).append(inside.astype(np.int64))
         until_ns = FOREVER if stated.untils_ns is None else int(stated.untils_ns[0])
         rules[each.author] = (int(stated.kinds[0]), float(stated.paces[0]), until_ns)
+    return {
+        author.partition(".")[2]: ZoneCells(
+            np.concatenate(cells[author]), MarkKind(rules[author][0]), *rules[author][1:]
+        )
+        for author in sorted(cells)[:MOST_ZONES]
+    }
+
+
+def zones_of(replica: MapReplica, now_ns: int) -> list[Zone]:
+    """The zones that stand, in order of name."""
     found = []
-    for author in sorted(cells)[:MOST_ZONES]:
-        rows, cols = np.concatenate(cells[author], axis=1)
-        kind, pace, until_ns = rules[author]
+    for name, each in cells_of_zones(replica, now_ns).items():
+        rows, cols = np.divmod(each.cells, replica.grid.cols)
+        lethal = each.kind == MarkKind.LETHAL
         found.append(
             Zone(
-                name=author.partition(".")[2],
-                kind="lethal" if kind == MarkKind.LETHAL else "pace",
-                pace_s_per_m=None if kind == MarkKind.LETHAL else pace,
+                name=name,
+                kind="lethal" if lethal else "pace",
+                pace_s_per_m=None if lethal else each.pace_s_per_m,
                 cells=len(rows),
                 window=[int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1],
-                until_ns=None if until_ns >= _LIMIT else max(until_ns, 0),
+                until_ns=None if each.until_ns >= _LIMIT else max(each.until_ns, 0),
             )
         )
     return found

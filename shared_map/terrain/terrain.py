@@ -410,12 +410,12 @@ def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
     return homes_of(terrain.pace_s_per_m, truth)
 
 
-def prepare(folder: Path, scenario: Scenario) -> tuple[Terrain, Floats]:
+def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) -> tuple[Terrain, Floats]:
     """Build terrain and truth of a scenario, unless they are kept from an earlier run, and leave them in a folder
     for the other processes. What is returned is mapped, as theirs."""
     key, kept = scenario_key(scenario), kept_key(scenario)
     if kept is None or not fetch_kept(kept, folder):
-        terrain = build_terrain(scenario)
+        terrain = build_terrain(scenario, progress)
         save_prepared(folder, terrain, build_truth(scenario, terrain), key)
         del terrain
         give_back_memory()

@@ -32,6 +32,7 @@ from swarm.bus.bus import (
     newest_of,
 )
 from swarm.bus.endpoints import listening, wait_for_router
+from swarm.bus.open_errors import why_not_listening, why_unreachable
 from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
 from swarm.bus.zenoh_threads import attached, guarded, says_json, taken_after, taken_from, timeout_of, waiting_in
@@ -85,10 +86,12 @@ def open_bus(
     except zenoh.ZError as error:
         if patient and not any(map(listening, endpoints)):
             return open_bus(network, patient=True, authenticator=authenticator)
-        reason = str(error).split(" at /")[0]
-        what = "listen on" if mode == "router" else "reach a router at"
-        hint = "is the port taken?" if mode == "router" else "is `swarm router` running there?"
-        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason} ({hint})") from error
+        log.info("zenoh says: %s", error)
+        if mode == "router":
+            what, reason = "listen on", why_not_listening(error)
+        else:
+            what, reason = "reach a router at", why_unreachable(endpoints, encrypted=network.tls is not None)
+        raise BusError(f"cannot {what} {', '.join(endpoints)}: {reason}") from error
 
 
 class ZenohBus:

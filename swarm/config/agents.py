@@ -6,6 +6,7 @@ import msgspec
 
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ConfigError
+from swarm.ranks import ranked_id
 
 
 class AgentPlan(msgspec.Struct, frozen=True):
@@ -44,6 +45,18 @@ def added_agent(
         most = scenario.vehicles.per_agent
         raise ConfigError(f"an agent hosts 1 to {most} vehicles (vehicles.per_agent), not {count}")
     return AddedAgent(AgentPlan(id, groups[group], 0, count), at)
+
+
+def crew_of(scenario: Scenario) -> list[tuple[str, str]]:
+    """(role, id) of the processes that a complete run needs. A router belongs to no run, and nothing waits for a
+    monitor."""
+    standbys = scenario.standbys
+    return [
+        ("keeper", "0"),
+        *(("targets", ranked_id("0", rank)) for rank in range(standbys.targets + 1)),
+        *(("planner", ranked_id(id, rank)) for rank in range(standbys.planner + 1) for id in scenario.target_ids),
+        *(("agent", plan.id) for plan in plan_agents(scenario)),
+    ]
 
 
 def agent_of(vehicle: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import msgspec
 
@@ -11,7 +11,8 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Li
 from swarm.clock import NS_PER_S
 from swarm.errors import RunMismatchError
 from swarm.liveness import Peer
-from swarm.runtime.stats import Counters
+from swarm.runtime.alarms import Alarms
+from swarm.runtime.stats import MESSAGES_PER_S, RESTARTS, Counters, carried
 from swarm.wire.fields import MOST_TEXT
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.processes import Note, RunInfo, Stats
@@ -24,6 +25,10 @@ NO_RUN = ""
 """The run id of what belongs to no run: a router passes on all messages."""
 _TAG = "run-check"
 _MOST_STRANGERS = 256
+_RATE_LEAST_S = 0.5
+"""Over a shorter time no rate is measured, as at the end."""
+_BEHIND_TICKS = 5
+"""A process that skips so many ticks in a second is behind."""
 
 
 class Member:
@@ -36,13 +41,22 @@ class Member:
     once.
     """
 
-    def __init__(self, info: RunInfo, bus: Bus, post: Post) -> None:
+    def __init__(self, info: RunInfo, bus: Bus, post: Post, before: Stats | None = None) -> None:
         self.info = info
+        self._before = before
+        """What earlier lives of this process have counted: those who hear of it late are told that, too."""
+        self.alarms = Alarms(() if before is None else before.alarms)
+        """What people should know that watch the run."""
         self.counters = Counters()
         """All that this process counts; never reset."""
         self._bus = bus
         self._post = post
         self._stats_due_ns = 0
+        self._rate_ns, self._rate_of = 0, 0
+        """When the rate of messages was measured last, and how many there had been."""
+        self._dropped = 0
+        """Ticks that had been dropped when that was looked at last."""
+        self.counters.gauge(RESTARTS, float(info.restarts))
         self._now_ns = 0  # of the last tick
         # Whether another process of this run has ever answered: from then on no answer ends this one.
         self._confirmed = info.run_id == NO_RUN
@@ -97,6 +111,9 @@ class Member:
 
     def tick(self, now_ns: int) -> None:
         """Name new strangers; publish the counters once a second."""
+        if not self._now_ns and self.info.restarts:
+            text = f"{self._name} was started again, restart {self.info.restarts}"
+            self.alarms.happened("restarted", self._name, text, now_ns)
         self._now_ns = now_ns
         for sentence in self._to_name:
             self.note(now_ns, "stranger", sentence)
@@ -108,21 +125,45 @@ class Member:
     def publish_stats(self, now_ns: int) -> None:
         """Publish the counters now: the last time when the service stops."""
         counts = {**self.counters.counts, **self._bus.counts}
+        self._measure(counts, now_ns)
         stats = Stats(
             role=self.info.role,
             id=self.info.id,
             incarnation=self.info.incarnation,
             stamp_ns=now_ns,
-            counts=counts,
-            gauges=dict(self.counters.gauges),
-            histograms={name: h.buckets for name, h in self.counters.histograms.items()},
+            counts=dict(sorted(counts.items())),  # when a figure was counted first must not show in the bytes
+            gauges=dict(sorted(self.counters.gauges.items())),
+            histograms={name: h.buckets for name, h in sorted(self.counters.histograms.items())},
             counts_by=self.counters.counts_by,
             histograms_by={
                 name: {id: h.buckets for id, h in each.items()}
                 for name, each in self.counters.histograms_by.items()
             },
+            alarms=self.alarms.told(),
         )
+        if self._before is not None:
+            stats = carried(self._before, stats)
         self._bus.publish(STATS, stats, role=self.info.role, id=self.info.id)
+
+    def _measure(self, counts: Mapping[str, int], now_ns: int) -> None:
+        """Measure what only this process can: all who watch then have the same rate, whenever they looked."""
+        passed_s = (now_ns - self._rate_ns) / NS_PER_S
+        if passed_s < _RATE_LEAST_S:
+            return
+        sent, dropped = counts.get("messages_out", 0), counts.get("ticks_dropped", 0)
+        if self._rate_ns:
+            self.counters.gauge(MESSAGES_PER_S, (sent - self._rate_of) / passed_s)
+            skipped = dropped - self._dropped
+            if skipped >= _BEHIND_TICKS:
+                text = f"{self._name} is behind: it skipped {skipped} ticks in {passed_s:.1f} s"
+                self.alarms.begin("behind", self._name, text, now_ns)
+            elif not skipped:
+                self.alarms.end("behind", self._name, now_ns)
+        self._rate_ns, self._rate_of, self._dropped = now_ns, sent, dropped
+
+    @property
+    def _name(self) -> str:
+        return f"{self.info.role}-{self.info.id}"
 
     def note(
         self, now_ns: int, kind: str, text: str, cell: int | None = None, *, target: str | None = None

@@ -20,7 +20,8 @@ from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
 from swarm.runtime.garbage import collected_rarely
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.stats import Counters
+from swarm.runtime.own_usage import OwnUsage
+from swarm.runtime.stats import ENDED, Counters
 
 log = logging.getLogger(__name__)
 
@@ -152,23 +153,25 @@ class Process:
         counters = self._service.counters
         counters.count("ticks_dropped", 0)
         counters.count("ticks_late", 0)
-        counters.counts.update(self._inbox.counts)
+        counters.set_counts(self._inbox.counts)
         self._service.start(self._clock.now_ns())
         try:
             with collected_rarely():
                 self._loop(counters)
+            counters.gauge(ENDED, 1.0)  # not where an error ends it
         finally:
             # A second signal must not interrupt the end, not even that of the interpreter.
             for number in self._signals:
                 signal.signal(number, signal.SIG_IGN)
             self._inbox.close()
-            counters.counts.update(self._inbox.counts)
+            counters.set_counts(self._inbox.counts)
             self._service.stop(self._clock.now_ns())
 
     def _loop(self, counters: Counters) -> None:
         due_ns = events_until_ns = self._clock.now_ns()
         if self._phase_ns is not None:
             due_ns += (self._phase_ns - due_ns) % self._tick_ns
+        usage = OwnUsage()
         while not self._stopping:
             now_ns = self._clock.now_ns()
             if now_ns >= due_ns and (now_ns >= events_until_ns or not len(self._inbox)):
@@ -176,12 +179,13 @@ class Process:
                 counters.count("ticks_dropped", missed)
                 counters.count("ticks_late", missed + (late_ns > self._tick_ns // 2))
                 due_ns += (missed + 1) * self._tick_ns
+                usage.look(counters, now_ns)
                 self._service.tick(now_ns)
                 took_ns = self._clock.now_ns() - now_ns
                 events_until_ns = now_ns + 2 * took_ns
                 counters.observe("tick_ms", took_ns / 1e6)
                 counters.gauge("inbox", float(len(self._inbox)))
-                counters.counts.update(self._inbox.counts)
+                counters.set_counts(self._inbox.counts)
             # Bounded, because a signal handler does not interrupt a wait for a lock.
             wait_s = min((due_ns - self._clock.now_ns()) / NS_PER_S, 0.5)
             event = self._inbox.take(wait_s)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from swarm.config.agents import AddedAgent
+from swarm.config.agents import AddedAgent, crew_of
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
-from swarm.wire.messages.processes import RunInfo
+from swarm.wire.fields import MOST_IDS
+from swarm.wire.messages.processes import RunInfo, Stats
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +20,9 @@ class RoleSetup:
     started_ns   start of the run
     run_dir      where this machine keeps the run: prepared terrain, the keeper's store, logs; None if nowhere
     added        of an agent that the scenario does not name: what it hosts
+    restarts     how often it was started before in this run
+    before       what its earlier lives have counted; None if that is not known
+    record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
     """
 
     scenario: Scenario
@@ -29,6 +33,9 @@ class RoleSetup:
     started_ns: int
     run_dir: Path | None = None
     added: AddedAgent | None = None
+    restarts: int = 0
+    before: Stats | None = None
+    record_inputs: bool = False
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
         """What this process answers when others ask which run it belongs to."""
@@ -46,6 +53,9 @@ class RoleSetup:
             west_m=grid.west_m,
             north_m=grid.north_m,
             crs=grid.crs,
+            vehicles=self.scenario.vehicle_count,
+            crew=[f"{role}-{id}" for role, id in crew_of(self.scenario)][:MOST_IDS],
+            restarts=self.restarts,
         )
 
     @property

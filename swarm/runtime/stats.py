@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm.wire.fields import MOST_IDS, TOP_BUCKET, ZERO_BUCKET
+from swarm.wire.messages.processes import Stats
 
 CAPTURES_OF = "captures_of"
 """Per target, by the process that moves the targets."""
@@ -22,6 +24,13 @@ UNPROVEN_TO = "followed_unproven_to"
 """Per target, by agents: routes begun without a lower bound."""
 UNPROVEN_OF = "followed_unproven_of"
 """The same per vehicle."""
+
+ENDED = "ended"
+"""Gauge: 1 in the last words of a process that ends because it was asked to."""
+RESTARTS = "restarts"
+"""Gauge: how often the process was started again in this run."""
+MESSAGES_PER_S = "messages_per_s"
+"""Gauge: messages that the process sent per second, over the last second or so."""
 
 _BASE = 1.04
 _LOG_BASE = math.log(_BASE)
@@ -63,6 +72,10 @@ class Histogram:
     def count(self) -> int:
         return sum(self.buckets.values())
 
+    def values(self) -> list[tuple[float, int]]:
+        """Middles of the buckets, rising, and how many values are in each."""
+        return [(_value(bucket), count) for bucket, count in sorted(self.buckets.items())]
+
     def quantile(self, q: float) -> float | None:
         """The value below which a share `q` of all values lies, within 2 %; None if there are none."""
         total = self.count
@@ -82,7 +95,7 @@ class Histogram:
         if total == 0:
             return None
         # In order, so that the sum does not depend on the order of merging.
-        return math.fsum(_value(bucket) * count for bucket, count in sorted(self.buckets.items())) / total
+        return math.fsum(value * count for value, count in self.values()) / total
 
 
 def _value(bucket: int) -> float:
@@ -95,6 +108,36 @@ def merged(parts: Iterable[Mapping[int, int]]) -> Histogram:
     for part in parts:
         whole.merge(part)
     return whole
+
+
+def carried(before: Stats, own: Stats) -> Stats:
+    """The statistics of a life that goes on counting where the one before it ended. Gauges are of now."""
+    return msgspec.structs.replace(
+        own,
+        counts=_summed(before.counts, own.counts),
+        histograms=_merged_each(before.histograms, own.histograms),
+        counts_by={
+            name: _summed(before.counts_by.get(name, {}), own.counts_by.get(name, {}))
+            for name in {**before.counts_by, **own.counts_by}
+        },
+        histograms_by={
+            name: _merged_each(before.histograms_by.get(name, {}), own.histograms_by.get(name, {}))
+            for name in {**before.histograms_by, **own.histograms_by}
+        },
+        since=before.since or before.incarnation,
+    )
+
+
+def _summed(one: Mapping[str, int], other: Mapping[str, int]) -> dict[str, int]:
+    names = dict.fromkeys([*one, *other])
+    return {name: one.get(name, 0) + other.get(name, 0) for name in list(names)[:MOST_IDS]}
+
+
+def _merged_each(
+    one: Mapping[str, Mapping[int, int]], other: Mapping[str, Mapping[int, int]]
+) -> dict[str, dict[int, int]]:
+    names = dict.fromkeys([*one, *other])
+    return {name: merged((one.get(name, {}), other.get(name, {}))).buckets for name in list(names)[:MOST_IDS]}
 
 
 class Counters:
@@ -128,6 +171,10 @@ class Counters:
 
     def count(self, name: str, by: int = 1) -> None:
         self.counts[name] = self.counts.get(name, 0) + by
+
+    def set_counts(self, counts: Mapping[str, int]) -> None:
+        """Take over what somebody else counts, under its names."""
+        self.counts.update(counts)
 
     def gauge(self, name: str, value: float) -> None:
         """Set the present value; infinities and NaN remove it."""

@@ -13,6 +13,7 @@ import pytest
 from support.live_swarm import LiveSwarm, ask, client, swarm
 from support.processes import eventually, session_of
 
+from launch_scripts.replay.run import replay_run
 from swarm.bus.zenoh_bus import ZenohBus
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import RouteRequest
@@ -24,7 +25,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
-    live = LiveSwarm(tmp_path_factory.mktemp("live"))
+    live = LiveSwarm(tmp_path_factory.mktemp("live"), "--record-inputs")
     try:
         live.wait_until_up()
         yield live
@@ -113,7 +114,7 @@ def test_garbage_on_every_key_is_counted_and_dropped(live: LiveSwarm, bus: Zenoh
     status = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)
     dropped = {f"{p['role']}-{p['id']}": p["counts"]["payloads_dropped"] for p in status["processes"]}
     assert all(count > 0 for count in dropped.values()), dropped
-    assert live.said("0 restarts")
+    assert live.said("restarts 0")
     assert not live.said("starts again")
 
 
@@ -177,3 +178,13 @@ def test_a_ctrl_c_ends_all_in_order_and_leaves_the_report(live: LiveSwarm) -> No
     for name in ("report.png", "run.rrd", "router-0.log", "planner-t1.log", "launcher.log"):
         assert (live.run_dir / name).stat().st_size > 0
     eventually(lambda: not session_of(live.process.pid), 5, "the end of all")
+
+
+def test_each_process_of_it_gives_the_same_when_its_inputs_are_replayed(live: LiveSwarm) -> None:
+    replayed = list(replay_run(live.run_dir))
+    assert {(each.recorded.process, each.recorded.life) for each in replayed} >= {
+        *(("planner-t0", 2), ("planner-t1", 1), ("agent-a0", 2), ("agent-a1", 1)),
+        *(("keeper-0", 1), ("targets-0", 1)),
+    }
+    for each in replayed:
+        assert each.same, each

@@ -124,6 +124,7 @@ def fake_run(terrain: Terrain, truth: NDArray[np.float32], scenario: Scenario, h
             yield now_ns, _mark_set(tile, marked[tile], seqs)
         if step % max(1, int(hz)) == 0:
             counters["agent"].count("messages_out", int(rng.normal(1400, 60)))
+            counters["agent"].gauge("messages_per_s", float(rng.normal(1400, 60)))
             counters["agent"].observe("route_query_ms", float(rng.lognormal(0.6, 0.5)))
             for _ in range(20):
                 counters["planner"].observe("growth_ms", float(rng.lognormal(0.3, 0.25)))

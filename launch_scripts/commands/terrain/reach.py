@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.commands.terrain.route_on_terrain import finder_for
+from launch_scripts.commands.terrain.route_on_terrain import between, finder_for
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.report.geo.geo_shapes import areas_of, polygon
 from shared_map.arrays import Floats
@@ -70,13 +70,9 @@ def corridor(source: str, start: str, end: str, slack: float, preset: str | None
     ConfigError, TerrainError
         With one sentence, also if there is no way.
     """
-    first_place, last_place = read_place(start, "--from"), read_place(end, "--to")
-    scenario = find_scenario(source, preset)
-    terrain = build_terrain(scenario)
+    scenario, terrain, first, last = between(source, start, end, preset)
     if terrain.climb is not None or scenario.planner.length_weight:
         raise ConfigError("--from: no corridors with cost.directional = true or with planner.length_weight")
-    frame = MapFrame(terrain.grid)
-    first, last = cell_of(first_place, frame, "--from"), cell_of(last_place, frame, "--to")
     back_s = _to(scenario, terrain, first, "--from")
     finder = finder_for(scenario, terrain, last)
     best = finder.route(*terrain.grid.row_col(first))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from launch_scripts.commands.routes.route_files import DescribedRoute, metres_along
@@ -24,16 +26,33 @@ def find_route(source: str, start: str, end: str, preset: str | None = None) -> 
     TerrainError, ConfigError
         With one sentence, also if there is no way.
     """
-    first_place, last_place = read_place(start, "--from"), read_place(end, "--to")
-    scenario = find_scenario(source, preset)
-    terrain = build_terrain(scenario)
-    frame = MapFrame(terrain.grid)
-    first, last = cell_of(first_place, frame, "--from"), cell_of(last_place, frame, "--to")
+    scenario, terrain, first, last = between(source, start, end, preset)
     finder = finder_for(scenario, terrain, last)
     found = finder.route(*terrain.grid.row_col(first))
     if found.status is not RouteStatus.OK:
         raise TerrainError(_why_not(found.status, terrain, first, last))
     return _described(scenario.name, terrain, finder, found, scenario.planner)
+
+
+class Ends(NamedTuple):
+    """Two cells of a terrain, and the scenario that says what driving on it costs."""
+
+    scenario: Scenario
+    terrain: Terrain
+    first: int
+    last: int
+
+
+def between(source: str, start: str, end: str, preset: str | None = None) -> Ends:
+    """The terrain of a file, a scenario or a built-in one, and the cells of two places on it.
+
+    Places are read before the terrain is built: a mistake in one takes no time. Raises ConfigError or TerrainError.
+    """
+    places = read_place(start, "--from"), read_place(end, "--to")
+    scenario = find_scenario(source, preset)
+    terrain = build_terrain(scenario)
+    frame = MapFrame(terrain.grid)
+    return Ends(scenario, terrain, cell_of(places[0], frame, "--from"), cell_of(places[1], frame, "--to"))
 
 
 def finder_for(scenario: Scenario, terrain: Terrain, target: int) -> RouteFinder:

@@ -5,22 +5,35 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from launch_scripts.commands.shared_options import AsJson, PresetOption
+from launch_scripts.commands.terrain import photo_classes
 from launch_scripts.commands.terrain.terrain_files import write_geotiff
+from launch_scripts.commands.terrain.terrain_options import (
+    TIFF,
+    Cover,
+    CoverCodes,
+    Crs,
+    Encoding,
+    Fill,
+    PictureOption,
+    Resolution,
+    Scale,
+    check_target,
+    console,
+    draw_terrain,
+    print_shares,
+)
 from launch_scripts.launcher.progress import progress
-from shared_map.arrays import Bytes
-from shared_map.terrain.layers import TerrainClass
 from swarm.config.cost_rules import cost_of_preset
-from swarm.config.scenario import ElevationEncoding, Scenario, TerrainConfig
-from swarm.errors import ConfigError, SwarmError, TerrainError
+from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.errors import SwarmError, TerrainError
 
 if TYPE_CHECKING:
     from shared_map.terrain.row_bands import Progress as Tell
@@ -45,39 +58,6 @@ app = typer.Typer(
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-console = Console()
-
-Crs = Annotated[str | None, typer.Option(help="Coordinate system, where the file names none: EPSG:32632.")]
-Resolution = Annotated[
-    float | None, typer.Option(help="Cell size in metres to bring everything to.", min=1e-6, max=1e6)
-]
-Scale = Annotated[
-    float | None, typer.Option(help="Metres per unit of height, where the file does not say it.", min=1e-9, max=1e6)
-]
-Fill = Annotated[
-    bool, typer.Option("--fill", help="Fill voids from their surroundings instead of forbidding them.")
-]
-Cover = Annotated[str | None, typer.Option(help="A raster of land-cover codes on the same ground.")]
-CoverCodes = Annotated[
-    str | None, typer.Option(help="What its codes mean: worldcover, corine, corine-level-3, nlcd, or a CSV file.")
-]
-Encoding = Annotated[
-    ElevationEncoding | None, typer.Option(help="What stands for a height, where the file does not show it.")
-]
-_TIFF = (".tif", ".tiff")
-PictureOption = Annotated[Path | None, typer.Option(help="Write a picture (.png) too.")]
-
-
-def _check_target(path: Path | None, option: str, *endings: str) -> None:
-    """Raises ConfigError now, not after the work, if a file cannot be written."""
-    if path is None:
-        return
-    if path.is_dir():
-        raise ConfigError(f"{option} {path}: cannot write a file there, it is a folder")
-    if path.suffix.lower() not in endings:
-        raise ConfigError(f"{option} {path}: write {' or '.join(endings)}")
-    if not path.parent.is_dir():
-        raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
 
 
 def _scenario(name: str, preset: str | None = None) -> Scenario:
@@ -182,8 +162,8 @@ def cost(
     """
     from shared_map.terrain.terrain import build_terrain
 
-    _check_target(out, "--out", *_TIFF)
-    _check_target(picture, "--picture", ".png")
+    check_target(out, "--out", *TIFF)
+    check_target(picture, "--picture", ".png")
     loaded = _scenario(scenario, preset)
     with progress() as tell:
         started = time.perf_counter()
@@ -192,7 +172,9 @@ def cost(
         if out is not None:
             _write_cost(terrain, out, tell)
     if picture is not None:
-        _draw(terrain, picture, loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem)
+        draw_terrain(
+            terrain, picture, loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem
+        )
     finite = terrain.pace_s_per_m[np.isfinite(terrain.pace_s_per_m)]
     console.print(
         f"{terrain.grid.rows} x {terrain.grid.cols} cells of {terrain.grid.resolution_m:g} m in {seconds:.1f} s,"
@@ -201,7 +183,7 @@ def cost(
         highlight=False,
         soft_wrap=True,
     )
-    _print_shares(terrain.classes)
+    print_shares(terrain.classes)
     for note in terrain.notes:
         console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)
 
@@ -210,18 +192,6 @@ def _write_cost(terrain: Terrain, path: Path, tell: Tell) -> None:
     pace = terrain.pace_s_per_m
     write_geotiff(path, [np.where(np.isfinite(pace), pace, np.float32(-1))], terrain.grid, nodata=-1.0)
     tell("writing", 1.0)
-
-
-def _draw(terrain: Terrain, path: Path, title: str) -> None:
-    from launch_scripts.commands.terrain.terrain_picture import draw
-
-    draw(terrain, path, title)
-
-
-def _print_shares(classes: Bytes) -> None:
-    counts = np.bincount(classes.reshape(-1), minlength=max(TerrainClass) + 1)
-    shares = [f"{kind.name.lower()} {counts[kind] / classes.size:.1%}" for kind in TerrainClass if counts[kind]]
-    console.print("classes: " + ", ".join(shares), highlight=False)
 
 
 @app.command()
@@ -243,7 +213,7 @@ def rules(
     """
     from launch_scripts.commands.terrain import slope_rules
 
-    _check_target(picture, "--picture", ".png")
+    check_target(picture, "--picture", ".png")
     if scenario is None:
         shown = slope_rules.of_all()
     else:
@@ -279,9 +249,9 @@ def synth(
     from shared_map.terrain.terrain import build_terrain
     from swarm.grid import GridSpec
 
-    _check_target(out, "--out", *_TIFF, ".npz")
-    _check_target(photo, "--photo", *_TIFF)
-    _check_target(picture, "--picture", ".png")
+    check_target(out, "--out", *TIFF, ".npz")
+    check_target(photo, "--photo", *TIFF)
+    check_target(picture, "--picture", ".png")
     config = TerrainConfig(
         source="synthetic",
         rows=rows,
@@ -304,7 +274,7 @@ def synth(
     if photo is not None:
         write_geotiff(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
     if picture is not None:
-        _draw(terrain, picture, f"synthetic, seed {seed}")
+        draw_terrain(terrain, picture, f"synthetic, seed {seed}")
     console.print(f"{rows} x {cols} cells of {resolution_m:g} m, relief {relief_m:g} m, seed {seed}: {out}")
 
 
@@ -342,7 +312,7 @@ def reach(
     from launch_scripts.commands.terrain.reach import corridor, write_reach
     from launch_scripts.commands.terrain.reach import reach as reach_of
 
-    _check_target(out, "--out", *_TIFF, ".geojson")
+    check_target(out, "--out", *TIFF, ".geojson")
     found = reach_of(terrain, to, preset) if start is None else corridor(terrain, start, to, slack, preset)
     if out is not None:
         write_reach(found, out, every_s)
@@ -362,92 +332,7 @@ def reach(
     console.print(said, highlight=False, soft_wrap=True)
 
 
-@app.command()
-def classify(
-    elevation: Annotated[Path, typer.Argument(help="The elevation file.")],
-    photo: Annotated[Path, typer.Argument(help="The colour photo.")],
-    labels: Annotated[
-        Path | None, typer.Option(help="Learn from these labels (TOML), and compare with them.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Write a GeoTIFF: 0 unknown, 1 water, 2 forest, 3 rock, 4 grass, 5 soil, ..."),
-    ] = None,
-    picture: PictureOption = None,
-    crs: Crs = None,
-    resolution_m: Resolution = None,
-) -> None:
-    """Say what a photo shows: water, forest, rock, grass, soil, road, built, snow.
-
-    Without --labels by rules. With labels the classes are learnt from them,
-    and two tables show what the labelled cells were taken for: by the rules,
-    and by a model that had not seen the polygon it was asked about.
-    A file of labels, in metres east and south of the north-west corner:
-
-    [\\[labels]]
-    class = "water"        # forest, rock, grass, soil, road, built, snow
-    polygon_m = [[4300, 1750], [4900, 1700], [4600, 2400]]
-    [\\[labels]]
-    class = "forest"
-    points_m = [[4700, 4200], [5300, 2900]]
-    """
-    from shared_map.terrain.terrain import build_terrain
-
-    _check_target(out, "--out", *_TIFF)
-    _check_target(picture, "--picture", ".png")
-    terrain_config = TerrainConfig(
-        source=str(elevation),
-        photo=str(photo),
-        labels=None if labels is None else str(labels),
-        crs=crs,
-        resolution_m=resolution_m,
-    )
-    with progress() as tell:
-        terrain = build_terrain(Scenario(terrain=terrain_config), tell)
-    _print_shares(terrain.classes)
-    if labels is not None:
-        _compare(terrain, labels)
-    if out is not None:
-        write_geotiff(out, [terrain.classes], terrain.grid)
-    if picture is not None:
-        _draw(terrain, picture, f"{photo.name} on {elevation.name}")
-    for note in terrain.notes:
-        console.print(f"- {note}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _compare(terrain: Terrain, path: Path) -> None:
-    from shared_map.terrain.importers.photos.classify import by_rules, confusion, held_out
-    from shared_map.terrain.importers.photos.labels import read_labels
-
-    labels = read_labels(path, terrain.grid)
-    inputs = (terrain.photo, terrain.elevation_m, terrain.grid.resolution_m)
-    labelled = labels.classes != TerrainClass.UNKNOWN
-    ruled = by_rules(*inputs)
-    _print_confusion("by rules", confusion(labels.classes[labelled], ruled[labelled]))
-    _print_confusion("learnt, on polygons not seen", confusion(*held_out(*inputs, labels.classes, labels.groups)))
-
-
-def _print_confusion(title: str, counts: Any) -> None:
-    labelled = [kind for kind in TerrainClass if counts[kind].any()]
-    present = [kind for kind in TerrainClass if counts[kind].any() or counts[:, kind].any()]
-    unknown = counts[:, TerrainClass.UNKNOWN].sum() / counts.sum()
-    right = np.trace(counts) / counts.sum()
-    table = Table(
-        title=f"{title}: {right:.1%} of the labelled cells, {unknown:.1%} unknown, {1 - right - unknown:.1%} wrong",
-        title_justify="left",
-    )
-    table.add_column("labelled")
-    for kind in present:
-        table.add_column(kind.name.lower(), justify="right")
-    table.add_column("IoU", justify="right")
-    overlaps = []
-    for kind in labelled:
-        union = counts[kind].sum() + counts[:, kind].sum() - counts[kind, kind]
-        cells = [str(counts[kind, other]) for other in present]
-        overlaps.append(counts[kind, kind] / union)
-        table.add_row(kind.name.lower(), *cells, f"{overlaps[-1]:.2f}")
-    table.caption = f"mean IoU {np.mean(overlaps):.2f}"
-    console.print(table)
+app.add_typer(photo_classes.app)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.report.pictures.hillshade import hillshade
-from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
+from shared_map.terrain.pyramid import level_of
 from shared_map.terrain.terrain import Terrain
 from swarm.grid import Window
 
@@ -26,10 +25,6 @@ _MOST_TEXELS = 1 << 20
 _MOST_VERTICES = 1 << 17
 _RELIEF = 0.09
 """Height of the view, from the lowest to the highest cell, as a share of the terrain's width."""
-
-LETHAL_MARK = (86, 22, 150)
-SLOW_MARK = (235, 150, 0)
-FAST_MARK = (90, 200, 250)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,14 +45,16 @@ class MeshTile:
 class TerrainMesh:
     """The terrain as the view has it: of a large one, the finest level of its pyramid with at most `_MOST_TEXELS`.
 
+    seen       that level
     texel      cells of the terrain along one pixel of the photo
+    stretch    how many times as high as they are heights are drawn
     heights_m  float32, of that level, stretched; over the lowest
     """
 
-    def __init__(self, terrain: Terrain) -> None:
+    def __init__(self, terrain: Terrain, height_factor: float | None = None) -> None:
         self.grid = terrain.grid
-        seen = level_of(terrain, _MOST_TEXELS)
-        self._seen, self.texel = seen.grid, seen.side
+        self.seen = seen = level_of(terrain, _MOST_TEXELS)
+        self.texel = seen.side
         heights = np.array(seen.elevation_m, np.float32)
         voids = ~np.isfinite(heights)
         lowest = float(heights[~voids].min()) if not voids.all() else 0.0
@@ -67,9 +64,8 @@ class TerrainMesh:
         self.depth_m = self.grid.rows * self.grid.resolution_m
         relief_m = float(heights.max())
         wanted = _RELIEF * max(self.width_m, self.depth_m) / relief_m if relief_m > 0 else 1.0
-        self.stretch = min(max(wanted, 1.0), 8.0)
+        self.stretch = height_factor or min(max(wanted, 1.0), 8.0)
         self.heights_m = heights * np.float32(self.stretch)
-        self.photo = _lit_photo(seen)
         self.step = self.texel * max(2, math.ceil(math.sqrt(seen.grid.cells / _MOST_VERTICES)))
         self.tile_cells = max(MESH_TILE * self.texel // self.step, 1) * self.step
         self.tile_cols = -(-self.grid.cols // self.tile_cells)
@@ -83,7 +79,7 @@ class TerrainMesh:
     def place(self, east_m: Floats, south_m: Floats, above_m: float = 0.0) -> Floats:
         """Points on the terrain, float32 (n, 3), lifted by some metres of the view."""
         east_m, south_m = np.asarray(east_m, np.float32), np.asarray(south_m, np.float32)
-        seen = self._seen
+        seen = self.seen.grid
         rows = np.clip(south_m / seen.resolution_m - 0.5, 0, seen.rows - 1)
         cols = np.clip(east_m / seen.resolution_m - 0.5, 0, seen.cols - 1)
         row0, col0 = rows.astype(np.intp), cols.astype(np.intp)
@@ -105,9 +101,13 @@ class TerrainMesh:
             above_m,
         )
 
-    def mesh_tiles(self) -> list[MeshTile]:
-        """All tiles of the terrain's mesh."""
-        return [self._mesh_tile(index) for index in range(self.tile_rows * self.tile_cols)]
+    @property
+    def tiles(self) -> int:
+        return self.tile_rows * self.tile_cols
+
+    def mesh_tiles(self, coarser: int = 1) -> list[MeshTile]:
+        """All tiles of the terrain's mesh, with vertices so many times as far apart."""
+        return [self._mesh_tile(index, coarser * self.step) for index in range(self.tiles)]
 
     def tile_window(self, index: int) -> Window:
         tile_row, tile_col = divmod(index, self.tile_cols)
@@ -126,10 +126,10 @@ class TerrainMesh:
         cols = range(max(window.col0 - reach, 0) // self.tile_cells, (window.col1 - 1) // self.tile_cells + 1)
         return [row * self.tile_cols + col for row in rows for col in cols]
 
-    def _mesh_tile(self, index: int) -> MeshTile:
+    def _mesh_tile(self, index: int, step: int) -> MeshTile:
         window = self.tile_window(index)
-        rows = _stepped(window.row0, window.row1, self.step, self.tile_cells)
-        cols = _stepped(window.col0, window.col1, self.step, self.tile_cells)
+        rows = _stepped(window.row0, window.row1, step, self.tile_cells)
+        cols = _stepped(window.col0, window.col1, step, self.tile_cells)
         grid_rows, grid_cols = np.meshgrid(rows, cols, indexing="ij")
         vertices = self.place_cells((grid_rows * self.grid.cols + grid_cols).reshape(-1))
         height, width = (
@@ -146,24 +146,6 @@ class TerrainMesh:
             texcoords=texcoords.reshape(-1, 2).astype(np.float32),
         )
 
-    def texture(self, window: Window, pace: Floats, prior: Floats) -> Bytes:
-        """Photo of a window with all marks drawn in: where `pace`, as known now, differs from `prior`.
-
-        However many cells a texel shows, a mark on one of them is seen."""
-        part = (slice(window.row0, window.row1), slice(window.col0, window.col1))
-        photo: Bytes = self.photo[
-            window.row0 // self.texel : -(-window.row1 // self.texel),
-            window.col0 // self.texel : -(-window.col1 // self.texel),
-        ].copy()
-        now, before = pace[part], prior[part]
-        lethal = np.isinf(now) & ~np.isinf(before)
-        slow, fast = np.isfinite(now) & (now > before), np.isfinite(now) & (now < before)
-        for cells, colour, share in ((fast, FAST_MARK, 0.75), (slow, SLOW_MARK, 0.75), (lethal, LETHAL_MARK, 0.85)):
-            where = any_in_blocks(cells, self.texel)
-            blend = (1 - share) * photo[where] + share * np.array(colour)
-            photo[where] = blend.astype(np.uint8)
-        return photo
-
 
 def _stepped(first: int, end: int, step: int, tile_cells: int) -> NDArray[np.int64]:
     """Every step-th index from `first` to the next tile's first, or to the last before `end` at the border."""
@@ -179,12 +161,3 @@ def _triangles(rows: int, cols: int) -> NDArray[np.uint32]:
         [np.stack([north_west, south_west, north_east], 1), np.stack([north_east, south_west, south_east], 1)]
     )
     return faces.astype(np.uint32)
-
-
-def _lit_photo(seen: Level) -> Bytes:
-    shade = hillshade(seen.elevation_m, seen.grid.resolution_m)
-    photo = seen.photo.astype(np.float32)
-    grey = photo.mean(axis=2, keepdims=True)  # on full colours green vehicles would drown
-    lit: Floats = (0.42 * photo + 0.53 * grey) * (0.42 + 0.78 * shade[..., None])
-    lit_bytes: Bytes = np.clip(lit, 0, 255).astype(np.uint8)
-    return lit_bytes

@@ -62,6 +62,15 @@ class BoundedServer(socketserver.ThreadingTCPServer):
     def port(self) -> int:
         return int(self.server_address[1])
 
+    def close(self) -> None:
+        """Listen no more, and cut all connections."""
+        self.shutdown()
+        self.server_close()
+        with self._lock:
+            for connection in self._open:
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
+
     def keep(self, connection: socket.socket) -> None:
         """Let a connection last."""
         with self._lock:

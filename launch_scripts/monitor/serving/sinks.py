@@ -8,7 +8,7 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,9 +57,9 @@ class Streams:
     def __init__(self, *streams: rr.RecordingStream) -> None:
         self.streams = streams
 
-    def log(self, path: str, what: Any, *, static: bool = False) -> None:
+    def log(self, path: str, *what: Any, static: bool = False) -> None:
         for stream in self.streams:
-            stream.log(path, what, static=static)
+            stream.log(path, *what, static=static)
 
     def set_time(self, timeline: str, **when: Any) -> None:
         for stream in self.streams:
@@ -88,8 +88,8 @@ class Sinks:
             behind = _hidden_address()
             self._gate = _when_free(lambda port: StreamGate(port, behind), config.grpc_port, "grpc_port")
             threading.Thread(target=self._gate.serve_forever, name="stream-gate", daemon=True).start()
-            self.stream_url = stream_url = f"rerun+http://{LOOPBACK}:{self._gate.port}/proxy"
-            page = _when_free(lambda port: ViewerPage(port, stream_url), config.web_port, "web_port")
+            self.stream_url = f"rerun+http://{LOOPBACK}:{self._gate.port}/proxy"
+            page = _when_free(lambda port: ViewerPage(port, behind), config.web_port, "web_port")
             self._page = page
             sinks.append(rr.GrpcServerSink(bind_ip=behind[0], port=behind[1], server_memory_limit=_MEMORY))
         self.rec.set_sinks(*sinks, default_blueprint=blueprint)
@@ -98,6 +98,11 @@ class Sinks:
     def live_url(self) -> str | None:
         """Address for a browser on this machine."""
         return None if self._page is None else self._page.url
+
+    def tell_page(self, run: Callable[[], Mapping[str, Any]]) -> None:
+        """What the page shows of the run beside the view, asked once a second for each page that is open."""
+        if self._page is not None:
+            self._page.run = run
 
     def begin_file(self, path: Path) -> None:
         """Let what is logged to `streams` go to this file, too. On a stream of its own: new sinks for `rec` would
@@ -115,22 +120,37 @@ class Sinks:
         )
 
     def close(self, within_s: float = 3.0) -> None:
-        closing = threading.Thread(target=self._flush, args=(within_s,), name="flush", daemon=True)
-        closing.start()
-        closing.join(within_s)
-        if closing.is_alive():
-            log.warning("the recording was not written to the end within %.0f s", within_s)
+        written = _in_time(lambda: self._flush(within_s), within_s)
         if self._page is not None:
             self._page.close()
         if self._gate is not None:
-            self._gate.shutdown()
-            self._gate.server_close()
+            self._gate.close()
+        # Only now, as it would take who still watches back to the beginning.
+        if not written or not _in_time(self._let_play, 1.0):
+            log.warning("the recording was not written to the end within %.0f s", within_s)
 
     def _flush(self, within_s: float) -> None:
         for stream in reversed(self.streams.streams):
             with contextlib.suppress(Exception):  # a viewer that is gone must not keep the file from its end
                 stream.flush(timeout_sec=within_s * 0.8)
+
+    def _let_play(self) -> None:
+        """Let the recording be opened at its beginning and play: the live view follows its end."""
+        if (panel := self._blueprint.time_panel) is not None:
+            panel.play_state = "playing"
+        for stream in reversed(self.streams.streams):
+            with contextlib.suppress(Exception):  # as above
+                stream.send_blueprint(self._blueprint, make_active=True, make_default=True)
+                stream.flush(timeout_sec=0.8)
             stream.disconnect()
+
+
+def _in_time(work: Callable[[], None], within_s: float) -> bool:
+    """Whether it is done in time. It goes on beside if it is not."""
+    thread = threading.Thread(target=work, name="flush", daemon=True)
+    thread.start()
+    thread.join(within_s)
+    return not thread.is_alive()
 
 
 def _when_free(listen: Callable[[int], T], port: int, name: str) -> T:

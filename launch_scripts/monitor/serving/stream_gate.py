@@ -17,7 +17,7 @@ _PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 """So begins HTTP/2 in the clear, which native viewers speak and no browser does."""
 _HEAD_BYTES = 1 << 14
 _HEAD_WITHIN_S = 5.0
-_SEND_WITHIN_S = 20.0
+SEND_WITHIN_S = 20.0
 """A reader that takes nothing for so long is cut off."""
 _PIECE_BYTES = 1 << 16
 
@@ -46,11 +46,11 @@ class _Visit(socketserver.BaseRequestHandler):
                     b"Content-Length: %d\r\n\r\n%s" % (len(body), body)
                 )
                 return
-        with socket.create_connection(self.server.behind, timeout=_SEND_WITHIN_S) as inner:
+        with socket.create_connection(self.server.behind, timeout=SEND_WITHIN_S) as inner:
             self.server.keep(self.request)
-            self.request.settimeout(_SEND_WITHIN_S)
+            self.request.settimeout(SEND_WITHIN_S)
             inner.sendall(head)
-            _join(self.request, inner)
+            join_sockets(self.request, inner)
 
     def _head(self) -> bytes:
         """The first bytes of a connection, up to the end of what tells who comes."""
@@ -83,7 +83,7 @@ def _checked(head: bytes) -> tuple[str | None, bytes]:
     return why, "\r\n".join([*kept, "Connection: close"]).encode("latin1") + end + body
 
 
-def _join(one: socket.socket, other: socket.socket) -> None:
+def join_sockets(one: socket.socket, other: socket.socket) -> None:
     """Pass on what either says, until one has no more to say."""
     while True:
         ready, _, _ = select.select([one, other], [], [])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import http.client
 import importlib.util
+import json
 import logging
 import os
 import socket
@@ -16,23 +17,29 @@ import sys
 import threading
 import time
 import urllib.parse
+from collections.abc import Callable, Mapping
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.serving.loopback_guard import LOOPBACK, BoundedServer, refusal
+from launch_scripts.monitor.serving.stream_gate import SEND_WITHIN_S, join_sockets
 from swarm.errors import StoreError
 
 log = logging.getLogger(__name__)
 
 _FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/favicon.ico", "/sw.js")
+_BANNER = "/run_banner.js"
 _READY_WITHIN_S = 20.0
+_MOST_ASKED = 1 << 16
+"""Bytes of a question that is passed on to rerun's server."""
+_OF_A_LINK = frozenset(("connection", "keep-alive"))
 _HEADERS = {
     # No requests to other hosts: usage data, fonts, release news.
     "Content-Security-Policy": (
         "default-src 'self' blob: data:; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; "
-        f"style-src 'self' 'unsafe-inline'; worker-src 'self' blob:; connect-src 'self' http://{LOOPBACK}:*"
+        "style-src 'self' 'unsafe-inline'; worker-src 'self' blob:; connect-src 'self'"
     ),
     "Cache-Control": "no-cache",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -47,14 +54,18 @@ class _File(NamedTuple):
 
 
 class ViewerPage:
-    """Serves the page of the web viewer; a visit to `/` leads to the recording stream. Raises OSError if it cannot
-    listen on the port; 0 is any."""
+    """Serves the page of the web viewer, and its stream; a visit to `/` leads to both. Raises OSError if it cannot
+    listen on the port; 0 is any.
 
-    def __init__(self, port: int, stream_url: str) -> None:
+    stream  address of rerun's server
+    """
+
+    def __init__(self, port: int, stream: tuple[str, int]) -> None:
+        self.stream = stream
+        self.run: Callable[[], Mapping[str, Any]] = dict
+        """What the page is told of the run whenever it asks, see `run_banner.js`."""
         self._files: dict[str, _File] = {}
         self._fetching = threading.Lock()
-        query = {"url": stream_url, "theme": "dark", "hide_welcome_screen": "1"}
-        self._entrance = "/?" + urllib.parse.urlencode(query)
         self._server = _Server(port, _Handler)
         self._server.page = self
         threading.Thread(target=self._server.serve_forever, name="viewer-page", daemon=True).start()
@@ -64,20 +75,25 @@ class ViewerPage:
         return f"http://{LOOPBACK}:{self._server.port}/"
 
     def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
+        self._server.close()
 
-    def entrance(self, path: str) -> str | None:
-        """Redirect of a visit without a query."""
-        return self._entrance if path == "/" else None
+    def entrance(self, host: str) -> str:
+        """Where a visit without a query is sent. The stream comes through the page's own port: so a tunnel needs
+        one port, and may begin at any."""
+        query = {"url": f"rerun+http://{host}/proxy", "theme": "dark", "hide_welcome_screen": "1"}
+        return "/?" + urllib.parse.urlencode(query)
 
     def file(self, path: str) -> _File | None:
         """Raises OSError if the viewer cannot be started."""
+        if path == _BANNER:
+            return _File("text/javascript", Path(__file__).with_name("run_banner.js").read_bytes())
+        if path == "/run.json":
+            return _File("application/json", json.dumps(self.run()).encode())
         if path not in _FILES:
             return None
         with self._fetching:
             if not self._files:
-                self._files = _take_files()
+                self._files = _with_banner(_take_files())
         return self._files.get(path)
 
 
@@ -96,10 +112,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(403, "only pages of this machine are served")
             return
         path, _, query = self.path.partition("?")
-        entrance = None if query else self.server.page.entrance(path)
-        if entrance is not None:
+        if path == "/" and not query:
             self.send_response(302)
-            self.send_header("Location", entrance)
+            self.send_header("Location", self.server.page.entrance(headers["host"]))
             self.send_header("Content-Length", "0")
             self.end_headers()
             return
@@ -120,6 +135,30 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(file.content)
 
+    def do_POST(self) -> None:
+        """The viewer asks rerun's server for the stream."""
+        headers = {name.lower(): value for name, value in self.headers.items()}
+        if len(self.headers.get_all("host", [])) > 1 or refusal(headers) is not None:
+            self.send_error(403, "only pages of this machine are served")
+            return
+        length = headers.get("content-length", "")
+        if (
+            not self.path.startswith("/rerun.")
+            or not (length.isascii() and length.isdigit())
+            or ("transfer-encoding" in headers or len(self.headers.get_all("content-length", [])) > 1)
+        ):
+            self.send_error(404)
+            return
+        body = self.rfile.read(min(int(length), _MOST_ASKED))
+        passed = [f"{name}: {value}" for name, value in self.headers.items() if name.lower() not in _OF_A_LINK]
+        head = "\r\n".join([f"POST {self.path} HTTP/1.1", *passed, "Connection: close", "", ""])
+        self.close_connection = True
+        with socket.create_connection(self.server.page.stream, timeout=SEND_WITHIN_S) as inner:
+            self.server.keep(self.connection)
+            self.connection.settimeout(SEND_WITHIN_S)
+            inner.sendall(head.encode("latin1") + body)
+            join_sockets(self.connection, inner)
+
     def log_message(self, format: str, *args: Any) -> None:
         log.debug(format, *args)
 
@@ -130,6 +169,14 @@ def viewer_program() -> Path:
     if spec is None or spec.origin is None:
         raise StoreError("rerun's viewer is not installed: install rerun-sdk, or set monitor.live = false")
     return Path(spec.origin).parent / ("rerun.exe" if sys.platform == "win32" else "rerun")
+
+
+def _with_banner(files: dict[str, _File]) -> dict[str, _File]:
+    """The page with our script at its end."""
+    page = files["/"]
+    body, end, rest = page.content.rpartition(b"</body>")
+    script = f'<script src="{_BANNER}"></script>'.encode()
+    return {**files, "/": _File(page.content_type, body + script + end + rest)}
 
 
 def _take_files() -> dict[str, _File]:

@@ -11,6 +11,9 @@ YELLOW, BLACK, GREY = "#FFD21F", "#1b1b1b", "#b8bcc0"
 INK, FAINT, RULE = "#22272e", "#6b7480", "#d5dade"
 
 MARKED_LETHAL, MARKED_SLOW = VIOLET, ORANGE
+LETHAL_GROUND, FORBIDDEN = "#39404a", YELLOW
+GROUPS = (GREEN, BLUE, PINK, SKY, BLACK)
+"""Of groups, in the scenario's order; then from the first again."""
 STATE_COLOURS = {
     VehicleState.FOLLOWING: GREEN,
     VehicleState.ARRIVED: BLUE,
@@ -20,3 +23,9 @@ STATE_COLOURS = {
     VehicleState.LOST: BLACK,
     VehicleState.OUTDATED: YELLOW,
 }
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """`#rrggbb` as numbers from 0 to 255."""
+    red, green, blue = (int(colour[n : n + 2], 16) for n in (1, 3, 5))
+    return red, green, blue

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta
 
 from swarm.wire.fields import (
     IDS,
+    MOST_IDS,
     SMALL,
     Bucket,
     Cell,
@@ -33,6 +35,8 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     rows, cols, resolution_m    of the grid; 0 of a router, which has none
     west_m, north_m, crs        where its north-west corner is, and in which coordinate system
     now_ns                      its clock when it answered, as of its last tick; 0 before the first
+    vehicles, crew              how many vehicles the scenario has, and which processes it needs, as `role-id`
+    restarts                    how often the process was started again in this run
     """
 
     run_id: Word
@@ -49,12 +53,34 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     north_m: Metres = 0.0
     crs: LongText = "local"
     now_ns: StampNs = 0
+    vehicles: Count = 0
+    crew: Annotated[list[Word], Meta(max_length=MOST_IDS)] = []
+    restarts: Count = 0
+
+
+class Alarm(msgspec.Struct, frozen=True, kw_only=True):
+    """What a process wants people to know that watch the run: a collision, an author beyond its quota.
+
+    kind      a word of `launch_scripts.report.run_state.alarms.KINDS`; any other is shown as it is
+    about     the process, target, author or vehicle that it is about
+    since_ns  when it began; over_ns when it was over, None while it lasts
+    """
+
+    kind: Word
+    about: Word
+    text: Text
+    since_ns: StampNs
+    over_ns: StampNs | None = None
+    cell: Cell | None = None
+    target: Id | None = None
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
-    """What a process has counted since its incarnation began. Histograms are as in `swarm.runtime.stats`.
+    """What a process has counted. Histograms are as in `swarm.runtime.stats`.
 
     counts_by, histograms_by    name -> id of a target or vehicle -> the same, of that one alone
+    since                       counts are those of all incarnations of this process from this one on; 0: of its own
+    alarms                      what lasts, and the newest of what is over
     """
 
     role: Id
@@ -69,6 +95,8 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
         dict[Word, Annotated[dict[Id, Annotated[dict[Bucket, Count], Meta(max_length=40_000)]], IDS]],
         Meta(max_length=16),
     ] = {}
+    since: Incarnation = 0
+    alarms: Annotated[list[Alarm], Meta(max_length=64)] = []
 
 
 class Beat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):

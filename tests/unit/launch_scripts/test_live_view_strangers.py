@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from launch_scripts.monitor import loopback_guard, stream_gate
 from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.serving import loopback_guard, stream_gate
 from launch_scripts.monitor.serving.loopback_guard import MOST_CONNECTIONS, refusal
 from launch_scripts.monitor.serving.sinks import Sinks
 from shared_map.terrain.terrain import terrain_of_pace
@@ -81,6 +81,10 @@ def test_pages_of_other_sites_are_refused_by_both_servers(sinks: Sinks, headers:
     page, stream = ports(sinks)
     filled = {name: value.format(port=page) for name, value in headers.items()}
     assert ask(page, "GET", "/", filled)[0] == 403
+    assert ask(page, "GET", "/run.json", filled)[0] == 403
+    status, body = ask(page, "POST", READ, {**GRPC_WEB, **filled}, bytes(5))
+    assert status == 403
+    assert b"where everybody is" not in body
     filled = {name: value.format(port=stream) for name, value in headers.items()}
     for method in ("POST", "OPTIONS", "GET"):
         status, body = ask(stream, method, READ, {**GRPC_WEB, **filled}, bytes(5))
@@ -93,13 +97,18 @@ def test_pages_of_this_machine_come_in_through_tunnels_too(sinks: Sinks, headers
     page, stream = ports(sinks)
     filled = {name: value.format(port=page) for name, value in headers.items()}
     assert ask(page, "GET", "/", filled)[0] == 302
+    status, body = ask(page, "POST", READ, {**GRPC_WEB, **filled}, bytes(5))
+    assert (status, len(body) > 50) == (200, True), "the stream comes through the page's port, too"
     status, body = ask(stream, "POST", READ, {**GRPC_WEB, **filled}, bytes(5))
     assert (status, len(body) > 50) == (200, True)
 
 
-def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sinks: Sinks) -> None:
-    _, port = ports(sinks)
+@pytest.mark.parametrize("server", [0, 1], ids=["page", "stream"])
+def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sinks: Sinks, server: int) -> None:
+    port = ports(sinks)[server]
     own = b"OPTIONS / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n"
+    if server == 0:
+        own = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\n\r\n".encode() + bytes(5)
     foreign = f"POST {READ} HTTP/1.1\r\nHost: evil.example\r\nContent-Type: application/grpc-web+proto\r\n"
     with socket.create_connection(("127.0.0.1", port), timeout=10) as both:
         both.sendall(own + foreign.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
@@ -142,7 +151,7 @@ def test_connections_and_their_threads_are_bounded_and_the_idle_ones_cut(
 
 
 def test_a_reader_that_takes_nothing_is_cut_off(sinks: Sinks, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_gate, "_SEND_WITHIN_S", 1.0)
+    monkeypatch.setattr(stream_gate, "SEND_WITHIN_S", 1.0)
     before = threading.active_count()
     head = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/grpc-web+proto\r\n"
     with socket.socket() as slow:

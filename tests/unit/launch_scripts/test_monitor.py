@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.fake_run import fake_run
-from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
+from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain, say
 
 from launch_scripts.monitor import die_with_parent
 from launch_scripts.monitor.blueprint import make_blueprint
@@ -33,9 +33,10 @@ from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
+from swarm.liveness import Peer
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Note
+from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import Sighted
 from swarm.wire.messages.vehicles import Followed
 from swarm.wire.topics import FOLLOWED, NOTE, TOPICS
@@ -123,7 +124,7 @@ def test_a_sighting_is_drawn_when_it_is_heard_and_taken_away_when_it_has_ended(
     rig.play([(NS_PER_S // 2, seen)])
     rig.run(3)
     rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 2
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/targets/sighted"] == 3, "none, one, none"
 
 
 def test_a_body_is_drawn_where_it_says_and_taken_away_when_its_lease_ends(
@@ -136,7 +137,7 @@ def test_a_body_is_drawn_where_it_says_and_taken_away_when_its_lease_ends(
     rig.play([(NS_PER_S // 2, body), (NS_PER_S, msgspec.structs.replace(body, seq=2, x_m=x_m + 30.0))])
     rig.run(3)
     rig.close()
-    assert rows_by_entity(tmp_path / "run.rrd")["/world/bodies"] == 3
+    assert rows_by_entity(tmp_path / "run.rrd")["/world/bodies/discs"] == 4, "none, here, there, none"
 
 
 def test_the_view_goes_on_where_a_killed_monitor_left_off_in_a_file_of_its_own(
@@ -179,6 +180,32 @@ def test_where_to_watch_is_told_once(scenario: Scenario, terrain: Terrain) -> No
     notes = [event.message for event in heard]  # type: ignore[union-attr]
     assert [(note.kind, note.text) for note in notes if isinstance(note, Note)] == [
         ("live_view", "http://127.0.0.1:1/")
+    ]
+
+
+def test_who_ends_as_asked_is_no_warning_and_who_dies_is_one(scenario: Scenario, terrain: Terrain) -> None:
+    rig = Rig(scenario, terrain, None)
+    told: list[tuple[str, str]] = []
+    rig.service._drawing.note = lambda text, level: told.append((level, text))  # type: ignore[method-assign]
+    rig.run(3)
+    for id, gauges in (("a0", {"ended": 1.0}), ("a1", {})):
+        bus = rig.bus(id)
+        bus.declare_alive(Peer("agent", id, 7))
+        rig.run(1)
+        stats = Stats(role="agent", id=id, incarnation=7, stamp_ns=1, counts={}, gauges=gauges, histograms={})
+        say(bus, terrain, stats)
+        bus.close()
+        rig.run(1)
+    bus = rig.bus("a2")
+    bus.declare_alive(Peer("agent", "a2", 7))
+    rig.run(1)
+    bus.close()
+    rig.run(0.2)
+    rig.close()  # tells what it knows by then
+    assert [(level, text) for level, text in told if "up" not in text] == [
+        ("INFO", "agent a0 has ended as asked"),
+        ("WARN", "agent a1 is gone"),
+        ("WARN", "agent a2 is gone"),
     ]
 
 
@@ -256,7 +283,7 @@ def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_ho
             assert "rerun%2Bhttp%3A%2F%2F127.0.0.1%3A" in reply.url, "led to the stream"
             assert b"re_viewer.js" in reply.read()
             policy = reply.headers["Content-Security-Policy"]
-        assert policy.endswith("connect-src 'self' http://127.0.0.1:*")
+        assert policy.endswith("connect-src 'self'")
         with urllib.request.urlopen(f"{sinks.live_url}re_viewer_bg.wasm", timeout=30) as reply:
             assert reply.headers["Content-Type"] == "application/wasm"
             assert reply.read(4) == b"\0asm"
@@ -280,6 +307,7 @@ from launch_scripts.monitor.blueprint import make_blueprint
 from launch_scripts.monitor.serving.sinks import Sinks
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.liveness import Peer
 from swarm.config.scenario import MonitorConfig
 import rerun as rr
 mesh = TerrainMesh(terrain_of_pace(numpy.ones((8, 8), numpy.float32)))
@@ -310,6 +338,7 @@ from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.liveness import Peer
 from swarm.config.scenario import MonitorConfig
 
 path = new_recording_path(pathlib.Path({str(tmp_path)!r}))

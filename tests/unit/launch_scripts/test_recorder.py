@@ -164,16 +164,27 @@ def test_what_nobody_told_of_is_null_and_not_zero(recorder: Recorder) -> None:
 def test_counts_are_summed_over_processes_and_incarnations_but_gauges_over_the_newest(recorder: Recorder) -> None:
     hear(
         recorder,
-        stats("agent", "a0", 1, 1.0, {"marks": 5}, {"stranded": 2.0}),
-        stats("agent", "a0", 1, 2.0, {"marks": 7}, {"stranded": 2.0}),
-        stats("agent", "a0", 2, 3.0, {"marks": 1}, {"stranded": 0.0}),
-        stats("agent", "a1", 1, 3.0, {"marks": 10}, {"stranded": 1.0}),
+        stats("agent", "a0", 1, 1.0, {"marks": 5}, {"restarts": 0.0}),
+        stats("agent", "a0", 1, 2.0, {"marks": 7}, {"restarts": 0.0}),
+        stats("agent", "a0", 2, 3.0, {"marks": 1}, {"restarts": 1.0}),
+        stats("agent", "a1", 1, 3.0, {"marks": 10}, {"restarts": 2.0}),
     )
     report = recorder.report()
     assert report["marks"] == 7 + 1 + 10
-    assert report["stranded"] == 1
-    assert report["restarts"] == 1
-    assert report["processes"] == 2
+    assert report["restarts"] == 3
+
+
+def test_a_life_that_carries_on_what_earlier_ones_counted_is_not_added_to_them(recorder: Recorder) -> None:
+    """So who heard all lives and who heard only the last have the same sums."""
+    first = stats("agent", "a0", 1, 2.0, {"marks": 7})
+    second = msgspec.structs.replace(stats("agent", "a0", 2, 4.0, {"marks": 9}), since=1)
+    other = stats("agent", "a0", 5, 6.0, {"marks": 100})
+    late = Recorder(scenario(), GRID)
+    hear(recorder, first, second)
+    hear(late, second)
+    assert recorder.report()["marks"] == late.report()["marks"] == 9
+    hear(recorder, other)  # one that was started by hand knows of no other life
+    assert recorder.report()["marks"] == 109
 
 
 def test_an_older_stats_message_that_comes_late_changes_nothing(recorder: Recorder) -> None:
@@ -314,6 +325,7 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
 
 def test_the_live_table_has_a_line_per_target(recorder: Recorder) -> None:
     recorder.alive(Peer("planner", "t0", 1), True, 0)
+    recorder.alive(Peer("agent", "a0", 1), True, 0)
     hear(
         recorder,
         pose("t0", 100.0, 100.0, 1),
@@ -339,7 +351,8 @@ def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_i
     first, second = recorder.summary(10 * NS_PER_S).targets
     assert (first.title, first.lost, first.pose_age_s) == ("t0 (lost 9 s)", True, 9.0)
     assert (second.title, second.lost, second.pose_age_s) == ("t1", False, 1.0)
-    assert plain_line(recorder.summary(10 * NS_PER_S), {}, 0).endswith("; lost targets: t0")
+    lost = "target lost: nobody knows where t0 is; routes lead to where it was, row 0, col 0, since 0 s"
+    assert lost in plain_line(recorder.summary(10 * NS_PER_S))
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
     hear(recorder, status("t0", 1.0), at_s=60.0)  # the last words of a run that takes long to end
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
@@ -377,11 +390,16 @@ def test_the_run_is_ready_when_all_processes_are_alive_and_a_vehicle_has_a_route
     assert recorder.ready_ns == NS_PER_S
 
 
-def test_messages_per_second_are_the_difference_of_samples(recorder: Recorder) -> None:
+def test_messages_per_second_are_what_the_processes_that_live_say(recorder: Recorder) -> None:
+    recorder.alive(Peer("agent", "a0", 1), True, 0)
+    recorder.alive(Peer("agent", "a1", 1), True, 0)
     for second in range(4):
-        hear(recorder, stats("agent", "a0", 1, second, {"messages_out": 50 * second}), at_s=float(second))
+        told = [stats("agent", id, 1, second, gauges={"messages_per_s": 25.0}) for id in ("a0", "a1")]
+        hear(recorder, *told, at_s=float(second))
     assert recorder.summary(3 * NS_PER_S).messages_per_s == 50.0
-    assert recorder.report()["messages_per_s"] == 50.0
+    assert recorder.report()["messages_per_s"] == pytest.approx(50.0, rel=0.2)
+    recorder.alive(Peer("agent", "a1", 1), False, 3 * NS_PER_S)
+    assert recorder.summary(3 * NS_PER_S).messages_per_s == 25.0
 
 
 def test_the_report_is_json_without_nan_or_infinity(recorder: Recorder) -> None:

@@ -14,7 +14,7 @@ from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.wire.messages.marks import MarkSet
-from swarm.wire.messages.processes import Note, Stats
+from swarm.wire.messages.processes import Note
 from swarm.wire.statements import MarkKind
 from swarm.wire.topics import NOTE
 
@@ -148,17 +148,13 @@ def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up()
     assert "calm.1" in listener.replica.held.ledger.held()
     assert keeper.counters.gauges[THROTTLED + "loud"] == 1
     assert notes == ["author loud exceeds its quota; its marks are delayed"]
+    assert [(each.kind, each.about, each.over_ns) for each in keeper._member.alarms.told()] == [
+        ("quota", "loud", None)
+    ]
     swarm.run(400)
     assert listener.sync.throttled == []
+    assert [each.over_ns is None for each in keeper._member.alarms.told()] == [False]
     assert THROTTLED + "loud" not in keeper.counters.gauges
     assert (
         listener.replica.held.fingerprint() == loud.replica.held.fingerprint() == keeper.replica.held.fingerprint()
     )
-
-
-def test_status_names_who_is_throttled() -> None:
-    from launch_scripts.commands.query import _throttled
-
-    gauges = {"sets_waiting": 0.0, THROTTLED + "loud.1": 1.0}
-    stats = Stats(role="keeper", id="0", incarnation=1, stamp_ns=1, counts={}, gauges=gauges, histograms={})
-    assert _throttled({("keeper", "0"): stats}) == ["loud.1"]

@@ -1,0 +1,44 @@
+"""`swarm metrics`: figures of a running swarm for Prometheus."""
+
+from __future__ import annotations
+
+import time
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from swarm.config.scenario import NetworkConfig
+
+_TURN_S = 0.1
+
+
+def serve_metrics(network: NetworkConfig, port: int) -> None:
+    """Serve until Ctrl-C. Raises BusError if the port is taken, or no router can be reached."""
+    from launch_scripts.metrics.endpoint import MetricsEndpoint
+    from launch_scripts.metrics.exporter import Exporter
+    from launch_scripts.metrics.families import families
+    from swarm.bus.zenoh_bus import open_bus
+
+    endpoint = MetricsEndpoint(port)
+    try:
+        with open_bus(network) as bus:
+            exporter = Exporter(bus)
+            typer.echo(f"metrics at {endpoint.url}; Ctrl-C ends it")
+            told = None
+            while True:
+                exporter.listen(time.monotonic_ns(), _TURN_S)
+                endpoint.answer(lambda: families(exporter.figures()))
+                if exporter.run is not None and exporter.run.run_id != told:
+                    told = exporter.run.run_id
+                    typer.echo(f"run {told}, scenario {exporter.run.scenario}")
+    except KeyboardInterrupt:
+        pass
+    finally:
+        endpoint.close()
+
+
+def dashboard() -> str:
+    """A dashboard for Grafana, as JSON."""
+    return files("launch_scripts.metrics").joinpath("dashboard.json").read_text(encoding="utf-8")

@@ -1,0 +1,1 @@
+"""Commands about a swarm that runs: where it is, how it is."""

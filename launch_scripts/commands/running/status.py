@@ -1,0 +1,187 @@
+"""What `swarm status` tells: a run as it is now, for whoever knows nothing of it and listens for a moment."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.table import Table
+
+from launch_scripts.commands.run_frame import frame_of_members
+from launch_scripts.report.results.certified_gap import gaps_to
+from launch_scripts.report.run_state import facts
+from launch_scripts.report.run_state.model import HEARD, RunModel
+from launch_scripts.report.run_state.plan import plan_of_members
+from launch_scripts.report.run_state.state import RunState
+from shared_map.terrain.places import MapFrame
+from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.places import extent_of, fields_of, written
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import Beat, RunInfo
+from swarm.wire.topics import RUN
+
+_TAG = "status-run"
+_ASK_S = 1.0
+_NO_GRID = GridSpec(1, 1, 1.0)
+_SHOWN_ALARMS = 12
+
+
+@dataclass(frozen=True)
+class Status:
+    """A run at an instant.
+
+    members    processes that have answered, those of the run first; routers belong to none
+    strangers  those of another run in the same namespace
+    """
+
+    members: list[RunInfo]
+    strangers: list[RunInfo]
+    model: RunModel
+    leads: dict[tuple[str, str], bool]
+    frame: MapFrame | None
+    now_ns: int
+
+    @property
+    def state(self) -> RunState:
+        return self.model.state(self.now_ns)
+
+
+class StatusWatch:
+    """Listens to a swarm and asks who takes part. Whoever owns it passes it what comes in (`take`)."""
+
+    def __init__(self, bus: Bus, post: Post) -> None:
+        self._told: list[tuple[int, Event]] = []
+        self._found: list[RunInfo] = []
+        self.answered = False
+        """Whether all who would answer have."""
+        for topic, every_s in HEARD.items():
+            bus.subscribe(topic, post, every_s=every_s)
+        bus.watch_alive(post)
+        bus.ask(RUN, Nothing(), post, tag=_TAG, timeout_s=_ASK_S)
+
+    def take(self, event: Event, now_ns: int) -> None:
+        """Take in one event."""
+        match event:
+            case Replied(tag=tag, message=RunInfo() as info) if tag == _TAG:
+                self._found.append(info)
+            case AskEnded(tag=tag) if tag == _TAG:
+                self.answered = True
+            case Heard() | Appeared() | Disappeared():
+                self._told.append((now_ns, event))
+
+    def status(self, now_ns: int) -> Status | None:
+        """What was told so far; None if nobody has answered."""
+        if not self._found:
+            return None
+        # The run is that of most; routers belong to none; whoever answers with another is a stranger.
+        runs = Counter((info.run_id, info.terrain) for info in self._found if info.run_id)
+        run = runs.most_common(1)[0][0] if runs else ("", "")
+        found = sorted(self._found, key=lambda info: (not info.run_id, info.role, info.id))
+        strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
+        members = [info for info in found if info not in strangers]
+        frame = frame_of_members(members)
+        model = RunModel(plan_of_members(members), _NO_GRID if frame is None else frame.grid)
+        leads: dict[tuple[str, str], bool] = {}
+        for told_ns, event in self._told:
+            match event:
+                case Heard(message=message):
+                    if isinstance(message, Beat):
+                        leads[message.role, message.id] = message.leads
+                    model.heard(message, told_ns)
+                case Appeared(peer):
+                    model.alive(peer, True, told_ns)
+                case Disappeared(peer):
+                    model.alive(peer, False, told_ns)
+        return Status(members, strangers, model, leads, frame, now_ns)
+
+
+def print_status(status: Status, console: Console) -> None:
+    """For people."""
+    first, state, frame = status.members[0], status.state, status.frame
+    if not first.run_id:
+        console.print("no run yet: only routers answer", highlight=False)
+    else:
+        time = facts.fact("elapsed_s")
+        head = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells, "
+        console.print(f"{head}{time.label} {time.shown(state)}", highlight=False, soft_wrap=True)
+        if frame is not None and frame.grid.crs != "local":
+            console.print(f"terrain: {extent_of(frame, 'latlon')}", highlight=False)
+        for line in facts.lines(state):
+            console.print(line, highlight=False, soft_wrap=True)
+    console.print(_processes(status))
+    for line in facts.alarm_lines(state, _SHOWN_ALARMS, over=True):
+        console.print(line, style="yellow", highlight=False, soft_wrap=True)
+    if state.targets:
+        labels, rows = facts.table(state, whole=True)
+        table = Table(*labels, pad_edge=False)
+        for target, row in zip(state.targets, rows, strict=True):
+            table.add_row(*row, style="yellow" if target.lost or not target.planner_up else None)
+        console.print(table)
+    for id, planner in sorted(status.model.observed.status.items()):
+        cell = _target_cell(planner, frame)
+        if frame is not None and cell is not None:
+            was = "was" if planner.tracker_lost else "is"
+            console.print(f"{id} {was} at {written(frame, cell)}", highlight=False, soft_wrap=True)
+    for ordered in state.orders:
+        console.print(f"ordered: {ordered}", style="yellow", highlight=False, soft_wrap=True)
+    for info in status.strangers:
+        text = f"stranger {info.role}-{info.id} answers for run {info.run_id[:40]}, terrain {info.terrain[:40]}"
+        console.print(text, style="yellow", highlight=False, soft_wrap=True)
+
+
+def _processes(status: Status) -> Table:
+    crew = Table("process", "up", "messages out", "in", "dropped", pad_edge=False)
+    for info in status.members:
+        stats = status.model.observed.newest_stats(info.role, info.id)
+        counts = {} if stats is None else stats.counts
+        told = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
+        up_s = max(status.now_ns - info.incarnation, 0) / NS_PER_S
+        leading = {True: ", leads", False: ", stands by", None: ""}[status.leads.get((info.role, info.id))]
+        crew.add_row(f"{info.role}-{info.id}{leading}", facts.seconds(up_s), *(facts.count(n) for n in told))
+    return crew
+
+
+def status_fields(status: Status) -> dict[str, Any]:
+    """For programs."""
+    observed, first, frame = status.model.observed, status.members[0], status.frame
+
+    def process_fields(info: RunInfo) -> dict[str, Any]:
+        stats = observed.newest_stats(info.role, info.id)
+        return {
+            "role": info.role,
+            "id": info.id,
+            "incarnation": info.incarnation,
+            "leads": status.leads.get((info.role, info.id)),
+            "counts": None if stats is None else stats.counts,
+            "gauges": None if stats is None else stats.gauges,
+        }
+
+    def planner_fields(planner: PlannerStatus) -> dict[str, Any]:
+        cell = _target_cell(planner, frame)
+        at = None if frame is None or cell is None else fields_of(frame, cell)
+        return {**msgspec.to_builtins(planner), "target_at": at}
+
+    return {
+        "run_id": first.run_id,
+        "scenario": first.scenario,
+        "terrain": first.terrain,
+        **facts.for_report(status.state),
+        "processes": [process_fields(info) for info in status.members],
+        "crs": None if frame is None else frame.grid.crs,
+        "planners": [planner_fields(planner) for _, planner in sorted(observed.status.items())],
+        "certified_gap_to": {id: gap.fields() for id, gap in gaps_to(observed).items()},
+        "orders": list(status.state.orders),
+        "strangers": [f"{info.role}-{info.id}" for info in status.strangers],
+    }
+
+
+def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
+    """Where the planner's target is; None if that is not known, or not on this terrain."""
+    cell = planner.target_cell
+    return cell if frame is not None and cell is not None and 0 <= cell < frame.grid.cells else None

@@ -1,0 +1,167 @@
+"""What colours the terrain has in each layer of the view: arrays in, pixels out.
+
+Colours are those of Okabe and Ito where they carry meaning; what is known beforehand is hatched, what was found is
+filled, so that the two differ without colour, too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
+from launch_scripts.report.pictures import palette
+from launch_scripts.report.pictures.hillshade import hillshade
+from launch_scripts.report.pictures.palette import rgb
+from shared_map.arrays import Bools
+from shared_map.terrain.layers import TerrainClass
+from shared_map.terrain.pyramid import any_in_blocks
+from shared_map.terrain.terrain import Terrain
+from swarm.grid import Window
+
+LETHAL_MARK, SLOW_MARK, FAST_MARK = (98, 30, 165), (235, 150, 0), (90, 200, 250)
+LETHAL_PRIOR, HATCH, NO_GO, ROAD = (12, 14, 20), (200, 200, 212), rgb(palette.RED), (232, 222, 196)
+STILL_HIDDEN_LETHAL, STILL_HIDDEN_SLOW = rgb(palette.RED), rgb(palette.ORANGE)
+FOUND, OVERRULED = rgb(palette.SKY), rgb(palette.PINK)
+WINDOW = (255, 200, 60)
+_HATCH_TEXELS = 7
+COST_COLOURS = "cividis"
+"""From dear to cheap."""
+_COST_STEPS = 256
+
+
+class GroundColours:
+    """The layers' pixels. What is known now is read from the shared map's ground, which changes in place.
+
+    now     float32 (rows, cols)  the ground as the map knows it; inf is lethal
+    truth   the ground as it is, where this process knows it
+    slowest_s_per_m, quickest_s_per_m  ends of the scale of costs
+    """
+
+    def __init__(self, mesh: TerrainMesh, terrain: Terrain, now: Floats, truth: Floats | None) -> None:
+        self._mesh, self._now, self._truth, self._prior = mesh, now, truth, terrain.ground_s_per_m
+        seen = mesh.seen
+        shade = 0.42 + 0.78 * hillshade(seen.elevation_m, seen.grid.resolution_m)[..., None]
+        self._shade = np.asarray(shade, np.float32)
+        self.photo = _lit_photo(seen.photo, self._shade)
+        road = seen.classes == TerrainClass.ROAD
+        self.photo[road] = _mixed(self.photo[road], ROAD, 0.4)
+        self._closed: Bools = seen.lethal_share >= 0.5
+        self._no_go: Bools = np.zeros(self._closed.shape, np.bool_)
+        drivable = seen.pace_s_per_m[np.isfinite(seen.pace_s_per_m)]
+        ends = np.percentile(drivable, (1, 99)) if len(drivable) else (0.1, 1.0)
+        self.quickest_s_per_m = float(ends[0])
+        self.slowest_s_per_m = max(float(ends[1]), 1.25 * self.quickest_s_per_m)
+        self._cost_colours = colours_of(COST_COLOURS, _COST_STEPS)
+
+    def close(self, cells: NDArray[np.int64]) -> None:
+        """Says which cells zones close."""
+        side, cols = self._mesh.texel, self._mesh.grid.cols
+        self._no_go[:] = False
+        self._no_go[cells // cols // side, cells % cols // side] = True
+
+    def photo_of(self, window: Window) -> Bytes:
+        """Photo of a window with closed ground and marks drawn in: where the map's ground differs from the prior.
+
+        However many cells a texel shows, a mark on one of them is seen."""
+        texels = self._texels(window)
+        photo: Bytes = self.photo[texels].copy()
+        self._hatch(photo, window)
+        part = _cells(window)
+        now, before = self._now[part], self._prior[part]
+        lethal = np.isinf(now) & ~np.isinf(before)
+        slow, fast = np.isfinite(now) & (now > before), np.isfinite(now) & (now < before)
+        found = any_in_blocks(lethal, self._mesh.texel) & ~self._no_go[texels]
+        for where, colour, share in (
+            (any_in_blocks(fast, self._mesh.texel), FAST_MARK, 0.75),
+            (any_in_blocks(slow, self._mesh.texel), SLOW_MARK, 0.75),
+            (found, LETHAL_MARK, 0.85),
+        ):
+            photo[where] = _mixed(photo[where], colour, share)
+        return photo
+
+    def cost_of(self, window: Window) -> Bytes:
+        """What a metre costs, dark where it is dear, and hatched where nothing drives."""
+        side, part = self._mesh.texel, _cells(window)
+        now = self._now[part]
+        low, high = np.log(self.quickest_s_per_m), np.log(self.slowest_s_per_m)
+        with np.errstate(divide="ignore"):
+            level = np.clip((high - np.log(now[::side, ::side])) / (high - low), 0, 1)
+        index = (level * (_COST_STEPS - 1)).astype(np.intp)
+        shade = 0.45 + 0.55 * self._shade[self._texels(window)]
+        image: Bytes = np.clip(self._cost_colours[index] * shade, 0, 255).astype(np.uint8)
+        image[any_in_blocks(np.isinf(now), side)] = LETHAL_PRIOR
+        self._hatch(image, window)
+        return image
+
+    def known_of(self, window: Window) -> Bytes:
+        """What the map knows against what is true, on grey relief."""
+        assert self._truth is not None
+        part, side = _cells(window), self._mesh.texel
+        now, before, true = self._now[part], self._prior[part], self._truth[part]
+        grey = np.clip(105 * self._shade[self._texels(window)], 0, 255)
+        image: Bytes = np.broadcast_to(grey, (*grey.shape[:2], 3)).astype(np.uint8)
+        image[self._closed[self._texels(window)]] //= 2
+        hidden = now != true
+        for where, colour in (
+            ((now == true) & (true != before), FOUND),
+            (hidden & (now != before), OVERRULED),
+            (hidden & (now == before) & np.isfinite(true), STILL_HIDDEN_SLOW),
+            (hidden & (now == before) & np.isinf(true), STILL_HIDDEN_LETHAL),
+        ):
+            seen = any_in_blocks(where, side)
+            image[seen] = _mixed(image[seen], colour, 0.85)
+        return image
+
+    def shaded(self, colours: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bytes:
+        """Colours on the relief of these texels."""
+        shade = 0.5 + 0.5 * self._shade[rows[:, None], cols[None, :]]
+        lit: Bytes = np.clip(colours * shade, 0, 255).astype(np.uint8)
+        return lit
+
+    def _hatch(self, image: Bytes, window: Window) -> None:
+        """Darkens ground that was known to be lethal, and hatches it; red where a zone closes it."""
+        texels = self._texels(window)
+        closed, no_go = self._closed[texels], self._no_go[texels]
+        if not (closed.any() or no_go.any()):
+            return
+        row, col = texels[0].start, texels[1].start
+        rows, cols = np.ogrid[row : row + image.shape[0], col : col + image.shape[1]]
+        stripe = (rows + cols) % _HATCH_TEXELS < 2
+        closed = closed & ~no_go
+        image[closed] = _mixed(image[closed], LETHAL_PRIOR, 0.45)
+        image[closed & stripe] = _mixed(image[closed & stripe], HATCH, 0.3)
+        stripe = (rows - cols) % _HATCH_TEXELS < 3
+        image[no_go] = _mixed(image[no_go], NO_GO, 0.25)
+        image[no_go & stripe] = _mixed(image[no_go & stripe], NO_GO, 0.75)
+
+    def _texels(self, window: Window) -> tuple[slice, slice]:
+        side = self._mesh.texel
+        return (
+            slice(window.row0 // side, -(-window.row1 // side)),
+            slice(window.col0 // side, -(-window.col1 // side)),
+        )
+
+
+def colours_of(colour_map: str, steps: int) -> Floats:
+    """Colours of a colour map of matplotlib, float32 (steps, 3), 0 to 255."""
+    from matplotlib import colormaps
+
+    colours: Floats = (255 * colormaps[colour_map](np.linspace(0, 1, steps))[:, :3]).astype(np.float32)
+    return colours
+
+
+def _cells(window: Window) -> tuple[slice, slice]:
+    return slice(window.row0, window.row1), slice(window.col0, window.col1)
+
+
+def _mixed(pixels: Bytes, colour: tuple[int, int, int], share: float) -> Bytes:
+    mixed: Bytes = ((1 - share) * pixels + share * np.array(colour)).astype(np.uint8)
+    return mixed
+
+
+def _lit_photo(photo: Bytes, shade: Floats) -> Bytes:
+    colours = photo.astype(np.float32)
+    grey = colours.mean(axis=2, keepdims=True)  # on full colours green vehicles would drown
+    lit: Bytes = np.clip((0.42 * colours + 0.53 * grey) * shade, 0, 255).astype(np.uint8)
+    return lit

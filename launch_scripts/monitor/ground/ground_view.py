@@ -1,0 +1,151 @@
+"""What lies still in the view: decides which tiles, zones and windows are drawn again, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import rerun as rr
+
+from launch_scripts.monitor.ground import layers
+from launch_scripts.monitor.ground.ground_colours import GroundColours
+from launch_scripts.monitor.ground.ground_drawing import PHOTO, GroundDrawing
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
+from launch_scripts.monitor.ground.windows import window_outlines
+from launch_scripts.monitor.ground.zones import Area, closed_cells, ordered_areas
+from launch_scripts.monitor.movers.looks import Look
+from launch_scripts.monitor.serving.sinks import Streams
+from shared_map.cost_map import CostMap
+from shared_map.replication.replica import MapReplica
+from shared_map.terrain.terrain import Terrain
+from swarm.clock import NS_PER_S
+from swarm.grid import Window
+from swarm.wire.messages.planning import PlannerStatus
+
+_WINDOWS_NS = NS_PER_S
+_REFRESH_NS = NS_PER_S
+_ZONES_AGAIN_NS = 10 * NS_PER_S
+
+
+@dataclass(eq=False)
+class _Tiles:
+    """A layer of tiles: which are out of date. Marks come many times a second to the same tiles, and each of their
+    pictures is drawn once for all.
+
+    entity     under which its tiles are logged
+    every_ns   how often tiles that are out of date are drawn
+    at_once    how many at most
+    """
+
+    entity: str
+    picture: Callable[[Window], Bytes]
+    every_ns: int
+    at_once: int
+    due_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self.stale: dict[int, None] = {}
+
+
+class GroundView:
+    """Draws terrain, layers, zones and windows on a recording stream.
+
+    truth  the true ground, where this process knows it
+    zones  those of the scenario
+    movers  what the legends say of all that moves
+    """
+
+    def __init__(
+        self,
+        rec: rr.RecordingStream | Streams,
+        mesh: TerrainMesh,
+        terrain: Terrain,
+        cost_map: CostMap,
+        replica: MapReplica,
+        truth: Floats | None = None,
+        zones: Sequence[Area] = (),
+        movers: Sequence[Look] = (),
+    ) -> None:
+        self._mesh, self._cost_map, self._replica, self._zones = mesh, cost_map, replica, list(zones)
+        self._movers = movers
+        self._cells = terrain.grid.cells
+        self._drawing = GroundDrawing(rec, mesh)
+        self._colours = colours = GroundColours(mesh, terrain, cost_map.ground_s_per_m, truth)
+        self._colours.close(closed_cells(self._zones))
+        self._layers = [
+            _Tiles(PHOTO, colours.photo_of, NS_PER_S, 80),
+            _Tiles(layers.COST.entity, colours.cost_of, 3 * NS_PER_S, 40),
+        ]
+        if truth is not None:
+            self._layers.append(_Tiles(layers.KNOWN.entity, colours.known_of, 3 * NS_PER_S, 40))
+        self._ordered: list[Area] = []
+        self._zones_version, self._zones_due_ns = 0, 0
+        self._windows: dict[str, tuple[int, ...]] = {}
+        """Target -> the window that its planner grew last."""
+        self._windows_new, self._windows_due_ns = False, 0
+        self._refresh_due_ns, self._next_refresh = 0, 0
+
+    def begin(self) -> None:
+        """Draws all of it."""
+        entities = [each.entity for each in self._layers]
+        self._drawing.begin(entities[1:], layers.legends(self._colours, entities, self._movers), self._zones)
+        self._drawing.ordered(self._ordered)
+        for layer in self._layers:
+            layer.stale = dict.fromkeys(range(self._mesh.tiles))
+            self._draw_tiles(layer, self._mesh.tiles)
+
+    def hear_status(self, status: PlannerStatus) -> None:
+        window = tuple(status.window)
+        if self._windows.get(status.target) != window:
+            self._windows[status.target] = window
+            self._windows_new = True
+
+    def tick(self, now_ns: int) -> None:
+        """Draws what has changed, now and then."""
+        for window in self._cost_map.take_dirty():
+            changed = dict.fromkeys(self._mesh.tiles_touching(window))
+            for layer in self._layers:
+                layer.stale.update(changed)
+        if now_ns >= self._refresh_due_ns:
+            self._refresh(now_ns)
+        self._draw_ordered(now_ns)
+        for layer in self._layers:
+            if layer.stale and now_ns >= layer.due_ns:
+                layer.due_ns = now_ns + layer.every_ns
+                self._draw_tiles(layer, layer.at_once)
+        if self._windows_new and now_ns >= self._windows_due_ns:
+            self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
+            self._draw_windows()
+
+    def _refresh(self, now_ns: int) -> None:
+        """Sends one tile of each layer again: a viewer which joins late has only what the server still holds."""
+        self._refresh_due_ns = now_ns + _REFRESH_NS
+        for layer in self._layers:
+            if not layer.stale:
+                layer.stale[self._next_refresh] = None
+        self._next_refresh = (self._next_refresh + 1) % self._mesh.tiles
+
+    def _draw_tiles(self, layer: _Tiles, most: int) -> None:
+        for tile in list(layer.stale)[:most]:
+            del layer.stale[tile]
+            self._drawing.texture(layer.entity, tile, layer.picture(self._mesh.tile_window(tile)))
+
+    def _draw_ordered(self, now_ns: int) -> None:
+        """Draws operators' zones when they change, and now and then for viewers that join late."""
+        version = self._replica.zones_version
+        if version == self._zones_version and (not self._ordered or now_ns < self._zones_due_ns):
+            return
+        self._zones_due_ns = now_ns + _ZONES_AGAIN_NS
+        if version != self._zones_version:
+            self._zones_version = version
+            self._ordered = ordered_areas(self._replica, now_ns)
+            self._colours.close(closed_cells([*self._zones, *self._ordered]))
+        self._drawing.ordered(self._ordered)
+
+    def _draw_windows(self) -> None:
+        """Draws the window that each planner grew last, unless it is the whole terrain."""
+        told = (
+            (target, Window(*self._windows[target])) for target in sorted(self._windows) if self._windows[target]
+        )
+        parts = {target: w for target, w in told if not w.empty and w.cells < self._cells}
+        self._drawing.windows(window_outlines(self._mesh, list(parts.values())), list(parts))

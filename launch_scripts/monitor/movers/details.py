@@ -1,0 +1,85 @@
+"""What a person reads of vehicles and targets: the labels, and a sentence for who points at one of them. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from launch_scripts.monitor.movers.routes import RouteNow
+from launch_scripts.report.results.certified_gap import percent
+from launch_scripts.report.run_state.state import TargetLine
+from launch_scripts.report.vehicle_columns import VehicleColumns
+from swarm.clock import NS_PER_S
+from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.vehicles import VehicleState
+
+MOST_LABELS = 40
+"""With more labels nothing can be read."""
+_DOES = {
+    VehicleState.IDLE: "idle",
+    VehicleState.WAITING: "waits for a route",
+    VehicleState.FOLLOWING: "on its way",
+    VehicleState.ARRIVED: "arrived",
+    VehicleState.STRANDED: "stranded",
+    VehicleState.LOST: "goes on without its planner",
+    VehicleState.OUTDATED: "goes by an old pose",
+}
+_TO = {
+    state: " to" if state in (VehicleState.WAITING, VehicleState.FOLLOWING) else "; chases"
+    for state in VehicleState
+}
+_TO[VehicleState.ARRIVED] = " at"
+
+
+def vehicle_details(
+    vehicles: VehicleColumns, groups: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
+) -> list[str]:
+    """As `a0-04 of scouts: on its way to t3; route 2 s old, certified gap 1.20%`."""
+    target_ids = vehicles.target_ids
+    lines = []
+    for id, state, target in zip(vehicles.ids, vehicles.states.tolist(), vehicles.targets.tolist(), strict=True):
+        chased = target_ids[target] if target >= 0 else None
+        line = f"{id} of {groups.get(id, '?')}: {_DOES[state]}"
+        if chased is not None:
+            line += f"{_TO[state]} {chased}"
+            route = routes.get(id)
+            if route is not None and route.target == chased and state != VehicleState.ARRIVED:
+                line += f"; route {(now_ns - route.begun_ns) / NS_PER_S:.0f} s old, {_proven(route.gap)}"
+        lines.append(line)
+    return lines
+
+
+def _proven(gap: float | None) -> str:
+    return "gap not proven" if gap is None else f"certified gap {percent(gap)}"
+
+
+def body_details(body: Body) -> str:
+    """As `r1 of mowers: radius 2.0 m, 1.5 m/s`."""
+    return f"{body.id} of {body.group}: radius {body.radius_m:.1f} m, {body.speed_m_per_s:.1f} m/s"
+
+
+def target_details(line: TargetLine) -> str:
+    """As `t3: 16 chase it, nearest at 0.4 km, captured 2 times, certified gap 1.05%`."""
+    parts = [f"{line.following} chase it"]
+    if line.nearest_m is not None:
+        parts.append(f"nearest at {line.nearest_m / 1000:.1f} km")
+    parts.append(f"captured {line.captures} times")
+    if line.gap is not None:
+        parts.append(f"certified gap {percent(line.gap.mean)}")
+    return f"{line.title}: {', '.join(parts)}"
+
+
+def target_labels(
+    posed: Collection[str], lost: Collection[str], seen_age_s: Mapping[str, float]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Labels at pins and at sightings, by target. No target has two, and none that is drawn has none.
+
+    posed       targets that have a place because a tracker told it
+    lost        those of them that nobody tracks now
+    seen_age_s  targets that vehicles saw -> seconds since then
+    """
+    pins = {id: id for id in posed if id not in lost}
+    sightings = {id: f"{id} seen {age_s:.0f} s ago" for id, age_s in seen_age_s.items() if id not in pins}
+    for id in posed:
+        if id in lost and id not in sightings:
+            pins[id] = f"{id} lost"
+    return pins, sightings

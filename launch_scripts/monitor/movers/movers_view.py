@@ -1,0 +1,96 @@
+"""The moving half of the view: hears who is where, and has it drawn frame by frame."""
+
+from __future__ import annotations
+
+import rerun as rr
+
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.details import target_details
+from launch_scripts.monitor.movers.levels import level_for
+from launch_scripts.monitor.movers.looks import Looks
+from launch_scripts.monitor.movers.mover_drawing import MoverDrawing
+from launch_scripts.monitor.movers.targets_view import TargetsView
+from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
+from launch_scripts.monitor.serving.sinks import Streams
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.run_state.state import RunState
+from shared_map.replication.filter import MarkFilter
+from shared_map.sightings import Sightings
+from swarm.config.scenario import Scenario
+from swarm.runtime.stats import Counters
+from swarm.wire.messages.base import Message
+from swarm.wire.messages.bodies import Body
+from swarm.wire.messages.targets import Sighted
+from swarm.wire.messages.vehicles import Fleet, Followed
+from vehicle_agent.bodies import Bodies
+
+
+class MoversView:
+    """Vehicles, guests, targets, sightings, bodies, routes and trails.
+
+    recorder  has heard each message before `hear`
+    filter    whose sightings count
+    """
+
+    def __init__(
+        self,
+        rec: rr.RecordingStream | Streams,
+        mesh: TerrainMesh,
+        scenario: Scenario,
+        recorder: Recorder,
+        counters: Counters,
+        filter: MarkFilter,
+    ) -> None:
+        self._recorder = recorder
+        self._counters = counters
+        level = level_for(scenario.vehicle_count)
+        self.looks = looks = Looks([group.name for group in scenario.groups], scenario.target_ids)
+        self._drawing = MoverDrawing(rec, looks, level)
+        self._vehicles = VehiclesView(self._drawing, mesh, scenario, level, looks)
+        self._targets = TargetsView(self._drawing, mesh, looks, trails_of(scenario, mesh, level))
+        self._sightings = Sightings(filter)
+        self._bodies = Bodies(mesh.grid)
+        """Taken in as vehicles do: what they avoid is drawn, and nothing else."""
+        self._details: dict[str, str] = {}
+        """Target -> a sentence about it."""
+        self._crew: frozenset[tuple[str, str]] = frozenset()
+        """(role, id) of the processes that the run needs; of others that went, vehicles have left."""
+        self._fleets_new = False
+
+    def begin(self) -> None:
+        """Logs styles; all else is drawn anew."""
+        self._drawing.begin()
+        self._vehicles.draw_anew()
+        self._targets.draw_anew()
+
+    def hear(self, message: Message, now_ns: int) -> None:
+        match message:
+            case Fleet():
+                self._fleets_new = True
+            case Sighted() as sighted:
+                self._sightings.hear(sighted, now_ns)
+            case Body() as body:
+                self._bodies.hear(body, now_ns)
+            case Followed() as followed:
+                if not self._vehicles.begun(followed, now_ns):
+                    self._counters.count("routes_unreadable")
+
+    def summarised(self, summary: RunState) -> None:
+        """Takes what the figures say of targets, so that all places say the same."""
+        self._details = {line.id: target_details(line) for line in summary.targets}
+        plan = self._recorder.model.plan
+        self._crew = frozenset(plan.crew_now(plan.targets_now(self._recorder.book)))
+
+    def tick(self, now_ns: int) -> None:
+        """Draws what is due in one frame."""
+        observed = self._recorder.observed
+        if self._fleets_new:
+            self._fleets_new = False
+            self._vehicles.draw(observed.driven(self._crew, now_ns), observed.groups, now_ns)
+        self._sightings.expire(now_ns)
+        lost = self._recorder.tracked.lost(now_ns)
+        self._targets.draw(observed.targets(), lost, self._sightings.best(now_ns), self._details, now_ns)
+        self._bodies.tick(now_ns)
+        self._bodies.take_changed()
+        self._bodies.complaints.clear()
+        self._targets.draw_bodies(self._bodies.reports, now_ns)

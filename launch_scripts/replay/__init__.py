@@ -1,0 +1,1 @@
+"""Recorded processes of a run, fed to the services of this build."""

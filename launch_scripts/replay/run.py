@@ -1,0 +1,159 @@
+"""A run's recordings: which there are, what each of them gives when it is replayed, and a copy of a part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from launch_scripts.replay.rebuild import REPLAYED, Ground, Grounds, rebuilt, setup_of
+from launch_scripts.report.results.run_folder import SCENARIO_FILE
+from swarm.clock import NS_PER_S
+from swarm.errors import ConfigError, StoreError, SwarmError
+from swarm.runtime.recording.recording import path_of, versions
+from swarm.runtime.recording.records import (
+    CALLS,
+    FOLDER,
+    SUFFIX,
+    Cut,
+    Head,
+    RecordReader,
+    RecordWriter,
+)
+from swarm.runtime.recording.replaying import Outcome, Progress, replay
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """One life of a process, in a file.
+
+    life   which of its lives it is, from 1
+    bytes  of the file
+    """
+
+    path: Path
+    process: str
+    life: int
+    head: Head
+    bytes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replayed:
+    """What became of one recording.
+
+    outcome  None if it could not be replayed, and `why` says why
+    """
+
+    recorded: Recorded
+    outcome: Outcome | None
+    why: str | None = None
+
+    @property
+    def same(self) -> bool:
+        """Whether it was replayed to its end without a difference."""
+        return self.outcome is not None and self.outcome.difference is None and self.outcome.damaged is None
+
+
+def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
+    """The recordings in a run's folder, in the order of roles and ids. Raises ConfigError if there is none, and
+    StoreError if one is damaged at its beginning."""
+    found: list[tuple[Head, Path]] = []
+    for path in sorted((folder / FOLDER).glob(f"*{SUFFIX}")):
+        with RecordReader(path) as reader:
+            found.append((reader.head, path))
+    if not found:
+        raise ConfigError(
+            f"{folder} holds no recorded inputs: `swarm up` and `swarm demo` record them with --record-inputs, "
+            "`swarm simulate` always does"
+        )
+    order = {role: place for place, role in enumerate(REPLAYED)}
+    found.sort(key=lambda each: (order.get(each[0].role, len(order)), _natural(each[0].id), each[0].incarnation))
+    lives: dict[str, int] = {}
+    recorded: list[Recorded] = []
+    for head, path in found:
+        name = f"{head.role}-{head.id}"
+        lives[name] = lives.get(name, 0) + 1
+        if process in (None, name):
+            size = path.stat().st_size
+            recorded.append(Recorded(path=path, process=name, life=lives[name], head=head, bytes=size))
+    if not recorded:
+        raise ConfigError(f"no process {process!r} is recorded in {folder}; there are {', '.join(lives)}")
+    return recorded
+
+
+def replay_run(
+    folder: Path,
+    process: str | None = None,
+    until_s: float | None = None,
+    ground: Ground | None = None,
+    progress: Callable[[Recorded], Progress] = lambda _: lambda _: None,
+) -> Iterator[Replayed]:
+    """Feed the recordings of a run to the services of this build, one after the other. Raises as `recordings_of`.
+
+    ground  of a run whose scenario does not say what it is on
+    """
+    grounds = Grounds(folder, ground)
+    for recorded in recordings_of(folder, process):
+        try:
+            outcome = _replay(folder, recorded, grounds, until_s, progress(recorded))
+        except SwarmError as error:
+            yield Replayed(recorded=recorded, outcome=None, why=str(error))
+        else:
+            yield Replayed(recorded=recorded, outcome=outcome)
+
+
+def _replay(
+    folder: Path, recorded: Recorded, grounds: Grounds, until_s: float | None, progress: Progress
+) -> Outcome:
+    with RecordReader(recorded.path) as reader:
+        setup = setup_of(reader.head, folder)
+        ground = grounds.of(setup, reader.head.terrain)
+        namespace = setup.scenario.network.namespace
+        return replay(reader, lambda boundary: rebuilt(setup, ground, boundary), namespace, until_s, progress)
+
+
+def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
+    """Package -> (version that it was recorded with, version here), where they differ."""
+    here = versions()
+    return {
+        name: (version, here.get(name, "none"))
+        for name, version in recorded.head.versions.items()
+        if version != here.get(name)
+    }
+
+
+def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
+    """Copy a recording, up to a time, into a folder which `swarm replay` and a test can replay. Raises
+    StoreError."""
+    head = recorded.head
+    path = path_of(folder, head.role, head.id, head.incarnation)
+    until_ns = None if until_s is None else head.started_ns + int(until_s * NS_PER_S)
+    if path.exists():
+        raise StoreError(f"{path} is there already: choose another folder")
+    with RecordReader(recorded.path) as reader:
+        writer = RecordWriter(path)
+        writer.write(head)
+        for record in reader:
+            if isinstance(record, CALLS) and until_ns is not None and record.now_ns > until_ns:
+                writer.write(Cut(f"kept until {until_s:g} s", whole=True))
+                break
+            writer.write(record)
+        writer.close()
+    try:
+        if writer.cut is not None:
+            raise StoreError(writer.cut)
+        if reader.damaged is not None:
+            raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until")
+        (folder / SCENARIO_FILE).write_text(head.scenario, encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"cannot write {folder / SCENARIO_FILE}: {error.strerror or error}") from error
+    except StoreError:
+        path.unlink(missing_ok=True)
+        raise
+    return path
+
+
+def _natural(id: str) -> tuple[int, str]:
+    """t2 before t10."""
+    return len(id), id

@@ -1,0 +1,377 @@
+"""A recording as a file: blocks behind each other, each with its length and checksum, of compressed records.
+
+    "swarm recording 1\n" {length u32, crc32 u32, zlib({length u32, record} {length, record} ...)} ...
+
+Records are MessagePack, numbers little-endian. A process that is killed leaves a file that can be read up to its
+last whole block. Whatever stands in a file, reading it raises nothing but StoreError.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgspec
+
+from swarm.config.agents import AddedAgent
+from swarm.config.input_files import FileKind, check_bytes
+from swarm.errors import StoreError
+
+log = logging.getLogger(__name__)
+
+MAGIC = b"swarm recording 1\n"
+SUFFIX = ".inputs"
+FOLDER = "inputs"
+"""Of a run's folder: one recording per life of a process."""
+MOST_BYTES = 64 << 20
+"""Of one recording: what comes later is not recorded, and the last record says so."""
+_BLOCK_BYTES = 1 << 16
+"""Of records, before they are compressed: a block is written once it has more."""
+_LONGEST_BLOCK_BYTES = 256 << 20
+"""A block is taken to hold no more, whatever it says."""
+_LEVEL = 1
+"""Of compression, the fastest: it leaves a third to a quarter of the bytes."""
+_HEAD = struct.Struct("<II")
+_LENGTH = struct.Struct("<I")
+
+
+class Record(msgspec.Struct, frozen=True, array_like=True):
+    """One record. Its tag is a number, because a run has millions of them."""
+
+
+class Head(Record, frozen=True, tag=0):
+    """The first: which process it was, and what it was started with.
+
+    scenario  as TOML, with every setting
+    terrain   digest
+    before    what its earlier lives have counted, as a payload; empty if that is not known
+    versions  package -> version of what made it
+    """
+
+    role: str
+    id: str
+    run_id: str
+    incarnation: int
+    started_ns: int
+    scenario: str
+    terrain: str
+    added: AddedAgent | None
+    restarts: int
+    before: bytes
+    versions: dict[str, str]
+
+
+class LoopFigures(msgspec.Struct, frozen=True, array_like=True):
+    """What the loop of a process, not its service, has counted since the last call."""
+
+    counts: dict[str, int]
+    gauges: dict[str, float]
+    buckets: dict[str, dict[int, int]]
+
+
+class Started(Record, frozen=True, tag=1):
+    now_ns: int
+    figures: LoopFigures | None = None
+
+
+class Ticked(Record, frozen=True, tag=2):
+    now_ns: int
+    figures: LoopFigures | None = None
+
+
+class Stopped(Record, frozen=True, tag=3):
+    now_ns: int
+    figures: LoopFigures | None = None
+
+
+class HeardOne(Record, frozen=True, tag=4):
+    """chunks  of the key, in the order of the topic's fields"""
+
+    now_ns: int
+    topic: str
+    chunks: list[str]
+    payload: bytes
+
+
+class HeardSome(Record, frozen=True, tag=5):
+    """samples  (key below the namespace, payload)"""
+
+    now_ns: int
+    topic: str
+    samples: list[tuple[str, bytes]]
+
+
+class WasAsked(Record, frozen=True, tag=6):
+    now_ns: int
+    topic: str
+    chunks: list[str]
+    payload: bytes
+    timeout_s: float
+
+
+class GotReply(Record, frozen=True, tag=7):
+    now_ns: int
+    topic: str
+    chunks: list[str]
+    payload: bytes
+    tag: str
+    took_s: float
+
+
+class AskOver(Record, frozen=True, tag=8):
+    now_ns: int
+    topic: str
+    tag: str
+    replies: int
+    failure: str | None
+
+
+class TokenChanged(Record, frozen=True, tag=9):
+    now_ns: int
+    role: str
+    id: str
+    incarnation: int
+    up: bool
+
+
+class LinkSeen(Record, frozen=True, tag=10):
+    now_ns: int
+    up: bool
+    beyond: bool
+
+
+class JobEnded(Record, frozen=True, tag=11):
+    """number  of the job among those that were submitted, from 0; reads  what it read of the outside"""
+
+    now_ns: int
+    tag: str
+    number: int
+    took_ns: int
+    reads: list[tuple[str, bytes]]
+
+
+class Read(Record, frozen=True, tag=12):
+    """What the service read of the outside, inside the call before; before the first call while it was made."""
+
+    what: str
+    value: bytes
+
+
+class Output(msgspec.Struct, frozen=True, array_like=True):
+    """What a call let out: to whom, how many bytes, and their digest."""
+
+    to: str
+    length: int
+    digest: bytes
+
+
+class Outputs(Record, frozen=True, tag=13):
+    """All that the call before let out, in order. A call that lets nothing out has none."""
+
+    outputs: list[Output]
+
+
+class Cut(Record, frozen=True, tag=14):
+    """The last record of a recording that does not go on to the end, though the process did.
+
+    whole  whether all that the last call let out is there
+    """
+
+    why: str
+    whole: bool = False
+
+
+class Ended(Record, frozen=True, tag=15):
+    """The last record of a process that ended in order."""
+
+
+Call = (
+    Started
+    | Ticked
+    | Stopped
+    | HeardOne
+    | HeardSome
+    | WasAsked
+    | GotReply
+    | AskOver
+    | TokenChanged
+    | LinkSeen
+    | JobEnded
+)
+CALLS = (
+    Started,
+    Ticked,
+    Stopped,
+    HeardOne,
+    HeardSome,
+    WasAsked,
+    GotReply,
+    AskOver,
+    TokenChanged,
+    LinkSeen,
+    JobEnded,
+)
+AnyRecord = Head | Call | Read | Outputs | Cut | Ended
+
+_encode = msgspec.msgpack.Encoder().encode
+_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(AnyRecord)
+
+
+def packed(*records: Record) -> bytes:
+    """Records as they stand in the file: in a block of their own."""
+    return _block(b"".join(_LENGTH.pack(len(body)) + body for body in map(_encode, records)))
+
+
+def _block(content: bytes | bytearray) -> bytes:
+    body = zlib.compress(content, _LEVEL)
+    return _HEAD.pack(len(body), zlib.crc32(body)) + body
+
+
+class RecordWriter:
+    """Appends records to a file of its own. A full disk, or `MOST_BYTES`, cut the recording, not the process.
+
+    cut  why it does not go on; None while it does
+    """
+
+    def __init__(self, path: Path, most_bytes: int = MOST_BYTES) -> None:
+        self.path = path
+        self.cut: str | None = None
+        self._most_bytes = most_bytes
+        self._bytes = 0
+        self._waiting = bytearray()
+        """Records of the next block."""
+        self._file: BinaryIO | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("xb", buffering=0)
+            self._append(MAGIC)
+        except OSError as error:
+            self._end(f"cannot write {path}: {error.strerror or error}")
+
+    def write(self, record: Record) -> None:
+        if self._file is None:
+            return
+        body = _encode(record)
+        self._waiting += _LENGTH.pack(len(body))
+        self._waiting += body
+        if len(self._waiting) >= _BLOCK_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand over to the system what waits."""
+        if self._file is None or not self._waiting:
+            return
+        block = _block(self._waiting)
+        self._waiting = bytearray()
+        try:
+            if self._bytes + len(block) > self._most_bytes:
+                why = f"a recording takes {self._most_bytes >> 20} MiB at most"
+                self._append(packed(Cut(why)))
+                self._end(why)
+            else:
+                self._append(block)
+        except OSError as error:
+            self._end(f"cannot write {self.path}: {error.strerror or error}")
+
+    def close(self) -> None:
+        self.flush()
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._file = None
+
+    def _append(self, content: bytes) -> None:
+        assert self._file is not None
+        if self._file.write(content) != len(content):
+            raise OSError("the disk is full")
+        self._bytes += len(content)
+
+    def _end(self, why: str) -> None:
+        self.cut = why
+        self._waiting = bytearray()
+        self.close()
+        log.warning("inputs are not recorded any more: %s", why)
+
+
+class RecordReader:
+    """Reads a recording from its beginning. Raises StoreError on a file that is none.
+
+    head     its first record
+    at       how many of its bytes are read
+    damaged  why it cannot be read further, in a sentence; None until that is found
+    torn     whether it ends within a block, as where a process was killed; found at its end
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.at = 0
+        self.damaged: str | None = None
+        self.torn = False
+        try:
+            check_bytes(path, FileKind.RECORDING)
+            self._file = path.open("rb")
+        except OSError as error:
+            raise StoreError(f"cannot read recording {path}: {error.strerror or error}") from error
+        try:
+            if self._file.read(len(MAGIC)) != MAGIC:
+                raise StoreError(f"{path} is no recording: it does not begin with {MAGIC.decode().strip()!r}")
+            self.at = len(MAGIC)
+            self._records = self._read()
+            head = next(self._records, None)
+            if not isinstance(head, Head):
+                why = self.damaged or "it does not say which process it is of"
+                raise StoreError(f"recording {path} is damaged: {why}")
+        except StoreError:
+            self._file.close()
+            raise
+        self.head = head
+
+    def __enter__(self) -> RecordReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __iter__(self) -> Iterator[AnyRecord]:
+        return self._records
+
+    def _read(self) -> Iterator[AnyRecord]:
+        try:
+            while (block := self._next_block()) is not None:
+                start = 0
+                while start < len(block):
+                    (length,) = _LENGTH.unpack_from(block, start)
+                    start += _LENGTH.size + length
+                    if start > len(block):
+                        raise ValueError("a record is longer than its block")
+                    record: AnyRecord = _decoder.decode(block[start - length : start])
+                    yield record
+        except (OSError, ValueError, RecursionError, struct.error, zlib.error, msgspec.MsgspecError) as error:
+            self.damaged = f"damaged at byte {self.at}: {error}"
+
+    def _next_block(self) -> bytes | None:
+        """The records of the next block; None if there is no whole one."""
+        head = self._file.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            self.torn = len(head) > 0
+            return None
+        length, checksum = _HEAD.unpack(head)
+        if length > FileKind.RECORDING.most_bytes:
+            raise ValueError(f"a block of {length} bytes")
+        body = self._file.read(length)
+        if len(body) < length:
+            self.torn = True
+            return None
+        if zlib.crc32(body) != checksum:
+            raise ValueError("a block does not match its checksum")
+        content = zlib.decompressobj()
+        block = content.decompress(body, _LONGEST_BLOCK_BYTES)
+        if content.unconsumed_tail:
+            raise ValueError(f"a block of more than {_LONGEST_BLOCK_BYTES} bytes")
+        self.at += len(head) + length
+        return block

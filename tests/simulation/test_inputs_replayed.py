@@ -1,0 +1,263 @@
+"""What a process heard, fed to the same code, gives the same outputs; other outputs are found at their event."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from launch_scripts.cli import app
+from launch_scripts.replay.run import keep, recordings_of, replay_run
+from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.simulate import simulate
+from launch_scripts.simulation.trial import nodes_of
+from launch_scripts.simulation.worlds import SMALL
+from swarm.errors import ConfigError, StoreError
+from swarm.runtime.recording import records
+from swarm.runtime.recording.records import (
+    CALLS,
+    MAGIC,
+    Cut,
+    HeardOne,
+    Output,
+    Outputs,
+    Read,
+    Record,
+    RecordReader,
+    packed,
+)
+from swarm.runtime.role import RoleSetup
+from vehicle_agent.agent import Agent
+
+SECONDS = 8
+
+
+def record(folder: Path, seed: int, seconds: float = SECONDS) -> Path:
+    plan = random_plan(seed, nodes_of(SMALL), seconds)
+    simulate(SMALL, seed, seconds, plan, record_to=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("run"), 4)
+
+
+def records_of(path: Path) -> list[Record]:
+    with RecordReader(path) as reader:
+        return [reader.head, *reader]
+
+
+def rewritten(run: Path, folder: Path, process: str, changed: list[Record]) -> Path:
+    """A run with one recording, of other records."""
+    path = next(each.path for each in recordings_of(run, process))
+    (folder / "inputs").mkdir(parents=True, exist_ok=True)
+    (folder / "inputs" / path.name).write_bytes(MAGIC + packed(*changed))
+    return folder
+
+
+@pytest.mark.parametrize("seed", [4, 11])
+def test_every_process_of_a_run_with_faults_gives_the_same_when_it_is_replayed(
+    seed: int, run: Path, tmp_path: Path
+) -> None:
+    replayed = list(replay_run(run if seed == 4 else record(tmp_path, seed, 5)))
+    assert {each.recorded.head.role for each in replayed} == {"keeper", "planner", "targets", "agent"}
+    assert seed != 4 or max(each.recorded.life for each in replayed) > 1  # crashes
+    for each in replayed:
+        assert each.same, each
+        assert each.outcome is not None
+        assert each.outcome.events > 5
+        assert each.outcome.outputs > 5
+
+
+def test_recording_a_run_does_not_change_it(tmp_path: Path) -> None:
+    logs = []
+    for folder in (None, tmp_path):
+        trace = io.StringIO()
+        simulate(SMALL, 4, 2, random_plan(4, nodes_of(SMALL), 2), trace, record_to=folder)
+        logs.append(trace.getvalue())
+    assert logs[0] == logs[1]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.data())
+def test_an_output_that_was_another_is_found_at_its_event(run: Path, data: st.DataObject) -> None:
+    process = data.draw(st.sampled_from(["keeper-0", "planner-t0"]))
+    whole = records_of(next(each.path for each in recordings_of(run, process)))
+    at = data.draw(st.sampled_from([n for n, each in enumerate(whole[:-20]) if isinstance(each, Outputs)]))
+    changed = whole[at]
+    assert isinstance(changed, Outputs)
+    wrong = data.draw(st.integers(0, len(changed.outputs) - 1))
+    outputs = list(changed.outputs)
+    kind = data.draw(st.sampled_from(["digest", "to", "missing", "more"]))
+    if kind == "missing":
+        del outputs[wrong]
+    elif kind == "more":
+        outputs.append(Output("put nowhere", 1, bytes(8)))
+    else:
+        other = {"digest": bytes(8)} if kind == "digest" else {"to": "put nowhere"}
+        outputs[wrong] = msgspec.structs.replace(outputs[wrong], **other)
+    event = sum(isinstance(each, CALLS) for each in whole[:at])
+    folder = rewritten(
+        run, run.parent / f"changed-{process}", process, [*whole[:at], Outputs(outputs), *whole[at + 1 :]]
+    )
+    (found,) = replay_run(folder)
+    assert found.outcome is not None
+    assert found.outcome.difference is not None
+    assert found.outcome.difference.event == event
+    assert found.outcome.events == max(event - 1, 0)
+
+
+def test_other_code_is_found_at_the_event_at_which_it_does_something_else(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decide = Agent.decide
+    calls = 0
+
+    def forgets(agent: Agent, now_ns: int) -> list[object]:
+        nonlocal calls
+        calls += 1
+        actions = decide(agent, now_ns)
+        return [] if calls > 30 else list(actions)
+
+    monkeypatch.setattr(Agent, "decide", forgets)
+    first, *_ = replay_run(run, "agent-a1")
+    assert first.outcome is not None
+    difference = first.outcome.difference
+    assert difference is not None
+    assert difference.what == "tick"
+    assert difference.recorded is not None
+    assert difference.recorded.startswith("ask ")
+    assert first.outcome.events == difference.event - 1 > 30
+
+
+def test_an_input_that_is_lost_shows(run: Path, tmp_path: Path) -> None:
+    whole = records_of(next(each.path for each in recordings_of(run, "keeper-0")))
+    kept = [each for each in whole if not (isinstance(each, HeardOne) and each.topic == "sighted")]
+    kept = [each for n, each in enumerate(kept) if not (isinstance(each, Read) and n == 40)]
+    marks = [each for each in whole if isinstance(each, records.HeardSome)]
+    assert marks
+    folder = rewritten(run, tmp_path / "lost", "keeper-0", [each for each in kept if each is not marks[0]])
+    (found,) = replay_run(folder)
+    assert found.outcome is not None
+    assert found.outcome.difference is not None
+
+
+def test_a_recording_that_ends_anywhere_is_replayed_up_to_there(run: Path, tmp_path: Path) -> None:
+    source = next(each.path for each in recordings_of(run, "planner-t0") if each.life == 2)
+    content = source.read_bytes()
+    (tmp_path / "inputs").mkdir()
+    path = tmp_path / "inputs" / source.name
+    events = []
+    for length in (len(content), len(content) * 2 // 3, len(content) // 2 + 1, len(content) // 2):
+        path.write_bytes(content[:length])
+        (found,) = replay_run(tmp_path)
+        assert found.same, found
+        assert found.outcome is not None
+        events.append(found.outcome.events)
+    assert events == sorted(events, reverse=True)
+    assert events[0] > events[-1] > 0
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_a_damaged_recording_is_said_in_a_sentence(run: Path, data: st.DataObject) -> None:
+    source = next(each.path for each in recordings_of(run, "planner-t0"))
+    content = bytearray(source.read_bytes())
+    at = data.draw(st.integers(0, len(content) - 1))
+    content[at] ^= data.draw(st.integers(1, 255))
+    path = run.parent / "damaged.inputs"
+    path.write_bytes(content)
+    with RecordReader(source) as reader:
+        first_block_ends = reader.at
+    if at < first_block_ends:
+        with pytest.raises(StoreError, match=str(path)):
+            RecordReader(path)
+        return
+    with RecordReader(path) as reader:
+        whole = list(reader)
+    assert reader.torn or (reader.damaged is not None and str(reader.at) in reader.damaged)
+    assert whole == records_of(source)[1 : len(whole) + 1]
+
+
+def test_bytes_that_match_their_checksum_and_are_no_records_are_said_too(run: Path, tmp_path: Path) -> None:
+    whole = records_of(next(each.path for each in recordings_of(run, "planner-t0")))
+    at = next(n for n, each in enumerate(whole) if isinstance(each, HeardOne))
+    heard = whole[at]
+    assert isinstance(heard, HeardOne)
+    for number, wrong in enumerate(
+        (
+            msgspec.structs.replace(heard, payload=b"\xff"),
+            msgspec.structs.replace(heard, topic="nothing"),
+            msgspec.structs.replace(heard, chunks=["a"] * 9),
+            whole[0],
+        )
+    ):
+        folder = rewritten(run, tmp_path / f"{number}", "planner-t0", [*whole[:at], wrong, *whole[at + 1 :]])
+        (found,) = replay_run(folder)
+        assert found.outcome is None
+        assert found.why is not None
+
+
+def test_a_recording_that_is_full_says_so_and_is_the_same_until_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records.RecordWriter.__init__, "__defaults__", (5_000,))
+    record(tmp_path, 4, 3)
+    found = list(replay_run(tmp_path))
+    assert any("at most" in each.outcome.ended for each in found if each.outcome is not None)
+    assert all(each.same for each in found)
+    assert all(each.recorded.bytes < 5_200 for each in found)
+
+
+def test_a_full_disk_cuts_the_recording_and_not_the_run(tmp_path: Path) -> None:
+    (tmp_path / "inputs").write_text("no folder")
+    simulate(SMALL, 4, 1, record_to=tmp_path)
+    with pytest.raises(ConfigError, match="no recorded inputs"):
+        recordings_of(tmp_path)
+
+
+def test_what_is_kept_of_a_recording_is_replayed_by_itself(run: Path, tmp_path: Path) -> None:
+    recorded = recordings_of(run, "agent-a1")[0]
+    keep(recorded, tmp_path, 3.0)
+    assert any(isinstance(each, Cut) for each in records_of(recordings_of(tmp_path)[0].path))
+    (kept,) = replay_run(tmp_path)
+    (until, *_) = replay_run(run, "agent-a1", 3.0)
+    assert kept.same
+    assert kept.outcome is not None
+    assert until.outcome is not None
+    assert kept.outcome.events == until.outcome.events
+    assert 2.5 < kept.outcome.seconds <= 3.0
+    with pytest.raises(StoreError, match="is there already"):
+        keep(recorded, tmp_path, 3.0)
+
+
+def test_the_command_says_what_is_the_same_and_exits_with_1_where_something_differs(
+    run: Path, tmp_path: Path
+) -> None:
+    told = CliRunner().invoke(app, ["replay", str(run), "--process", "keeper-0", "--json"])
+    assert told.exit_code == 0, told.output
+    found = json.loads(told.stdout)
+    assert [each["same"] for each in found["processes"]] == [True] * len(found["processes"])
+    whole = records_of(next(each.path for each in recordings_of(run, "keeper-0")))
+    at = next(n for n, each in enumerate(whole) if isinstance(each, Outputs) and n > 40)
+    other = rewritten(run, tmp_path / "other", "keeper-0", [*whole[:at], *whole[at + 1 :]])
+    told = CliRunner().invoke(app, ["replay", str(other), "--process", "keeper-0"])
+    assert told.exit_code == 1
+    assert "differs at event" in told.stdout
+    assert "recorded: nothing more" in told.stdout
+    assert max(map(len, told.stdout.splitlines()[:2])) <= 80
+    with pytest.raises(ConfigError, match="no process 'planner-x'"):
+        recordings_of(run, "planner-x")
+
+
+def test_all_that_a_process_is_started_with_is_recorded() -> None:
+    here = {"run_dir", "record_inputs"}  # where a process keeps its files is no input: what it reads there is
+    assert {field.name for field in dataclasses.fields(RoleSetup)} - here <= set(records.Head.__struct_fields__)

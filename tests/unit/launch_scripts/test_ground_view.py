@@ -1,0 +1,212 @@
+"""What lies still in the live view: closed ground, zones, layers, margin and legends."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image
+
+from launch_scripts.monitor.ground.ground_colours import (
+    FAST_MARK,
+    FOUND,
+    LETHAL_MARK,
+    NO_GO,
+    OVERRULED,
+    SLOW_MARK,
+    STILL_HIDDEN_LETHAL,
+    STILL_HIDDEN_SLOW,
+    GroundColours,
+)
+from launch_scripts.monitor.ground.layers import COST, KNOWN, PHOTO, legends
+from launch_scripts.monitor.ground.legend import HEIGHT_PX, WIDTH_PX
+from launch_scripts.monitor.ground.map_margin import map_margin, said_heights
+from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
+from launch_scripts.monitor.ground.zones import (
+    Area,
+    borders,
+    closed_cells,
+    ordered_areas,
+    scenario_areas,
+    title_places,
+)
+from launch_scripts.monitor.movers.looks import Looks
+from shared_map.replication.marks import zone_author
+from shared_map.replication.replica import MapReplica
+from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import Scenario
+from swarm.grid import Window
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.marks import MarkSet
+from swarm.wire.statements import MarkKind
+
+ALL = Window(0, 0, 40, 50)
+
+
+def flat(closed: NDArray[np.bool_] | None = None) -> Terrain:
+    pace = np.full((40, 50), 0.1, np.float32)
+    if closed is not None:
+        pace[closed] = np.inf
+    return terrain_of_pace(pace, 10.0)
+
+
+def colours_of(terrain: Terrain, now: Floats | None = None, truth: Floats | None = None) -> GroundColours:
+    return GroundColours(TerrainMesh(terrain), terrain, terrain.ground_s_per_m if now is None else now, truth)
+
+
+def zoned(zones: str) -> Scenario:
+    head = 'name = "z"\nseconds = 5\n[[targets]]\nname = "t"\n[[groups]]\nvehicles = 1\n'
+    return parse_scenario(head + zones)
+
+
+def near(pixel: Bytes, colour: tuple[int, ...], within: int = 45) -> bool:
+    return bool((np.abs(pixel.astype(int) - np.array(colour)) <= within).all())
+
+
+def test_ground_that_was_known_to_be_lethal_looks_neither_like_open_ground_nor_like_a_mark() -> None:
+    closed = np.zeros((40, 50), np.bool_)
+    closed[10:30, 10:30] = True
+    changed = (colours_of(flat(closed)).photo_of(ALL) != colours_of(flat()).photo_of(ALL)).any(axis=2)
+    np.testing.assert_array_equal(changed, closed)
+    pixels = colours_of(flat(closed)).photo_of(ALL)[closed]
+    assert len(np.unique(pixels, axis=0)) >= 2, "hatched, not filled: to be told apart without colour"
+    marks = (LETHAL_MARK, SLOW_MARK, FAST_MARK)
+    assert not any(near(pixel, mark) for pixel in pixels[:40] for mark in marks)
+
+
+def test_a_zone_that_closes_ground_is_hatched_red_even_where_operators_ordered_it() -> None:
+    now = np.array(flat().ground_s_per_m)
+    now[5:15, 5:15] = np.inf
+    colours = colours_of(flat(), now)
+    found = colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3)
+    assert all(near(pixel, LETHAL_MARK) for pixel in found)
+    cells = np.flatnonzero(np.isinf(now))
+    colours.close(cells)
+    ordered = colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3)
+    assert any(near(pixel, NO_GO) for pixel in ordered)
+    assert not any(near(pixel, LETHAL_MARK) for pixel in ordered)
+    colours.close(cells[:0])
+    np.testing.assert_array_equal(colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3), found)
+
+
+def test_dear_ground_is_darker_than_cheap_ground_and_found_obstacles_are_black() -> None:
+    now = np.array(flat().ground_s_per_m)
+    now[:, 10:20], now[:, 20:30], now[:, 30:40] = 0.2, 0.4, np.inf
+    terrain = terrain_of_pace(np.where(np.isinf(now), np.float32(0.8), now), 10.0)
+    cost = colours_of(terrain, now).cost_of(ALL).astype(int).sum(axis=2)
+    cheap, dearer, dear, lethal = (cost[20, col] for col in (5, 15, 25, 35))
+    assert cheap > dearer > dear > lethal
+
+
+def test_what_is_hidden_what_is_found_and_what_is_said_wrongly_have_colours_of_their_own() -> None:
+    terrain = flat()
+    now, truth = np.array(terrain.ground_s_per_m), np.array(terrain.ground_s_per_m)
+    truth[0:10], truth[10:20] = np.inf, 0.3
+    now[0:5], now[20:30] = np.inf, 0.5
+    known = colours_of(terrain, now, truth).known_of(ALL)
+    for row, colour in ((2, FOUND), (7, STILL_HIDDEN_LETHAL), (15, STILL_HIDDEN_SLOW), (25, OVERRULED)):
+        assert near(known[row, 25], colour), row
+    red, green, blue = known[35, 25].tolist()
+    assert red == green == blue, "elsewhere the relief is grey"
+
+
+@given(st.lists(st.tuples(st.integers(0, 39), st.integers(0, 49)), min_size=1, max_size=30))
+def test_a_border_lies_between_inside_and_outside_and_nowhere_else(
+    cells: list[tuple[int, int]],
+) -> None:
+    inside = np.zeros((40, 50), np.bool_)
+    inside[tuple(np.array(cells).T)] = True
+    mesh = TerrainMesh(flat())
+    strips = borders(mesh, [Area("a", "slow", np.flatnonzero(inside))])
+    drawn = {tuple(np.round(strip[:, :2] / 10).astype(int).reshape(-1).tolist()) for strip in strips}
+    padded = np.pad(inside, 1)
+    expected = set()
+    for row, col in zip(*np.nonzero(padded[:-1] != padded[1:]), strict=True):
+        expected.add((int(col) - 1, -int(row), int(col), -int(row)))
+    for row, col in zip(*np.nonzero(padded[:, :-1] != padded[:, 1:]), strict=True):
+        expected.add((int(col), -int(row) + 1, int(col), -int(row)))
+    assert drawn == expected
+    (place,) = title_places(mesh, [Area("a", "slow", np.flatnonzero(inside))])
+    assert inside[int(-place[1] // 10), int(place[0] // 10)], "a name stands inside its zone"
+
+
+def test_zones_of_a_scenario_are_drawn_by_what_they_do(tmp_path: Path) -> None:
+    file = tmp_path / "lake.geojson"
+    ring = [[100, -100], [200, -100], [200, -200], [100, -200], [100, -100]]
+    feature = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    square = "polygon_m = [[20, 20], [60, 20], [60, 60], [20, 60]]"
+    scenario = zoned(
+        f'[[cost.zones]]\nkind = "forbidden"\nname = "mines"\n{square}\n'
+        f'[[cost.zones]]\nkind = "factor"\nfactor = 3\n{square}\n'
+        f'[[cost.zones]]\nkind = "preferred"\n{square}\n'
+        f'[[cost.zones]]\nkind = "forbidden"\nname = "lake"\nfile = "{file}"\ncrs = "local"\n'
+        f'[[cost.zones]]\nkind = "forbidden"\nname = "gone"\nfile = "{tmp_path / "gone.geojson"}"\n'
+    )
+    areas = scenario_areas(scenario, flat().grid)
+    assert [(area.title, len(area.cells)) for area in areas] == [
+        ("mines: no-go", 16), ("factor: slow", 16), ("preferred: quick", 16), ("lake: no-go", 100)
+    ]  # fmt: skip
+    assert len(closed_cells(areas)) == 116
+
+
+def test_zones_of_operators_are_those_that_stand() -> None:
+    grid = flat().grid
+    replica = MapReplica(grid)
+
+    def order(name: str, tile: int, cells: list[int], kind: MarkKind, seq: int) -> MarkSet:
+        return MarkSet(
+            author=zone_author(name), group="operator", tile=tile, epoch=1, seq=seq,
+            cells=pack_column(cells, "<u2"), kinds=bytes([kind] * len(cells)),
+            paces=pack_column([0.5] * len(cells), "<f4"), stamps_ns=pack_column([1] * len(cells), "<i8"),
+        )  # fmt: skip
+
+    assert ordered_areas(replica, 10) == []
+    replica.merge([order("z1", 0, [33, 34], MarkKind.LETHAL, 1), order("z2", 1, [0], MarkKind.PACE, 1)])
+    z1, z2 = ordered_areas(replica, 10)
+    assert (z1.title, z1.cells.tolist(), z2.title, z2.cells.tolist()) == ("z1: no-go", [51, 52], "z2: pace", [32])
+    replica.merge([order("z1", 0, [], MarkKind.LETHAL, 2)])
+    assert [area.name for area in ordered_areas(replica, 10)] == ["z2"]
+
+
+@pytest.mark.parametrize(("width_cells", "text"), [(50, "100 m"), (400, "1 km"), (4100, "10 km")])
+def test_the_bar_is_as_long_as_it_says_and_the_arrow_points_north(width_cells: int, text: str) -> None:
+    margin = map_margin(TerrainMesh(terrain_of_pace(np.ones((10, width_cells), np.float32), 10.0)))
+    bar = margin.lines[0]
+    number, unit = text.split()
+    assert text in margin.texts
+    assert bar[1, 0] - bar[0, 0] == float(number) * (1000 if unit == "km" else 1)
+    foot, tip = margin.lines[4]
+    assert (tip[0], tip[2]) == (foot[0], foot[2])
+    assert tip[1] > foot[1]
+
+
+def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
+    elevation_m = np.tile(np.linspace(0, 5, 50, dtype=np.float32), (40, 1))
+    terrain = terrain_of_pace(np.ones((40, 50), np.float32), 10.0, elevation_m)
+    assert (said_heights(1.0), said_heights(3.24)) == ("heights to scale", "heights x 3.2")
+    for factor in (1.0, 2.5):
+        mesh = TerrainMesh(terrain, factor)
+        assert mesh.heights_m.max() == pytest.approx(5 * factor)
+        assert said_heights(factor) in map_margin(mesh).texts
+
+
+@pytest.mark.parametrize(
+    "groups", [["all"], ["reconnaissance", "haulage-trucks", "fire-fighters", "police-cars", "e"]]
+)
+def test_every_layer_has_a_legend(groups: list[str]) -> None:
+    layers = [PHOTO.entity, COST.entity, KNOWN.entity]
+    pictures = legends(colours_of(flat()), layers, Looks(groups, ["t0"]).legend())
+    assert set(pictures) == {"photo", "cost", "known"}
+    for picture in pictures.values():
+        image = Image.open(io.BytesIO(picture)).convert("RGB")
+        assert image.size == (WIDTH_PX, HEIGHT_PX)
+        right_edge = np.asarray(image)[:, -4:]
+        assert len(np.unique(right_edge.reshape(-1, 3), axis=0)) == 1, "nothing is cut off"

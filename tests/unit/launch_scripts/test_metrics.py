@@ -1,0 +1,261 @@
+"""Metrics are valid OpenMetrics whatever comes from the network, and say what processes said."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import threading
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from prometheus_client.openmetrics.parser import text_string_to_metric_families
+from prometheus_client.parser import text_string_to_metric_families as plain_families
+
+from launch_scripts.commands.metrics import dashboard
+from launch_scripts.metrics.endpoint import MetricsEndpoint
+from launch_scripts.metrics.exporter import Exporter
+from launch_scripts.metrics.families import HELP, Figures, Run, families, named
+from launch_scripts.report.results.counts import Counts
+from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
+from swarm.bus.scheduler import Scheduler
+from swarm.clock import NS_PER_S, ManualClock
+from swarm.errors import BusError
+from swarm.liveness import Peer
+from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters
+from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.processes import RunInfo, Stats
+from swarm.wire.topics import RUN, STATS, STATUS
+
+_BEGAN_NS = 1_790_000_000 * NS_PER_S
+
+
+def _stats(role: str, id: str, counters: Counters, life: int = _BEGAN_NS) -> Stats:
+    return Stats(
+        role=role,
+        id=id,
+        incarnation=life,
+        stamp_ns=life + NS_PER_S,
+        counts=counters.counts,
+        gauges=counters.gauges,
+        histograms={name: histogram.buckets for name, histogram in counters.histograms.items()},
+        counts_by=counters.counts_by,
+        histograms_by={
+            name: {id: each.buckets for id, each in by.items()} for name, by in counters.histograms_by.items()
+        },
+    )
+
+
+def _status(target: str) -> PlannerStatus:
+    return PlannerStatus(
+        target=target,
+        incarnation=_BEGAN_NS,
+        stamp_ns=_BEGAN_NS,
+        strategy="exact",
+        target_cell=5,
+        map_version=1,
+        tree_age_ms=250.0,
+        window=[],
+        growths=2,
+        window_growths=3,
+        growth_ms=4.0,
+        routes_served=5,
+        following=7,
+        pose_age_s=0.5,
+        tracker_lost=True,
+    )
+
+
+def _agent() -> Counters:
+    counters = Counters()
+    counters.count("messages_out", 40)
+    counters.count("ticks_late", 3)
+    counters.gauge("vehicles_following", 6)
+    for ms in (1.0, 3.0, 40.0, 20_000.0):
+        counters.observe("route_query_ms", ms)
+    counters.observe_by(GAPS_TO, "t0", 0.03)
+    return counters
+
+
+@pytest.fixture
+def figures() -> Figures:
+    counts, targets = Counts(), Counters()
+    targets.count("captures", 2)
+    targets.count_by(CAPTURES_OF, "t0")
+    counts.count(_stats("agent", "a0", _agent()))
+    counts.count(_stats("targets", "0", targets))
+    return Figures(Run("r1", "demo", _BEGAN_NS), counts, {"t0": _status("t0")}, [("agent", "a0")])
+
+
+def _scraped(
+    endpoint: MetricsEndpoint, figures: Figures, path: str = "/metrics", **headers: str
+) -> tuple[int, str]:
+    """Status and text of a scrape, answered by this thread as its owner would."""
+    found: list[tuple[int, str]] = []
+
+    def scrape() -> None:
+        host, port = endpoint.url.removeprefix("http://").split("/")[0].split(":")
+        connection = http.client.HTTPConnection(host, int(port), timeout=10)
+        connection.request("GET", path, headers=headers)
+        reply = connection.getresponse()
+        found.append((reply.status, reply.read().decode()))
+        connection.close()
+
+    visitor = threading.Thread(target=scrape)
+    visitor.start()
+    while visitor.is_alive():
+        endpoint.answer(lambda: families(figures))
+        visitor.join(0.01)
+    return found[0]
+
+
+@pytest.fixture
+def endpoint() -> Iterator[MetricsEndpoint]:
+    made = MetricsEndpoint(0)
+    yield made
+    made.close()
+
+
+def _samples(text: str) -> dict[tuple[str, ...], float]:
+    return {
+        (sample.name, *(f"{label}={value}" for label, value in sorted(sample.labels.items()))): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: Figures) -> None:
+    status, text = _scraped(endpoint, figures, accept="application/openmetrics-text; version=1.0.0")
+    found = _samples(text)
+    assert status == 200
+    assert found["swarm_run_info", "run_id=r1", "scenario=demo"] == 1
+    assert found["swarm_process_up", "id=a0", "role=agent"] == 1
+    assert found["swarm_process_up", "id=0", "role=targets"] == 0, "its token is not up"
+    assert found["swarm_messages_sent_total", "id=a0", "role=agent"] == 40
+    assert found["swarm_vehicles", "id=a0", "role=agent", "state=following"] == 6
+    assert found["swarm_target_captures_total", "target=t0"] == 1
+    assert found["swarm_target_lost", "target=t0"] == 1
+    assert found["swarm_target_tree_age_seconds", "target=t0"] == 0.25
+    query = "swarm_route_query_seconds"
+    assert found[f"{query}_count", "id=a0", "role=agent"] == 4
+    assert found[f"{query}_sum", "id=a0", "role=agent"] == pytest.approx(20.044, rel=0.02)
+    under = {key[2]: value for key, value in found.items() if key[0] == f"{query}_bucket"}
+    assert under["le=0.0005"] == 0
+    assert under["le=0.005"] == 2
+    assert under["le=10.0"] == 3, "20 s are above all bounds"
+    assert under["le=+Inf"] == 4
+
+
+def test_prometheus_of_any_age_reads_it(endpoint: MetricsEndpoint, figures: Figures) -> None:
+    _, text = _scraped(endpoint, figures)
+    assert {family.name for family in plain_families(text)} >= {"swarm_captures", "swarm_route_query_seconds"}
+
+
+def test_other_paths_and_other_sites_get_nothing(endpoint: MetricsEndpoint, figures: Figures) -> None:
+    assert _scraped(endpoint, figures, "/")[0] == 404
+    status, text = _scraped(endpoint, figures, Host="example.org")
+    assert (status, "swarm_" in text) == (403, False)
+
+
+def test_a_taken_port_is_named(endpoint: MetricsEndpoint) -> None:
+    port = int(endpoint.url.rpartition(":")[2].partition("/")[0])
+    with pytest.raises(BusError, match=f"metrics port {port} cannot be opened"):
+        MetricsEndpoint(port)
+
+
+_names = st.one_of(
+    st.text(max_size=12), st.sampled_from(["run", "process_up", "x_total", "x_count", "x", "Ä", "vehicles_"])
+)
+
+
+@given(
+    counts=st.dictionaries(_names, st.integers(0, 9), max_size=5),
+    gauges=st.dictionaries(_names, st.floats(allow_nan=False, allow_infinity=False), max_size=5),
+    histograms=st.dictionaries(
+        _names, st.dictionaries(st.integers(-300, 300), st.integers(1, 9), max_size=4), max_size=4
+    ),
+)
+def test_no_name_from_the_network_breaks_a_scrape(
+    counts: dict[str, int], gauges: dict[str, float], histograms: dict[str, dict[int, int]]
+) -> None:
+    from prometheus_client.openmetrics.exposition import generate_latest
+
+    from launch_scripts.metrics.endpoint import OneScrape
+
+    heard = Counts()
+    heard.count(
+        Stats(role="agent", id="a0", incarnation=1, stamp_ns=1, counts=counts, gauges=gauges, histograms=histograms)
+    )
+    run = Run('a"\n\\b', "demo", _BEGAN_NS)
+    text = generate_latest(OneScrape(families(Figures(run, heard, {}, [("agent", "a0")])))).decode()
+    found = _samples(text)
+    assert found["swarm_process_up", "id=a0", "role=agent"] == 1
+    assert found["swarm_run_info", 'run_id=a"\n\\b', "scenario=demo"] == 1
+
+
+def test_units_are_those_of_prometheus() -> None:
+    assert named("route_query_ms")[:2] == ("swarm_route_query_seconds", 1e-3)
+    assert named("followed_gap_excess")[0] == "swarm_followed_gap_excess_ratio"
+    assert named("bytes_out")[0] == "swarm_sent_bytes"
+    assert all(re.fullmatch(r"swarm_[a-z][a-z0-9_]*", named(name)[0]) for name in HELP)
+
+
+def test_the_dashboard_asks_for_what_is_exported() -> None:
+    board = json.loads(dashboard())
+    counters, agent = Counters(), _agent()
+    for name in HELP:
+        (agent.observe if name.endswith(("_ms", "_excess")) else counters.count)(name, 1)
+    counts = Counts()
+    counts.count(_stats("agent", "a0", agent))
+    counters.count_by(CAPTURES_OF, "t0")
+    counts.count(_stats("targets", "0", counters))
+    exported = {
+        sample.name
+        for family in families(Figures(None, counts, {"t0": _status("t0")}, []))
+        for sample in family.samples
+    }
+    asked = {
+        name
+        for panel in board["panels"]
+        for target in panel["targets"]
+        for name in re.findall(r"swarm_[a-z0-9_]+", target["expr"])
+    }
+    assert len(asked) >= 10
+    assert asked <= exported
+
+
+def test_an_exporter_goes_on_to_the_next_run() -> None:
+    scheduler = Scheduler(ManualClock(_BEGAN_NS))
+    network = MemoryNetwork(scheduler, PerfectLinks())
+    bus = network.bus("agent-a0")
+    run_id = "r1"
+
+    def answer(event: object) -> None:
+        info = RunInfo(
+            run_id=run_id, role="agent", id="a0", incarnation=1, scenario="demo", terrain="x",
+            rows=8, cols=8, resolution_m=1.0, started_ns=_BEGAN_NS,
+        )  # fmt: skip
+        event.answer(info, role="agent", id="a0")  # type: ignore[attr-defined]
+
+    bus.serve(RUN, answer, role="agent", id="a0")
+    exporter = Exporter(network.bus("metrics"))
+    bus.declare_alive(Peer("agent", "a0", 1))
+
+    def turn(seconds: float) -> None:
+        for _ in range(int(seconds * 10)):
+            exporter.listen(scheduler.clock.now_ns(), 0.0)
+            scheduler.run_until(scheduler.clock.now_ns() + NS_PER_S // 10)
+
+    bus.publish(STATS, _stats("agent", "a0", _agent(), 1), role="agent", id="a0")
+    bus.publish(STATUS, _status("t0"), target="t0")
+    turn(8)
+    figures = exporter.figures()
+    assert exporter.run == Run("r1", "demo", _BEGAN_NS)
+    assert list(figures.up) == [("agent", "a0")]
+    assert figures.counts.total("messages_out") == 40
+    run_id = "r2"
+    turn(8)
+    assert exporter.figures().run == Run("r2", "demo", _BEGAN_NS)
+    assert exporter.figures().counts.total("messages_out") is None, "another run's counts are no part of this one"

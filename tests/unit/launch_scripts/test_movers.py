@@ -1,0 +1,270 @@
+"""What moves in the live view: where it is drawn, how it looks, what it says of itself."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.details import target_details, target_labels, vehicle_details
+from launch_scripts.monitor.movers.due import Due
+from launch_scripts.monitor.movers.levels import LEVELS, level_for
+from launch_scripts.monitor.movers.looks import HUES, LOST_COLOUR, Looks, shaded
+from launch_scripts.monitor.movers.points import cell_at, label_places, target_points, vehicle_points
+from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_along
+from launch_scripts.monitor.movers.strips import Trails, poles, rings
+from launch_scripts.report.results.certified_gap import CertifiedGap
+from launch_scripts.report.run_state.state import TargetLine
+from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
+from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.clock import NS_PER_S
+from swarm.grid import walk
+from swarm.wire.messages.vehicles import VehicleState
+
+
+def hill(rows: int, cols: int) -> Terrain:
+    """Rises evenly to the east; cells of 10 m."""
+    elevation_m = np.tile(np.linspace(0, 50, cols, dtype=np.float32), (rows, 1))
+    return terrain_of_pace(np.ones((rows, cols), np.float32), 10.0, elevation_m)
+
+
+def columns(states: list[VehicleState], targets: list[int], target_ids: list[str]) -> VehicleColumns:
+    n = len(states)
+    ids = [f"a0-{each:02d}" for each in range(n)]
+    places = np.linspace(10, 100, n, dtype=np.float32), np.full(n, 20, np.float32)
+    return VehicleColumns(ids, *places, np.array(states, np.uint8), np.array(targets, np.int64), target_ids)
+
+
+# --- looks ----------------------------------------------------------------------------------------------------
+
+
+def lightness(colour: tuple[int, ...]) -> float:
+    """L* of CIELAB: what all people see alike, whatever colours they tell apart."""
+    linear = [value / 255 / 12.92 if value <= 10 else ((value / 255 + 0.055) / 1.055) ** 2.4 for value in colour]
+    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    return 116 * luminance ** (1 / 3) - 16 if luminance > 0.008856 else 903.3 * luminance
+
+
+# Simulated dichromacy, by Machado, Oliveira and Fernandes (2009), severity 1.
+DICHROMATS = {
+    "protan": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+    "deutan": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+}
+
+
+@pytest.mark.parametrize("who", DICHROMATS)
+def test_the_colour_blind_tell_groups_and_targets_apart(who: str) -> None:
+    def seen(colour: tuple[int, int, int]) -> NDArray[np.float64]:
+        linear = (np.array(colour) / 255) ** 2.2
+        return np.asarray(np.clip(np.array(DICHROMATS[who]) @ linear, 0, 1) ** (1 / 2.2) * 255)
+
+    for one, other in itertools.combinations(HUES, 2):
+        assert np.linalg.norm(seen(one) - seen(other)) > 35, (one, other)
+
+
+@pytest.mark.parametrize("hue", HUES)
+def test_brightness_says_how_a_vehicle_does(hue: tuple[int, int, int]) -> None:
+    light = {state: lightness(shaded(hue, state)) for state in VehicleState}
+    assert light[VehicleState.ARRIVED] > light[VehicleState.FOLLOWING] + 6
+    assert light[VehicleState.FOLLOWING] > light[VehicleState.WAITING] + 15
+    assert light[VehicleState.WAITING] > light[VehicleState.STRANDED] + 10
+    lost = shaded(hue, VehicleState.LOST)
+    assert max(lost) - min(lost) < 45, "grey"
+
+
+def test_with_one_group_a_vehicle_has_its_targets_colour_and_with_several_its_groups() -> None:
+    following = np.full(3, VehicleState.FOLLOWING, np.uint8)
+    one = Looks(["all"], ["t0", "t1"])
+    rows = np.array(one.rows(["t1", "t0", None]))
+    assert one.vehicles(rows, following).tolist() == [
+        list(one.target("t1")),
+        list(one.target("t0")),
+        [170, 176, 182],
+    ]
+    assert one.target("t0") != one.target("t1")
+    two = Looks(["scouts", "trucks"], ["t0", "t1"])
+    rows = np.array(two.rows(["scouts", "trucks", "strangers"]))
+    assert len({tuple(colour) for colour in two.vehicles(rows, following).tolist()}) == 3
+    assert two.target("t0") == two.target("t1")
+    assert one.target("t0", lost=True) == two.target("t0", lost=True) == LOST_COLOUR
+
+
+@pytest.mark.parametrize("groups", [["all"], ["scouts", "trucks"], [f"g{n}" for n in range(30)]])
+def test_the_legend_explains_every_state_and_kind_once(groups: list[str]) -> None:
+    legend = Looks(groups, ["t0", "t1"]).legend()
+    meanings = [look.meaning for look in legend]
+    assert len(meanings) == len(set(meanings)) <= 15
+    said = " ".join(meanings)
+    words = ("arrived", "waits", "stranded", "lost", "guest", "target", "seen", "body", "route", "alarm")
+    assert not [word for word in words if word not in said]
+
+
+# --- what a person reads --------------------------------------------------------------------------------------
+
+
+def test_who_points_at_a_vehicle_reads_who_it_is_and_what_it_does() -> None:
+    state = VehicleState
+    vehicles = columns([state.FOLLOWING, state.ARRIVED, state.STRANDED, state.WAITING], [0, 1, -1, 1], ["t0", "t1"])
+    route = RouteNow("t0", np.array([1, 2]), 1.0125, 3 * NS_PER_S)
+    groups = dict.fromkeys(vehicles.ids[:3], "all")
+    assert vehicle_details(vehicles, groups, {"a0-00": route, "a0-03": route}, 5 * NS_PER_S) == [
+        "a0-00 of all: on its way to t0; route 2 s old, certified gap 1.25%",
+        "a0-01 of all: arrived at t1",
+        "a0-02 of all: stranded",
+        "a0-03 of ?: waits for a route to t1",
+    ]
+
+
+def test_a_route_without_a_bound_claims_no_gap() -> None:
+    vehicles = columns([VehicleState.FOLLOWING], [0], ["t0"])
+    (line,) = vehicle_details(vehicles, {}, {"a0-00": RouteNow("t0", np.array([1, 2]))}, NS_PER_S)
+    assert line.endswith("route 1 s old, gap not proven")
+
+
+def test_who_points_at_a_target_reads_how_its_chase_goes() -> None:
+    line = TargetLine("t3", True, 0, 16, 420.0, 1, 1.0, captures=2, gap=CertifiedGap(1.0105), lost=False)
+    assert target_details(line) == "t3: 16 chase it, nearest at 0.4 km, captured 2 times, certified gap 1.05%"
+
+
+ids = st.sampled_from(["t0", "t1", "t2", "t3"])
+
+
+@given(st.sets(ids), st.sets(ids), st.dictionaries(ids, st.floats(0, 120)))
+def test_no_target_has_two_labels_and_none_that_is_drawn_has_none(
+    posed: set[str], lost: set[str], seen: dict[str, float]
+) -> None:
+    pins, sightings = target_labels(sorted(posed), lost, seen)
+    assert not pins.keys() & sightings.keys()
+    assert pins.keys() | sightings.keys() == posed | seen.keys()
+    for id in posed - lost:
+        assert pins[id] == id
+
+
+# --- places and lines -----------------------------------------------------------------------------------------
+
+
+def test_targets_stand_on_poles_above_the_ground_with_their_names_on_top() -> None:
+    mesh = TerrainMesh(hill(20, 20))
+    targets = target_points(mesh, {"t0": (50.0, 60.0)})
+    pole = poles(mesh, targets).line(0)
+    assert pole[:, :2].tolist() == [[50.0, -60.0], [50.0, -60.0]]
+    assert pole[0, 2] < pole[1, 2] < label_places(mesh, targets)[0, 2]
+
+
+def test_nobody_there_is_nothing_to_draw() -> None:
+    mesh = TerrainMesh(hill(20, 20))
+    assert vehicle_points(mesh, gathered([])).positions.shape == (0, 3)
+    assert len(poles(mesh, target_points(mesh, {}))) == 0
+    assert len(RouteLines(mesh, 3).lines([])) == 0
+    assert len(rings(mesh, np.empty((0, 3), np.float32), np.empty(0, np.float32))) == 0
+
+
+def test_a_ring_lies_on_the_ground_around_its_middle() -> None:
+    mesh = TerrainMesh(hill(40, 40))
+    ring = rings(mesh, np.array([[200, -200, 0]], np.float32), np.array([50], np.float32)).line(0)
+    assert np.hypot(ring[:, 0] - 200, ring[:, 1] + 200) == pytest.approx(np.full(len(ring), 50.0), abs=0.01)
+    assert ring[0] == pytest.approx(ring[-1], abs=0.01)
+    assert ring[:, 2].max() > ring[:, 2].min(), "the ground rises"
+
+
+def test_what_is_left_of_a_route_begins_where_the_vehicle_is() -> None:
+    route = RouteNow("t0", np.array([1, 2, 3, 4]))
+    assert route.ahead_of(3).tolist() == [3, 4]
+    assert route.ahead_of(9).tolist() == [1, 2, 3, 4]
+
+
+def test_the_cells_of_a_route_are_those_of_a_walk_along_it_and_none_off_the_map() -> None:
+    grid = hill(10, 20).grid
+    directions = bytes([2, 2, 3, 4, 4, 5])
+    cells = cells_along(grid, 41, directions)
+    assert cells is not None
+    assert cells.tolist() == walk(grid, 41, directions)
+    alone = cells_along(grid, 41, b"")
+    assert alone is not None
+    assert alone.tolist() == [41]
+    for start, wrong in ((0, bytes([0])), (19, bytes([2])), (200, b""), (-1, b""), (41, bytes([8]))):
+        assert cells_along(grid, start, wrong) is None
+
+
+def on_tree(parents: list[int], start: int) -> list[int]:
+    """From a node to the root, node 0."""
+    way = [start]
+    while way[-1] != 0:
+        way.append(parents[way[-1]])
+    return way
+
+
+@given(st.data())
+def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.DataObject) -> None:
+    """Against the slow twin: all edges of all routes."""
+    nodes = 60
+    parents = [0, *(data.draw(st.integers(0, n - 1)) for n in range(1, nodes))]
+    starts = data.draw(st.lists(st.integers(0, nodes - 1), max_size=12))
+    mesh = TerrainMesh(hill(1, nodes))
+    routes = [np.array(on_tree(parents, start)) for start in starts]
+    lines = RouteLines(mesh, 1)
+    for _ in range(2):  # what was drawn before leaves nothing behind
+        strips = lines.lines(routes)
+        drawn = []
+        for n in range(len(strips)):
+            cells = (strips.line(n)[:, 0] / 10 - 0.5).round().astype(int).tolist()
+            drawn += list(itertools.pairwise(cells))
+        assert len(drawn) == len(set(drawn))
+        assert set(drawn) == {edge for route in routes for edge in itertools.pairwise(route.tolist())}
+
+
+@pytest.mark.parametrize("length", [2, 3, 4, 7, 8, 1000])
+def test_a_route_is_drawn_with_fewer_points_that_keep_its_ends(length: int) -> None:
+    line = RouteLines(TerrainMesh(hill(1, 1000)), 3).lines([np.arange(length)]).line(0)
+    assert len(line) == -(-(length - 1) // 3) + 1
+    assert (line[0, 0], line[-1, 0]) == (5.0, length * 10 - 5.0)
+
+
+def test_a_trail_grows_by_what_was_driven_and_breaks_where_something_jumped() -> None:
+    trails = Trails(longest_m=100.0)
+
+    def at(*east_m: float) -> NDArray[np.float32]:
+        return np.array([[e, 0, 0] for e in east_m], np.float32)
+
+    assert len(trails.advance(["a", "b"], at(0, 0))[0]) == 0
+    strips, moved = trails.advance(["a", "b"], at(10, 0))
+    assert strips.line(0)[:, 0].tolist() == [0, 10]
+    assert moved.tolist() == [True, False]
+    assert len(trails.advance(["a", "b"], at(500, 0))[0]) == 0
+    strips, moved = trails.advance(["c", "a"], at(7, 510))
+    assert strips.line(0)[:, 0].tolist() == [500, 510]
+    assert moved.tolist() == [False, True]
+
+
+def test_a_place_outside_the_grid_is_taken_for_the_nearest_cell() -> None:
+    grid = hill(10, 20).grid
+    assert cell_at(grid, 15.0, 25.0) == 2 * 20 + 1
+    assert cell_at(grid, -1.0, 1e6) == 9 * 20
+
+
+# --- how much and how often -----------------------------------------------------------------------------------
+
+
+def test_the_more_vehicles_the_less_is_drawn_of_each() -> None:
+    assert level_for(0) is LEVELS[0]
+    assert level_for(10**6) is LEVELS[-1]
+    for fine, coarse in itertools.pairwise(LEVELS):
+        assert fine.most < coarse.most
+        for name in ("radius_px", "line_px", "trail_s", "names"):
+            assert getattr(fine, name) >= getattr(coarse, name), name
+        for name in ("frames", "trail_every_s", "details_s", "routes_s", "route_stride"):
+            assert getattr(fine, name) <= getattr(coarse, name), name
+
+
+def test_what_is_due_is_due_once_in_its_time() -> None:
+    due = Due({"often": 0.5, "seldom": 2.0})
+    times_s = np.arange(0, 10, 0.1)
+    often = [t for t in times_s if due.now("often", int(round(t, 1) * NS_PER_S))]
+    seldom = [t for t in times_s if due.now("seldom", int(round(t, 1) * NS_PER_S))]
+    assert len(often) == 20
+    assert len(seldom) == 5
