@@ -39,7 +39,7 @@ class TrueTerrain:
     """True pace of every cell, and the steps that are possible."""
 
     def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32]) -> None:
-        # Imported here: it takes as long as all else that the roles of a run share, and one process of them needs it.
+        # Imported here: it takes as long as all else that a run's roles share, and one process of them needs it.
         from scipy.ndimage import label
 
         self.grid = grid
