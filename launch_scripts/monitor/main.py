@@ -33,7 +33,12 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_bus(setup.scenario.network, patient=True))
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
-        blueprint = make_blueprint(mesh, vehicles=setup.scenario.vehicle_count, knows_truth=knows_truth)
+        blueprint = make_blueprint(
+            mesh,
+            vehicles=setup.scenario.vehicle_count,
+            knows_truth=knows_truth,
+            follow=setup.scenario.monitor.follow,
+        )
         sinks = Sinks(recording_id, path, config, blueprint)
         stack.callback(sinks.close)
         service = MonitorService(

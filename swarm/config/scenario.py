@@ -496,12 +496,14 @@ class MonitorConfig(Section, frozen=True, kw_only=True):
     web_port   loopback port of the page, for browsers; 0 is any free one
 
     height_factor  how many times as high as they are heights are drawn; chosen by the relief if absent
+    follow         vehicle or target that the camera follows; none if absent
     """
 
     live: bool = True
     grpc_port: Annotated[int, Meta(ge=0, le=65535)] = 9876
     web_port: Annotated[int, Meta(ge=0, le=65535)] = 9090
     height_factor: Annotated[float, Meta(gt=0, le=100)] | None = None
+    follow: str | None = None
 
 
 class Scenario(Section, frozen=True, kw_only=True):
