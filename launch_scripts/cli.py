@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import os
 import signal
 import sys
 import time
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.exceptions import TyperException
 
-from launch_scripts.commands import query, roles
+from launch_scripts.command_line import complete, usage
+from launch_scripts.command_line.families import CONTEXT, Family, rooted
+from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
+from launch_scripts.commands import afterwards, before, chaos, query, roles
 from launch_scripts.commands.orders import orders
-from launch_scripts.commands.shared_options import AsJson, Namespace, RunOptions, Runs, Tls, spread
-from swarm.errors import StoreError, SwarmError
+from launch_scripts.commands.shared_options import (
+    AsJson,
+    Namespace,
+    RunOptions,
+    Runs,
+    ScenarioArgument,
+    Tls,
+    spread,
+)
+from swarm.config.explain import choice
+from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.ranks import HIGHEST_RANK
 
 
@@ -31,14 +44,31 @@ def _began_s() -> float:
     return time.monotonic() - age_s
 
 
+FAMILIES = [
+    Family("terrain", "launch_scripts.commands.terrain.terrain", "Look at terrains, and find routes.", PREPARE),
+    Family("plugins", "launch_scripts.commands.plugins", "Your own sensors, walks, and so on.", PREPARE),
+    Family("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store.", LEFT),
+    Family("zone", "launch_scripts.commands.orders.zone", "Close areas while the swarm runs.", ORDER),
+    Family("target", "launch_scripts.commands.orders.target", "Add, move and remove targets.", ORDER),
+    Family("vehicle", "launch_scripts.commands.orders.guests", "Add, remove and stop vehicles.", ORDER),
+    Family("deploy", "launch_scripts.commands.deploy", "Certificates and zenohd, for several machines.", ADMIN),
+    Family("bench", "launch_scripts.bench.cli", "Measure: the paper's tables, scale, the wire.", ADMIN),
+]
+"""Sub-commands which have sub-commands of their own, imported when they are called."""
+
 app = typer.Typer(
     name="swarm",
+    cls=rooted(FAMILIES),
     help="""A swarm of vehicles chases moving targets over real terrain.
 
 For every target a planner keeps the tree of cheapest paths to it; vehicles
 follow their routes and mark what the map did not know; all meet on Zenoh.
 
     swarm demo                         the whole swarm, for a minute
+
+    swarm new my.toml                  asks, and writes a scenario of your own
+
+    swarm check my.toml                what is wrong with it, before it runs
 
     swarm up my.toml --port 0          your scenario, on free ports
 
@@ -47,17 +77,13 @@ follow their routes and mark what the map did not know; all meet on Zenoh.
     swarm route --target t3 --row 40 --col 200
 
     swarm simulate jacksboro --seed 7  in one process, faster than real time
+
+`swarm COMMAND -h` explains a command; `swarm --install-completion` lets the Tab key complete them.
 """,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=CONTEXT,
 )
-
-ScenarioArgument = Annotated[
-    str,
-    typer.Argument(metavar="SCENARIO", help="A .toml file, or the name of a built-in scenario such as jacksboro."),
-]
 
 
 def _version(wanted: bool) -> None:
@@ -75,18 +101,20 @@ def _root(
     pass
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 @spread
 def demo(run: RunOptions) -> None:
     """Run the whole swarm on real mountains: 100 vehicles, 10 targets, 18 processes.
 
     The same as `swarm up jacksboro`. Stops after --seconds, or on Ctrl-C, and leaves runs/RUN/ with run.rrd,
-    report.json, report.png and a log file per process.
+    report.html, report.json, report.png and a log file per process.
+
+    swarm demo --seconds 20 --port 0
     """
     _up("jacksboro", run)
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 @spread
 def up(
     scenario: ScenarioArgument,
@@ -94,14 +122,25 @@ def up(
     tls: Tls,
     connect: Annotated[
         str | None,
-        typer.Option(help="Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here."),
+        typer.Option(
+            help="Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here.",
+            rich_help_panel=NETWORK,
+        ),
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(help="Where the router listens too, for other machines, such as tls/0.0.0.0:7448."),
+        typer.Option(
+            help="Where the router listens too, for other machines, such as tls/0.0.0.0:7448.",
+            rich_help_panel=NETWORK,
+        ),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option(help="Start only this role; may be given several times.")
+        list[str] | None,
+        typer.Option(
+            help="Start only this role; may be given several times.",
+            rich_help_panel=PART,
+            autocompletion=complete.words("launch_scripts.process_table", "ROLES"),
+        ),
     ] = None,
     rank: Annotated[
         int | None,
@@ -109,10 +148,14 @@ def up(
             min=0,
             max=HIGHEST_RANK,
             help="Of planners and the targets process, start those of this rank: 0 lead, 1 stand by, and so on.",
+            rich_help_panel=PART,
         ),
     ] = None,
     run_id: Annotated[
-        str | None, typer.Option(help="Take part in this run; by default a new one, or the one in the namespace.")
+        str | None,
+        typer.Option(
+            help="Take part in this run; by default a new one, or the one in the namespace.", rich_help_panel=PART
+        ),
     ] = None,
     namespace: Namespace = None,
 ) -> None:
@@ -153,7 +196,6 @@ def _up(
     from launch_scripts.launcher import options
     from launch_scripts.launcher.up import UpOptions, run_swarm
     from launch_scripts.process_table import ROLES
-    from swarm.errors import ConfigError
 
     scenario = options.find_scenario(name)
     if run.port is not None:
@@ -175,7 +217,7 @@ def _up(
     )
     for role in only or ():
         if role not in ROLES:
-            raise ConfigError(f"--only: no role {role!r}; the roles are {', '.join(ROLES)}")
+            raise ConfigError(f"--only: no role {role!r}{choice(role, ROLES, ' the roles are ')}")
     roles = tuple(role for role in ROLES if not only or role in only)
     if connect is not None:
         roles = tuple(role for role in roles if role != "router")
@@ -195,7 +237,7 @@ def _up(
     raise typer.Exit(run_swarm(chosen))
 
 
-@app.command()
+@app.command(rich_help_panel=RUN)
 def simulate(
     scenario: Annotated[
         str | None,
@@ -203,6 +245,7 @@ def simulate(
             metavar="SCENARIO",
             help="A .toml file or a built-in name; with --seeds also a small world: small, wide, open, doors, "
             "corridor, maze. With --seeds and without a name each seed takes the next of these worlds.",
+            autocompletion=complete.scenarios_and_worlds,
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = None,
@@ -231,7 +274,6 @@ def simulate(
     swarm simulate doors --seeds 17:18
     """
     from launch_scripts.commands.simulate import simulate_once, simulate_seeds
-    from swarm.errors import ConfigError
 
     if seeds is None:
         if scenario is None:
@@ -244,163 +286,18 @@ def simulate(
         raise typer.Exit(1)
 
 
-@app.command()
-def chaos(
-    scenario: Annotated[
-        str, typer.Argument(metavar="SCENARIO", help="A .toml file, or the name of a built-in scenario.")
-    ] = "besieged",
-    seconds: Annotated[float | None, typer.Option(min=1, help="End after so many seconds.")] = None,
-    messages: Annotated[
-        int | None, typer.Option(min=1, help="End once so many hostile messages have been sent.")
-    ] = None,
-    blow: Annotated[
-        list[str] | None, typer.Option(help="Only this: kill, hang or messages; may be given several times.")
-    ] = None,
-    hostile: Annotated[
-        list[str] | None,
-        typer.Option(help="Only these messages: flipped, numbers, replayed or lies; may be given several times."),
-    ] = None,
-    spare: Annotated[
-        list[str] | None, typer.Option(help="Say nothing hostile under this topic; may be given several times.")
-    ] = None,
-    every: Annotated[float, typer.Option(min=1, help="Seconds from one blow to the next, at least.")] = 10.0,
-    within: Annotated[
-        float, typer.Option(min=0.1, help="Recovering later than so many seconds breaks a law.")
-    ] = 10.0,
-    seed: Annotated[int, typer.Option(min=0, max=2**53, help="Decides the blows and their order.")] = 1,
-    runs: Runs = Path("runs"),
-    as_json: AsJson = False,
-) -> None:
-    """Start a swarm on this machine, strike it, and measure how soon it recovers.
-
-    Processes are killed (kill -9 of one or two) or stopped for a while, and messages are said with flipped bits,
-    hostile numbers, replayed, or as well-formed lies. Lasts a minute unless --seconds or --messages say more. Exit
-    code 1 if a process ended by itself, vehicles did not recover in time or met, or memory grew. Leaves chaos.json
-    and chaos.png in the run's folder.
-
-    swarm chaos --seconds 60
-
-    swarm chaos --blow kill --every 10 --seconds 3600
-
-    swarm chaos --blow messages --messages 1000000
-    """
-    from launch_scripts.chaos.blows import BLOWS
-    from launch_scripts.chaos.hostile import KINDS
-    from launch_scripts.chaos.siege import SiegeOptions
-    from launch_scripts.commands import chaos as command
-    from swarm.wire.topics import TOPICS
-
-    if seconds is None and messages is None:
-        seconds = 60.0
-    options = SiegeOptions(
-        scenario=scenario,
-        seconds=seconds,
-        messages=messages,
-        seed=seed,
-        every_s=every,
-        kinds=command.check_kinds("--blow", blow, BLOWS),
-        hostile=command.check_kinds("--hostile", hostile, KINDS),
-        spared=command.check_kinds("--spare", spare, tuple(topic.name for topic in TOPICS)) if spare else (),
-        within_s=within,
-        runs=runs,
-    )
-    if not command.chaos(options, as_json):
-        raise typer.Exit(1)
-
-
-@app.command()
-def compare(
-    run: Annotated[list[str], typer.Argument(metavar="RUN...", help="Folders of runs, or their names in --runs.")],
-    runs: Runs = Path("runs"),
-    as_json: AsJson = False,
-) -> None:
-    """Show what differs between runs: settings, versions and machines, and all figures beside each other.
-
-    Where a run listened is left out: free ports differ each time.
-
-    swarm compare 20261122-154115-44bb LAST
-    """
-    from launch_scripts.commands.compare import compare_runs
-
-    compare_runs(run, runs, as_json)
-
-
+app.add_typer(before.app)
+app.add_typer(chaos.app)
+app.add_typer(afterwards.app)
 app.add_typer(roles.app)
 app.add_typer(query.app)
 app.add_typer(orders.app)
 
 
-MOUNTED: dict[str, str] = {}
-"""Name -> module of each sub-command which has sub-commands of its own."""
-
-
-@app.command()
-def replay(
-    run: Annotated[
-        str, typer.Argument(metavar="RUN", help="A run's folder, its name in --runs, or LAST.")
-    ] = "LAST",
-    process: Annotated[str | None, typer.Option(help="Only this process, such as planner-t3.")] = None,
-    until: Annotated[
-        float | None, typer.Option(min=0, help="Only so many seconds from the start of the run, by its own clock.")
-    ] = None,
-    keep: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Copy what is replayed into a folder: a test case.")
-    ] = None,
-    runs: Runs = Path("runs"),
-    as_json: AsJson = False,
-) -> None:
-    """Feed what the processes of a run heard to the services of this build, and say where their outputs first
-    differ.
-
-    swarm demo --record-inputs, then swarm replay
-
-    swarm replay LAST --process planner-t3 --until 34.5 --keep my-case
-
-    A simulated run is always recorded. Exit code 1 if any output differs or a recording cannot be replayed.
-    """
-    from launch_scripts.commands.replay import replay_one
-
-    if not replay_one(run, runs, process, until, keep, as_json):
-        raise typer.Exit(1)
-
-
-def _mount(name: str, module: str, help: str) -> None:
-    """Adds a sub-command whose own typer app is imported when it is called."""
-
-    def forward(ctx: typer.Context) -> None:
-        sub_app: Any = importlib.import_module(module).app
-        sub_app(args=ctx.args, prog_name=f"swarm {name}")
-
-    forward.__doc__ = help
-    MOUNTED[name] = module
-    app.command(
-        name,
-        context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []},
-        add_help_option=False,
-    )(forward)
-
-
-_mount(
-    "bench", "launch_scripts.bench.cli", "Measure: the paper's tables, scale, the wire. See `swarm bench --help`."
-)
-_mount("terrain", "launch_scripts.commands.terrain.terrain", "Look at terrains. See `swarm terrain --help`.")
-_mount("map", "launch_scripts.commands.map", "Look at shared maps and the keeper's store. See `swarm map --help`.")
-_mount("report", "launch_scripts.commands.report", "What runs have left. See `swarm report --help`.")
-_mount("zone", "launch_scripts.commands.orders.zone", "Close areas while the swarm runs. See `swarm zone --help`.")
-_mount(
-    "target", "launch_scripts.commands.orders.target", "Add, move and remove targets. See `swarm target --help`."
-)
-_mount(
-    "vehicle", "launch_scripts.commands.orders.guests", "Add, remove and stop vehicles. See `swarm vehicle --help`."
-)
-_mount(
-    "plugins", "launch_scripts.commands.plugins", "Your own sensors, walks, and so on. See `swarm plugins --help`."
-)
-_mount(
-    "deploy",
-    "launch_scripts.commands.deploy",
-    "Certificates and zenohd, for several machines. See `swarm deploy --help`.",
-)
+@cache
+def command() -> Any:
+    """The command with all of its sub-commands."""
+    return typer.main.get_command(app)
 
 
 def main() -> int:
@@ -409,9 +306,16 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         try:
-            app(prog_name="swarm")
+            code = command().main(prog_name="swarm", standalone_mode=False)
         finally:
             sys.stdout.flush()
+    except TyperException as error:
+        if said := usage.sentence(error):
+            print(f"swarm: {said}", file=sys.stderr)
+        return ConfigError.exit_code
+    except typer.Abort:
+        print("swarm: stopped; nothing is written", file=sys.stderr)
+        return 1
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
@@ -424,7 +328,7 @@ def main() -> int:
         _leave_output()
         print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
         return StoreError.exit_code
-    return 0
+    return code if isinstance(code, int) else 0
 
 
 def _leave_output() -> None:

@@ -18,6 +18,7 @@ from planner_service.strategy import Growths, StrategyWorld, strategy_of
 from planner_service.target_tree import TargetTree
 from shared_map.arrays import Floats
 from shared_map.terrain.cost_layers import CostWorld, checked_layer, cost_world
+from swarm.config.explain import choice
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ConfigError, SwarmError
@@ -70,7 +71,7 @@ def check_plugin(
     One sentence for each broken promise; empty if the plug-in keeps all.
     """
     if kind not in PLUGIN_KINDS:
-        raise ConfigError(f"no kind of plug-in {kind!r}: it is one of {', '.join(PLUGIN_KINDS)}")
+        raise ConfigError(f"no kind of plug-in {kind!r}{choice(kind, list(PLUGIN_KINDS))}")
     named = NamedPlugin(PLUGIN_KINDS[kind], kind, name, options or {})
     broken: dict[str, None] = {}
     try:

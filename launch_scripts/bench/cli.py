@@ -220,7 +220,10 @@ def directed(
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
-    """Trees, windows and repairs where uphill is not downhill (cost.directional), beside those where it is."""
+    """Trees, windows and repairs where uphill is not downhill (cost.directional), beside those where it is.
+
+    swarm bench directed --json
+    """
     from launch_scripts.bench.planning.directed import run
 
     show(run(numbers_of(sizes, "sizes", 16), repeats, seed), as_json)
@@ -255,7 +258,10 @@ def terrain(
     degrees: Annotated[bool, typer.Option("--degrees", help="Files in degrees, which have to be warped.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Elevation and photo to cost: seconds and memory, beside a plain pass."""
+    """Elevation and photo to cost: seconds and memory, beside a plain pass.
+
+    swarm bench terrain --json
+    """
     from launch_scripts.bench.terrain import run
 
     with progress_of("terrain") as progress:

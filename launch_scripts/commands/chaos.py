@@ -4,16 +4,98 @@ from __future__ import annotations
 
 import json
 import signal
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from launch_scripts.command_line import complete
+from launch_scripts.command_line.panels import RUN
+from launch_scripts.commands.shared_options import AsJson, Runs
 
 if TYPE_CHECKING:
     from launch_scripts.chaos.siege import SiegeOptions
     from launch_scripts.chaos.tally import Tally
 
+app = typer.Typer()
 
-def chaos(options: SiegeOptions, as_json: bool) -> bool:
+
+@app.command(rich_help_panel=RUN)
+def chaos(
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO",
+            help="A .toml file, or the name of a built-in scenario.",
+            autocompletion=complete.scenarios,
+        ),
+    ] = "besieged",
+    seconds: Annotated[float | None, typer.Option(min=1, help="End after so many seconds.")] = None,
+    messages: Annotated[
+        int | None, typer.Option(min=1, help="End once so many hostile messages have been sent.")
+    ] = None,
+    blow: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only this: kill, hang or messages; may be given several times.",
+            autocompletion=complete.words("launch_scripts.chaos.blows", "BLOWS"),
+        ),
+    ] = None,
+    hostile: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only these messages: flipped, numbers, replayed or lies; may be given several times.",
+            autocompletion=complete.words("launch_scripts.chaos.hostile", "KINDS"),
+        ),
+    ] = None,
+    spare: Annotated[
+        list[str] | None, typer.Option(help="Say nothing hostile under this topic; may be given several times.")
+    ] = None,
+    every: Annotated[float, typer.Option(min=1, help="Seconds from one blow to the next, at least.")] = 10.0,
+    within: Annotated[
+        float, typer.Option(min=0.1, help="Recovering later than so many seconds breaks a law.")
+    ] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, max=2**53, help="Decides the blows and their order.")] = 1,
+    runs: Runs = Path("runs"),
+    as_json: AsJson = False,
+) -> None:
+    """Start a swarm on this machine, strike it, and measure how soon it recovers.
+
+    Processes are killed (kill -9 of one or two) or stopped for a while, and messages are said with flipped bits,
+    hostile numbers, replayed, or as well-formed lies. Lasts a minute unless --seconds or --messages say more. Exit
+    code 1 if a process ended by itself, vehicles did not recover in time or met, or memory grew. Leaves chaos.json
+    and chaos.png in the run's folder.
+
+    swarm chaos --seconds 60
+
+    swarm chaos --blow kill --every 10 --seconds 3600
+
+    swarm chaos --blow messages --messages 1000000
+    """
+    from launch_scripts.chaos.blows import BLOWS
+    from launch_scripts.chaos.hostile import KINDS
+    from launch_scripts.chaos.siege import SiegeOptions
+    from swarm.wire.topics import TOPICS
+
+    if seconds is None and messages is None:
+        seconds = 60.0
+    options = SiegeOptions(
+        scenario=scenario,
+        seconds=seconds,
+        messages=messages,
+        seed=seed,
+        every_s=every,
+        kinds=check_kinds("--blow", blow, BLOWS),
+        hostile=check_kinds("--hostile", hostile, KINDS),
+        spared=check_kinds("--spare", spare, tuple(topic.name for topic in TOPICS)) if spare else (),
+        within_s=within,
+        runs=runs,
+    )
+    if not besiege(options, as_json):
+        raise typer.Exit(1)
+
+
+def besiege(options: SiegeOptions, as_json: bool) -> bool:
     """Besiege a swarm, print what came of it. True if every law held."""
     from launch_scripts.chaos.picture import draw
     from launch_scripts.chaos.siege import Siege
@@ -49,11 +131,12 @@ def _interrupt(number: int, frame: object) -> None:
 
 def check_kinds(option: str, given: list[str] | None, known: tuple[str, ...]) -> tuple[str, ...]:
     """What an option that may be given several times names; all if it is not given. Raises ConfigError."""
+    from swarm.config.explain import choice
     from swarm.errors import ConfigError
 
     for each in given or ():
         if each not in known:
-            raise ConfigError(f"{option}: no {each!r}; there are {', '.join(known)}")
+            raise ConfigError(f"{option}: no {each!r}{choice(each, known, ' there are ')}")
     return tuple(given or known)
 
 

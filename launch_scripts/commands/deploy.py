@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from launch_scripts.command_line import complete
 from launch_scripts.commands.shared_options import Namespace, Tls, spread
 from swarm.errors import ConfigError, StoreError
 
@@ -29,7 +30,10 @@ def certs(
     ] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(help="Make those that its processes lack, too, and number anew what it revokes."),
+        typer.Option(
+            help="Make those that its processes lack, too, and number anew what it revokes.",
+            autocompletion=complete.scenarios,
+        ),
     ] = None,
     days: Annotated[int, typer.Option(min=1, max=3650, help="Days until they expire.")] = 365,
     renew: Annotated[bool, typer.Option(help="Replace existing certificates of the names given.")] = False,
@@ -102,7 +106,10 @@ def zenohd(
     peer: Annotated[list[str] | None, typer.Option(help="Another router to connect to.")] = None,
     namespace: Namespace = None,
     scenario: Annotated[
-        str | None, typer.Option(help="Whose processes may take part: needed with certificates.")
+        str | None,
+        typer.Option(
+            help="Whose processes may take part: needed with certificates.", autocompletion=complete.scenarios
+        ),
     ] = None,
     plugins: Annotated[
         Path | None, typer.Option(help="Folder with libzenoh_plugin_storage_manager.so, to store marks, too.")

@@ -38,7 +38,10 @@ def _read(path: Path) -> tuple[str, GridSpec, list[MarkSet]]:
 
 @app.command()
 def inspect(store: Store, as_json: AsJson = False) -> None:
-    """Show what a store holds, by author."""
+    """Show what a store holds, by author.
+
+    swarm map inspect runs/LAST/map.sqlite
+    """
     terrain, grid, sets = _read(store)
     _, kind = stored_marks.to_bands(grid, sets, time.time_ns())
     authors: dict[str, list[MarkSet]] = {}
@@ -96,7 +99,12 @@ def export(
     store: Store,
     out: Annotated[Path, typer.Argument(help=".json: every set; .tif, .gpkg, .geojson: the winners.")],
 ) -> None:
-    """Write the marks of a store: all of them as JSON, which can be imported; the winners as pixels or polygons."""
+    """Write the marks of a store: all of them as JSON, which can be imported; the winners as pixels or polygons.
+
+    swarm map export runs/LAST/map.sqlite marks.json
+
+    swarm map export runs/LAST/map.sqlite marks.gpkg
+    """
     terrain, grid, sets = _read(store)
     kind_of_file = out.suffix.lower()
     try:
@@ -129,7 +137,10 @@ def import_(
     file: Annotated[Path, typer.Argument(help="A .json file of `swarm map export`.")],
     store: Annotated[Path, typer.Argument(help="The store; made if missing.")],
 ) -> None:
-    """Import exported marks into a store, where they merge with those it holds. No keeper may use it meanwhile."""
+    """Import exported marks into a store, where they merge with those it holds. No keeper may use it meanwhile.
+
+    swarm map import marks.json my.sqlite
+    """
     terrain, grid, sets = stored_marks.from_json(read_bytes(file, FileKind.EXPORTED_MAP))
     with KeeperStore(store) as into:
         into.bind(terrain, grid)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from launch_scripts.command_line import complete
 from swarm.errors import ConfigError
 
 app = typer.Typer(no_args_is_help=True, help="List plug-ins, and check one of your own.")
@@ -15,7 +16,10 @@ app = typer.Typer(no_args_is_help=True, help="List plug-ins, and check one of yo
 
 @app.command(name="list")
 def list_plugins() -> None:
-    """Print every name that a scenario may use, by kind: those built in, and those of installed packages."""
+    """Print every name that a scenario may use, by kind: those built in, and those of installed packages.
+
+    swarm plugins list
+    """
     from swarm.config.plugin_names import PLUGIN_KINDS, installed
 
     for kind in PLUGIN_KINDS.values():
@@ -29,7 +33,13 @@ def list_plugins() -> None:
 
 @app.command()
 def check(
-    kind: Annotated[str, typer.Argument(help="sensor, walk, cost_layer, assignment, strategy or dynamics.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="sensor, walk, cost_layer, assignment, strategy or dynamics.",
+            autocompletion=complete.words("swarm.config.plugin_names", "PLUGIN_KINDS"),
+        ),
+    ],
     name: Annotated[str, typer.Argument(help="As in a scenario: module:Name, or an installed one's name.")],
     options: Annotated[str, typer.Option(help="Its options, as a JSON object.")] = "{}",
     folder: Annotated[Path, typer.Option(help="Where its module lies, if it is not installed.")] = Path(),
@@ -44,7 +54,9 @@ def check(
     try:
         table = json.loads(options)
     except ValueError as error:
-        raise ConfigError(f"--options: {error}; expected a JSON object") from error
+        raise ConfigError(
+            f"--options: found {options[:40]!r}, expected a JSON object: {str(error).lower()}"
+        ) from error
     if not isinstance(table, dict):
         raise ConfigError(f"--options: found {options[:40]!r}, expected a JSON object")
     broken = check_plugin(kind, name, table, str(folder), range(seeds))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch_scripts.command_line import complete, panels
 from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, spread
 
 if TYPE_CHECKING:
@@ -26,8 +27,10 @@ _STATUS_LISTEN_S = 1.5
 class Where:
     """Router and namespace of the swarm that a command asks."""
 
-    connect: Annotated[str, typer.Option(help="The router's endpoint.")] = "tcp/127.0.0.1:7447"
-    namespace: Annotated[str, typer.Option(help="Prefix of all keys.")] = "swarm"
+    connect: Annotated[str, typer.Option(help="The router's endpoint.", rich_help_panel=panels.NETWORK)] = (
+        "tcp/127.0.0.1:7447"
+    )
+    namespace: Annotated[str, typer.Option(help="Prefix of all keys.", rich_help_panel=panels.NETWORK)] = "swarm"
 
     def network(self, tls: Tls) -> NetworkConfig:
         import msgspec
@@ -49,7 +52,9 @@ class Where:
 def route(
     where: Where,
     tls: Tls,
-    target: Annotated[str | None, typer.Option(help="The target, such as t3.")] = None,
+    target: Annotated[
+        str | None, typer.Option(help="The target, such as t3.", autocompletion=complete.target_ids)
+    ] = None,
     row: Annotated[int | None, typer.Option(help="Row of the start, counted from the north.")] = None,
     col: Annotated[int | None, typer.Option(help="Column of the start, counted from the west.")] = None,
     steps: Annotated[int, typer.Option(min=0, help="Most steps to show; 1 is the next, 0 is all.")] = 0,
@@ -143,7 +148,12 @@ def _route_on_terrain(
 @app.command(rich_help_panel=_PANEL)
 @spread
 def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong."""
+    """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
+
+    swarm status
+
+    swarm status --json | jq .planners
+    """
     from rich.console import Console
 
     from launch_scripts.commands.running.status import StatusWatch, print_status, status_fields

@@ -1,53 +1,36 @@
-"""`swarm report`: what a run has left, for other programs."""
+"""`swarm report` and `swarm export`: what a run has left, for people and for other programs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from launch_scripts.commands.shared_options import Runs
-
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+from launch_scripts.report.results.run_folder import find_run
+from swarm.errors import ConfigError
 
 
-@app.callback()
-def _root() -> None:
-    """Look at what runs have left."""
+def write_report_page(run: str, runs: Path) -> None:
+    """Write a run's page again. Raises ConfigError or StoreError in one sentence."""
+    from launch_scripts.report.page.run_page import write_page
+
+    print(write_page(find_run(run, runs)))
 
 
-@app.command()
-def export(
-    run: Annotated[str, typer.Argument(help="A run's folder, or its name in --runs.")],
-    out: Annotated[Path, typer.Option(help="Write .gpkg (layers, in the map's metres) or .geojson (WGS 84).")],
-    runs: Runs = Path("runs"),
+def export_from(
+    run: str, runs: Path, what: Sequence[str], format: str, out: Path | None, force: bool, gif: bool
 ) -> None:
-    """Write the tracks, captures and marks of a run for a GIS.
+    """Write files of a run. Raises ConfigError or StoreError in one sentence."""
+    from launch_scripts.report.geo.run_export import FORMATS, WHAT, export_run
 
-    Layers: vehicle_tracks and target_tracks (lines, with the time of each point), captures (points), marks
-    (polygons of cells that say the same). The times are the property times of a GeoJSON's lines; a GeoPackage has
-    points with times, too: vehicle_places and target_places.
-
-    swarm report export runs/LAST --out run.gpkg
-    """
-    from launch_scripts.report.geo.geo_layers import check_layer_file, track_layers, write_layers
-    from launch_scripts.report.geo.track_file import TRACKS_FILE, read_tracks
-    from launch_scripts.report.results.run_folder import find_run
-    from shared_map.terrain.places import MapFrame
-    from swarm.errors import ConfigError
-
-    check_layer_file(out)
+    for option, given, allowed in (("--what", what, tuple(WHAT)), ("--format", [format], FORMATS)):
+        for each in given:
+            if each not in allowed:
+                raise ConfigError(f"{option} is {each!r}; expected one of {', '.join(allowed)}")
     folder = find_run(run, runs)
-    path = folder / TRACKS_FILE
-    if not path.exists():
-        raise ConfigError(f"{folder} has no {TRACKS_FILE}: the run has not ended yet, or its launcher was killed")
-    tracks = read_tracks(path)
-    layers = track_layers(tracks)
-    store = folder / "map.sqlite"
-    if store.exists():
-        from launch_scripts.commands.map import marks_of
+    if gif:
+        from launch_scripts.report.pictures.animation import export_gif
 
-        layers.append(marks_of(store)[1])
-    write_layers(out, layers, MapFrame(tracks.grid))
-    print(f"{out}: {', '.join(f'{len(layer.features)} {layer.name}' for layer in layers)}")
+        print(export_gif(folder, out, force))
+        return
+    for line in export_run(folder, what, format, out, force):
+        print(line)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from launch_scripts.command_line import complete, panels
 from launch_scripts.commands.shared_options import Namespace, Rank, Runs, Tls, spread
 from swarm.ranks import ranked_id
 
@@ -26,10 +27,18 @@ class Place:
 
     scenario: Annotated[
         str,
-        typer.Argument(metavar="SCENARIO", help="A .toml file or a built-in name: the same for all of a run."),
+        typer.Argument(
+            metavar="SCENARIO",
+            help="A .toml file or a built-in name: the same for all of a run.",
+            autocompletion=complete.scenarios,
+        ),
     ] = "jacksboro"
     connect: Annotated[
-        str | None, typer.Option(help="The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.")
+        str | None,
+        typer.Option(
+            help="The router's endpoint, such as tcp/127.0.0.1:7447 or tls/HOST:7447.",
+            rich_help_panel=panels.NETWORK,
+        ),
     ] = None
     namespace: Namespace = None
     runs: Runs = Path("runs")
@@ -63,6 +72,8 @@ def router(
     """Pass everybody's messages on: the process that all others connect to. --connect names another router.
 
     With certificates, each process may do what its name allows and nothing else: see docs/deploy.md.
+
+    swarm router my.toml --listen tcp/127.0.0.1:7447
     """
     run_role("router", "0", place, tls, listen=listen)
 
@@ -92,7 +103,12 @@ def keeper(
 @app.command(rich_help_panel=_PANEL)
 @spread
 def planner(
-    target: Annotated[str, typer.Option(help="The target whose tree this planner keeps, such as t0.")],
+    target: Annotated[
+        str,
+        typer.Option(
+            help="The target whose tree this planner keeps, such as t0.", autocompletion=complete.target_ids
+        ),
+    ],
     part: Part,
     tls: Tls,
     rank: Rank = 0,
@@ -107,25 +123,41 @@ def planner(
 @app.command(rich_help_panel=_PANEL)
 @spread
 def agent(
-    id: Annotated[str, typer.Option("--id", help="The agent, such as a0: it hosts that part of the vehicles.")],
+    id: Annotated[
+        str,
+        typer.Option(
+            "--id",
+            help="The agent, such as a0: it hosts that part of the vehicles.",
+            autocompletion=complete.agent_ids,
+        ),
+    ],
     part: Part,
     tls: Tls,
 ) -> None:
-    """Drive the vehicles of one agent process."""
+    """Drive the vehicles of one agent process.
+
+    swarm agent jacksboro --id a0 --connect tcp/127.0.0.1:7447
+    """
     run_role("agent", id, part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
 @spread
 def targets(part: Part, tls: Tls, rank: Rank = 0) -> None:
-    """Move the simulated targets and referee the run, or stand by to do so."""
+    """Move the simulated targets and referee the run, or stand by to do so.
+
+    swarm targets jacksboro --rank 1
+    """
     run_role("targets", ranked_id("0", rank), part, tls)
 
 
 @app.command(rich_help_panel=_PANEL)
 @spread
 def monitor(part: Part, tls: Tls) -> None:
-    """Show and record the run."""
+    """Show and record the run.
+
+    swarm monitor jacksboro --connect tcp/127.0.0.1:7447
+    """
     run_role("monitor", "0", part, tls)
 
 

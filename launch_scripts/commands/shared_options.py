@@ -10,17 +10,37 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from launch_scripts.command_line import complete, panels
 from swarm.ranks import HIGHEST_RANK
 
 if TYPE_CHECKING:
     from swarm.config.scenario import TlsConfig
 
-Namespace = Annotated[str | None, typer.Option(help="Prefix of all keys: runs in different ones do not meet.")]
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENARIO",
+        help="A .toml file, or the name of a built-in scenario such as jacksboro.",
+        autocompletion=complete.scenarios,
+    ),
+]
+Namespace = Annotated[
+    str | None,
+    typer.Option(help="Prefix of all keys: runs in different ones do not meet.", rich_help_panel=panels.NETWORK),
+]
 Runs = Annotated[Path, typer.Option(help="Folder in which each run gets a folder of its own.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
+PortOption = Annotated[
+    int | None,
+    typer.Option(min=0, max=65533, help="Router on this port, live view on the next two; 0 picks free ones."),
+]
 PresetOption = Annotated[
     str | None,
-    typer.Option("--preset", help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset."),
+    typer.Option(
+        "--preset",
+        help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.",
+        autocompletion=complete.words("swarm.config.scenario", "Preset"),
+    ),
 ]
 Rank = Annotated[
     int,
@@ -61,13 +81,17 @@ def spread(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+def _certificate(help: str) -> Any:
+    return typer.Option(help=help, rich_help_panel=panels.CERTIFICATES)
+
+
 @dataclass(frozen=True)
 class Tls:
     """The three files of mutual TLS: all, or none."""
 
-    tls_ca: Annotated[str | None, typer.Option(help="Certificate of the authority, PEM.")] = None
-    tls_cert: Annotated[str | None, typer.Option(help="Our certificate, PEM.")] = None
-    tls_key: Annotated[str | None, typer.Option(help="Our private key, PEM.")] = None
+    tls_ca: Annotated[str | None, _certificate("Certificate of the authority, PEM.")] = None
+    tls_cert: Annotated[str | None, _certificate("Our certificate, PEM.")] = None
+    tls_key: Annotated[str | None, _certificate("Our private key, PEM.")] = None
 
     def config(self) -> TlsConfig | None:
         from launch_scripts.launcher.options import tls_of
@@ -84,10 +108,7 @@ class RunOptions:
     )
     seed: Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = None
     runs: Runs = Path("runs")
-    port: Annotated[
-        int | None,
-        typer.Option(min=0, max=65533, help="Router on this port, live view on the next two; 0 picks free ones."),
-    ] = None
+    port: PortOption = None
     no_live: Annotated[
         bool, typer.Option("--no-live", help="Serve no live view. The run is recorded all the same.")
     ] = False

@@ -26,8 +26,13 @@ def simulate_once(
     from launch_scripts.report.results.run_folder import begin_run
     from launch_scripts.report.write_report import with_series, write_report
     from launch_scripts.simulation.simulate import simulate as run_simulation
-    from swarm.errors import StoreError
+    from launch_scripts.simulation.worlds import WORLDS
+    from swarm.errors import ConfigError, StoreError
 
+    if name in WORLDS:
+        raise ConfigError(f"{name!r} is a small world, which goes with --seeds A:B; without it give a scenario")
+    if trace is not None and not trace.parent.is_dir():
+        raise StoreError(f"cannot write --trace {trace}: there is no folder {trace.parent}")
     scenario = find_scenario(name)
     terminal = Terminal(as_json, plain=True)
     with contextlib.ExitStack() as stack:

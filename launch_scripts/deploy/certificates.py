@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -135,6 +136,29 @@ def _read_authority(folder: Path) -> Authority:
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise StoreError(f"{folder / CA}.key is not the key of {folder / CA}.pem")
     return Authority(certificate, key)
+
+
+def check_signed(ca: Path, certificate: Path, key: Path) -> None:
+    """Raise StoreError where three files in PEM do not go together: another authority's, another's key, expired."""
+    try:
+        authority, own = (
+            x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE)) for path in (ca, certificate)
+        )
+        secret = serialization.load_pem_private_key(read_bytes(key, FileKind.CERTIFICATE), None)
+    except (ValueError, TypeError) as error:
+        raise StoreError(f"{ca}, {certificate} and {key} are not certificates and a key in PEM: {error}") from error
+    try:
+        own.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature) as error:
+        raise StoreError(f"{certificate} is not signed by the authority in {ca}; make it anew with both") from error
+    if secret.public_key() != own.public_key():
+        raise StoreError(f"{key} is not the key of {certificate}")
+    now = datetime.datetime.now(datetime.UTC)
+    if not own.not_valid_before_utc <= now <= own.not_valid_after_utc:
+        raise StoreError(
+            f"{certificate} is good from {own.not_valid_before_utc:%Y-%m-%d} to {own.not_valid_after_utc:%Y-%m-%d},"
+            " not today; make it anew with `swarm deploy certs FOLDER NAME --renew`"
+        )
 
 
 def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-import difflib
-import errno
 import hashlib
 import secrets
-import socket
 import time
 from pathlib import Path
 
 import msgspec
 
+from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_name
 from shared_map.terrain.importers.sources import is_terrain
-from swarm.bus.endpoints import host_port
 from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
-from swarm.config.explain import nearest
+from swarm.config.explain import explain, nearest
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TerrainConfig, TlsConfig
-from swarm.errors import BusError, ConfigError, StoreError
+from swarm.errors import ConfigError, StoreError
 from swarm.wire.fields import check_id
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
@@ -36,15 +32,32 @@ def find_scenario(name: str, preset: str | None = None) -> Scenario:
         return Scenario(name=path.stem, terrain=TerrainConfig(source=name), cost=cost_of_preset(preset))
     if preset is not None:
         raise ConfigError(f"--preset goes with a terrain file: in the scenario {name} set cost.preset")
-    if path.suffix == ".toml" or path.is_file():
-        return load_scenario(path)
+    return load_scenario(scenario_path(name))
+
+
+def scenario_path(name: str) -> Path:
+    """The file of a built-in scenario, or the one named. Raises ConfigError where there is none."""
+    path = Path(name)
+    if path.is_file():
+        return path
     built_in = SCENARIOS / f"{name}.toml"
     if "/" not in name and built_in.is_file():
-        return load_scenario(built_in)
+        return built_in
+    if path.is_dir():
+        within = sorted(each.name for each in path.glob("*.toml"))[:5]
+        hint = f"; in it are {', '.join(within)}" if within else ""
+        raise ConfigError(f"no scenario {name!r}: it is a folder, expected a .toml file{hint}")
     names = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    raise ConfigError(f"no scenario {name!r}{hint}: give a .toml file or one of: {', '.join(names)}")
+    if path.suffix == ".toml":
+        raise ConfigError(
+            f"cannot read scenario {name}: No such file; `swarm new {name}` writes one, built in are"
+            f" {', '.join(names)}"
+        )
+    if path.suffix in (".tif", ".tiff", ".hgt", ".asc", ".npz"):
+        raise ConfigError(f"no terrain {name!r}: no such file")
+    raise ConfigError(
+        f"no scenario {name!r}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"
+    )
 
 
 def with_network(
@@ -80,7 +93,7 @@ def _replaced(network: NetworkConfig, changes: dict[str, object]) -> NetworkConf
     try:
         return msgspec.convert(raw, NetworkConfig)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"network: {error}") from error
+        raise ConfigError(f"network: {explain(str(error), raw, NetworkConfig)}") from error
 
 
 def tls_of(ca: str | None, certificate: str | None, key: str | None) -> TlsConfig | None:
@@ -141,42 +154,6 @@ def with_port(scenario: Scenario, port: int) -> Scenario:
     return msgspec.structs.replace(scenario, network=network, monitor=monitor)
 
 
-def free_ports(count: int) -> list[int]:
-    """Ports of 127.0.0.1 which are free now."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in sockets]
-
-
-def check_ports(scenario: Scenario, roles: tuple[str, ...]) -> None:
-    """Raises BusError if a port that this machine needs is taken."""
-    wanted: list[tuple[str, str, int]] = []
-    if "router" in roles:
-        wanted += [("the router", *host_port(endpoint)) for endpoint in scenario.network.listen]
-    if "monitor" in roles and scenario.monitor.live:
-        wanted += [("the live view", "127.0.0.1", scenario.monitor.grpc_port)]
-        wanted += [("the live view", "127.0.0.1", scenario.monitor.web_port)]
-    for who, host, port in wanted:
-        if port and _taken(host, port):
-            raise BusError(
-                f"port {port}, which {who} needs, is taken; choose others with --port N (N, N+1 and N+2 are used), "
-                "or let --port 0 pick free ones"
-            )
-
-
-def _taken(host: str, port: int) -> bool:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            return error.errno == errno.EADDRINUSE
-    return False
-
-
 def new_run_id() -> str:
     """Id of a new run: the time, and four hexadecimal digits."""
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
@@ -203,5 +180,6 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StoreError(f"cannot make a run folder in {runs}: {error.strerror or error}") from error
+        why = "it is not a folder" if runs.is_file() else error.strerror or error
+        raise StoreError(f"cannot make a run folder in {runs}: {why}; choose another with --runs") from error
     return run_dir.resolve()

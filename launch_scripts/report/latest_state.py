@@ -39,6 +39,7 @@ class MarkedCells:
     cells: NDArray[np.int64]
     kinds: NDArray[np.uint8]
     paces: NDArray[np.float32]
+    stamps_ns: NDArray[np.int64]
 
 
 class Observed(Counts):
@@ -231,9 +232,10 @@ class Observed(Counts):
                 cell = row * self.grid.cols + col
                 if cell not in newest or (stamp_ns, author) > newest[cell][:2]:
                     newest[cell] = (stamp_ns, author, kind, pace)
-        kept = [(cell, kind, pace) for cell, (_, _, kind, pace) in sorted(newest.items()) if kind != MarkKind.CLEAR]
+        kept = [(cell, *told) for cell, told in sorted(newest.items()) if told[2] != MarkKind.CLEAR]
         return MarkedCells(
-            np.array([cell for cell, _, _ in kept], np.int64),
-            np.array([kind for _, kind, _ in kept], np.uint8),
-            np.array([pace for _, _, pace in kept], np.float32),
+            np.array([cell for cell, _, _, _, _ in kept], np.int64),
+            np.array([kind for _, _, _, kind, _ in kept], np.uint8),
+            np.array([pace for _, _, _, _, pace in kept], np.float32),
+            np.array([stamp_ns for _, stamp_ns, _, _, _ in kept], np.int64),
         )

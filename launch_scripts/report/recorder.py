@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from launch_scripts.report.begun_routes import BegunRoutes
 from launch_scripts.report.latest_state import MarkedCells
 from launch_scripts.report.results.certified_gap import gaps_to, of_excess
 from launch_scripts.report.results.results import Driven, results
@@ -20,7 +21,7 @@ from launch_scripts.report.run_state.facts import for_report
 from launch_scripts.report.run_state.model import HEARD, RunModel
 from launch_scripts.report.run_state.plan import plan_of
 from launch_scripts.report.run_state.state import RunState
-from launch_scripts.report.samples import Sample, Samples, messages_per_s
+from launch_scripts.report.samples import Sample, Samples, at_once, buckets_of, certified_gaps, messages_per_s
 from launch_scripts.report.tracks import TrackKey, Tracks
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
@@ -31,13 +32,15 @@ from swarm.runtime.stats import MESSAGES_PER_S, Histogram
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
-from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.topics import MARKS, NOTE, Topic
+from swarm.wire.messages.vehicles import Followed, VehicleState
+from swarm.wire.topics import FOLLOWED, MARKS, NOTE, Topic
 
 TRACK_S = 0.5
 """Places are sampled so often."""
+ROUTES_S = 2.0
+"""Of the routes that a vehicle begins within this time, the newest is kept."""
 RECORDED: dict[Topic, float] = {
-    **HEARD, NOTE: 0.0, MARKS: TRACK_S
+    **HEARD, NOTE: 0.0, MARKS: TRACK_S, FOLLOWED: ROUTES_S
 }  # fmt: skip
 """What a recorder hears, and how often it takes the newest of each key, in seconds; 0 for all that comes."""
 
@@ -71,6 +74,7 @@ class Recorder:
         self.samples = Samples()
         self.captures: deque[Capture] = deque(maxlen=_CAPTURES_KEPT)
         """Where and when targets were captured; how often, `Observed` counts."""
+        self.routes = BegunRoutes()
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
         self.vehicle_tracks = Tracks(_TRACK_NS)
@@ -88,6 +92,8 @@ class Recorder:
         if self.model.heard(message, now_ns) is None:
             return
         match message:
+            case Followed():
+                self.routes.add(now_ns, message)
             case PlannerStatus(gap_max=float(gap)):
                 self._gap_max = max(gap, self._gap_max or 0.0)
             case Note():
@@ -165,6 +171,9 @@ class Recorder:
             alive=len(observed.up()),
             gaps={id: gap.mean for id, gap in gaps_to(observed).items() if gap.mean is not None},
             growth_ms={id: s.growth_ms for id, s in status},
+            gap_excess=buckets_of(observed.histogram("followed_gap_excess").buckets),
+            waiting_s=float(self.driven.waiting_s.sum()),
+            standing_s=float(self.driven.standing_s.sum()),
         )
 
     def summary(self, now_ns: int) -> RunState:
@@ -222,15 +231,33 @@ class Recorder:
         samples = samples[:: max(1, -(-len(samples) // points))]
         names = ("captures", "marks", "reroute_requests", "routes_served", "alive")
         rates = {round(time_s, 6): rate for time_s, rate in messages_per_s(samples)}
+        gaps = certified_gaps(samples)
         fields: dict[str, list[Any]] = {
             "t_s": [sample.time_s for sample in samples],
             **{name: [getattr(sample, name) for sample in samples] for name in names},
             **{state.name.lower(): [sample.states[state] for sample in samples] for state in VehicleState},
-            "gap_mean": [_mean(sample.gaps.values()) for sample in samples],
+            **{f"certified_gap_{name}": [gap[name] for gap in gaps] for name in ("mean", "p95", "max")},
+            "routes_begun": [gap["routes"] for gap in gaps],
+            "waiting_at_once": at_once(samples, lambda sample: sample.waiting_s),
+            "standing_at_once": at_once(samples, lambda sample: sample.standing_s),
             "growth_ms_mean": [_mean(sample.growth_ms.values()) for sample in samples],
             "messages_per_s": [rates.get(round(sample.time_s, 6)) for sample in samples],
         }
         return {name: [_rounded(value) for value in values] for name, values in fields.items()}
+
+    def distributions(self) -> dict[str, list[list[float]]]:
+        """Histograms as [value, count], in order of value: logarithmic buckets 4 % wide."""
+        return {
+            name: [[_rounded(value), count] for value, count in self.observed.histogram(name).values()]
+            for name in DISTRIBUTIONS
+        }
+
+    def notes_told(self) -> list[dict[str, Any]]:
+        """The newest events for people, in order of time."""
+        return [
+            {"t_s": round(time_s, 3), "from": f"{note.role} {note.id}", "kind": note.kind, "text": note.text}
+            for time_s, note in self.notes
+        ]
 
     def _gap(self) -> dict[str, float | None]:
         """Driven cost over optimum, as the planners measured it.
@@ -245,6 +272,8 @@ class Recorder:
         return gap if self._gap_max is None else {**gap, "max": self._gap_max}
 
 
+DISTRIBUTIONS = ("followed_gap_excess", "growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms")
+"""Histograms that are reported whole."""
 TIMINGS = ("growth_ms", "window_ms", "route_query_ms", "mark_to_tree_ms", "body_ms", "tick_ms")
 """Histograms whose quantiles are reported."""
 

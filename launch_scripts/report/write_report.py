@@ -1,11 +1,12 @@
-"""Writes what a run leaves behind: `report.json`, tables of its results, `tracks.npz` and `report.png`."""
+"""Writes what a run leaves behind: `report.json`, tables, `tracks.npz`, `report.png`, `report.html`."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.report.files import replacing, write_file
-from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks
+from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks, tracks_in
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.result_tables import TABLES, csv_of
 from launch_scripts.report.results.run_folder import REPORT_FILE, ended
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import bounds_deg
 from swarm.errors import StoreError
+
+PICTURE_FILE = "report.png"
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +53,8 @@ def with_series(numbers: Mapping[str, Any], recorder: Recorder, terrain: Terrain
             "notes": list(terrain.notes),
         },
         "series": recorder.series(),
+        "distributions": recorder.distributions(),
+        "notes": recorder.notes_told(),
     }
 
 
@@ -65,27 +70,37 @@ def write_report(
 
     truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
     """
-    whole = {**report, **({"made": made} if (made := ended(folder)) else {})}
+    report = {**report, **({"made": made} if (made := ended(folder)) else {})}
+    # matplotlib takes a moment
+    from launch_scripts.report.pictures.ground_picture import GROUND_FILE, ground_picture
+
+    tracks = packed_tracks(recorder)
+    ground = ground_picture(terrain, recorder.scenario, truth)
+    report = {**report, "ground_shows": ground.drawn}
     contents: dict[str, Callable[[], bytes]] = {
-        REPORT_FILE: lambda: json.dumps(whole, indent=1, allow_nan=False).encode() + b"\n",
+        REPORT_FILE: lambda: json.dumps(report, indent=1, allow_nan=False).encode() + b"\n",
         **{file: partial(csv_of, section, report) for section, (file, _) in TABLES.items()},
-        TRACKS_FILE: lambda: packed_tracks(recorder),
+        TRACKS_FILE: lambda: tracks,
+        GROUND_FILE: ground.webp,
     }
     for name, content in contents.items():
-        try:
-            write_file(folder / name, content())
-        except OSError as error:
-            raise StoreError(f"cannot write {folder / name}: {error.strerror or error}") from error
-    _draw(folder / "report.png", recorder, report, terrain, truth)
+        _write(folder / name, content())
+    from launch_scripts.report.page.run_page import write_page
+    from launch_scripts.report.pictures.picture import save_picture
+
+    with _sentence(folder / PICTURE_FILE), replacing(folder / PICTURE_FILE) as half:
+        save_picture(half, ground, tracks_in(tracks, folder / TRACKS_FILE), report)
+    write_page(folder)
 
 
-def _draw(
-    path: Path, recorder: Recorder, report: dict[str, Any], terrain: Terrain, truth: NDArray[np.float32] | None
-) -> None:
-    from launch_scripts.report.pictures.picture import save_picture  # matplotlib takes a moment
+def _write(path: Path, content: bytes) -> None:
+    with _sentence(path):
+        write_file(path, content)
 
+
+@contextlib.contextmanager
+def _sentence(path: Path) -> Iterator[None]:
     try:
-        with replacing(path) as half:
-            save_picture(half, recorder, report, terrain, truth)
+        yield
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error

@@ -317,12 +317,13 @@ def _open(path: str) -> sqlite3.Connection:
 
 def _open_to_read(path: Path) -> sqlite3.Connection:
     if not path.is_file():
-        raise StoreError(f"there is no store {path}")
+        raise StoreError(f"there is no store {path}: no such file; a run leaves one as runs/RUN/map.sqlite")
     try:
         db = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True, timeout=2.0)
         db.execute("SELECT count(*) FROM meta").fetchone()
     except sqlite3.Error as error:
-        raise StoreError(f"cannot read the store {path}: {error}") from error
+        why = "it is not a keeper's store" if "not a database" in str(error) else str(error)
+        raise StoreError(f"cannot read the store {path}: {why}") from error
     return db
 
 

@@ -44,7 +44,7 @@ def true_ground(
     _rubble(truth, hidden.rubble_fields, rng)
     parts = _flooded(truth, elevation_m, hidden.flooded_share, rng, whole)
     _close_roads(parts, classes == TerrainClass.ROAD, hidden.closed_roads, rng, whole, hidden.flooded_share)
-    paint_zones(truth, hidden.zones, grid, cost, np.isnan(elevation_m))
+    paint_zones(truth, hidden.zones, grid, cost, np.isnan(elevation_m), key="terrain.hidden.zones")
     return truth
 
 

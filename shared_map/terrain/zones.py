@@ -113,17 +113,19 @@ def paint_zones(
     cost: CostConfig,
     void: Bools | None = None,
     classes: Bytes | None = None,
+    key: str = "cost.zones",
 ) -> list[ZoneFacts]:
     """Paint zones onto a pace, in place: step 3 of the merge rule in `layers`.
 
     classes  of the cells: those of roads and water from files are entered, if given
+    key      where the zones stand in a scenario, for errors
 
     Raises TerrainError with one sentence.
     """
     painter = _Painter(pace, grid, cost, void, classes)
     painted = []
-    for zone in zones:
-        painted.append(painter.read(zone))
+    for n, zone in enumerate(zones):
+        painted.append(painter.read(zone, f"{key}[{n}]: zone"))
         painter.cost(painted[-1])
     for each in painted:
         painter.water(each)
@@ -176,15 +178,15 @@ class _Painter:
         self._road_pace = np.float32(1 / cost.road_speed_m_per_s)
         self._water: Bools | None = None
 
-    def read(self, zone: ZoneConfig) -> _Painted:
+    def read(self, zone: ZoneConfig, where: str) -> _Painted:
         """What a zone covers."""
         if zone.file is not None:
             from shared_map.terrain.importers.zones.zone_files import burn_zone
 
-            burnt = burn_zone(zone, self._grid, f"zone {zone.called!r}")
+            burnt = burn_zone(zone, self._grid, f"{where} {zone.called!r}")
             cells = int((~np.isnan(burnt.values[1])).sum()) + int(burnt.lethal[1].sum())
             return _Painted(zone, burnt.values, burnt.lethal, replace(burnt, values=_NOTHING), cells)
-        inside = zone_mask(zone, self._grid)
+        inside = zone_mask(zone, self._grid, where)
         window = _around(inside)
         inside = inside[_part(window)]
         found = _Painted(zone, None, None, cells=int(inside.sum()))
@@ -321,7 +323,7 @@ def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
     if not inside.any():
         width, height = grid.cols * grid.resolution_m, grid.rows * grid.resolution_m
         raise TerrainError(
-            f"{where} {zone.name or zone.kind!r} covers no cell: its corners are metres east and south of the"
-            f" north-west corner of a terrain of {width:.0f} m x {height:.0f} m"
+            f"{where} {zone.name or zone.kind!r} covers no cell, so it is outside the terrain: its corners are"
+            f" metres east and south of the north-west corner of a terrain of {width:.0f} m x {height:.0f} m"
         )
     return inside

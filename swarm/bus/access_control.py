@@ -54,7 +54,10 @@ def bearer(name: str) -> Bearer:
         raise ConfigError(str(error)) from error
     if role not in (*ROLES, ROUTER) or not author or (role == "agent" and not (group and id)):
         roles = ", ".join((ROUTER, *ROLES))
-        raise ConfigError(f"{name!r} is no name of a process: ROLE.ID or agent.GROUP.ID; the roles are {roles}")
+        raise ConfigError(
+            f"{name!r} is no name of a process: write ROLE.ID or agent.GROUP.ID, such as planner.t0; the roles are"
+            f" {roles}"
+        )
     if role == "agent" and group.split(".")[0] == OPERATOR:
         raise ConfigError(
             f"{name!r} is no name of a process: no group is called {OPERATOR!r}, as zones are its marks"

@@ -131,7 +131,10 @@ def with_slope_csv(cost: CostConfig, source: str, base: Path | None) -> CostConf
     if cost.slope_table:
         raise ConfigError(f"{source}: cost: slope_table and slope_csv exclude each other")
     path = Path(cost.slope_csv) if base is None else base / cost.slope_csv
-    points = read_slope_table(path, cost.flat_speed_m_per_s)
+    try:
+        points = read_slope_table(path, cost.flat_speed_m_per_s)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: cost.slope_csv: {error}") from error
     return msgspec.structs.replace(cost, slope_csv=None, slope_table=points)
 
 

@@ -1,14 +1,35 @@
-"""Errors of a scenario in terms of TOML: the key, what was found, what is allowed, the nearest name."""
+"""Errors of a scenario in terms of TOML: the key, what was found, what is allowed, what was probably meant."""
 
 from __future__ import annotations
 
 import difflib
 import re
-import types
 import typing
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
 
+import msgspec
+
+from swarm.config.describe import bare, expected, is_section, is_several, section_in
 from swarm.config.input_files import shown
+
+_LONGEST_LIST = 200
+"""Characters of a list of allowed words; where one of them is near, a longer list says nothing more."""
+_UNITS: tuple[tuple[str, dict[str, float]], ...] = (
+    ("_s_per_m", {"s/m": 1}),
+    ("_m_per_s", {"m/s": 1, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6}),
+    ("_hz", {"hz": 1, "khz": 1000}),
+    ("_deg", {"deg": 1, "degrees": 1, "°": 1}),
+    ("_m", {"m": 1, "metres": 1, "meters": 1, "km": 1000, "cm": 0.01}),
+    ("_s", {"s": 1, "sec": 1, "seconds": 1, "ms": 0.001, "m": 60, "min": 60, "minutes": 60, "h": 3600}),
+    ("seconds", {"s": 1, "sec": 1, "seconds": 1, "ms": 0.001, "m": 60, "min": 60, "minutes": 60, "h": 3600}),
+    ("", {"%": 0.01}),
+)
+"""Ending of a key -> the units that somebody may write after its number, in its own unit."""
+_MEANT = dict.fromkeys(
+    ("vehicles.count", "vehicles.number", "vehicles.vehicles"),
+    "how many vehicles there are is `vehicles` of [[groups]]",
+)
 
 
 def explain(reason: str, raw: dict[str, Any], root: type) -> str:
@@ -18,67 +39,175 @@ def explain(reason: str, raw: dict[str, Any], root: type) -> str:
     raw     what was read from the file
     root    the type that it was to become
     """
-    path = "$"
-    located = re.fullmatch(r"(.*) - at `(.*)`", reason, re.DOTALL)
-    if located:
-        reason, path = located[1], located[2]
-    steps = re.findall(r"\.([A-Za-z_]\w*)|\[(\d+|\.\.\.)\]", path)
-    unknown = re.fullmatch(r"Object contains unknown field `(.*)`", reason)
-    section: Any = root
+    reason, path = located(reason)
+    hint: Any = root
     value: Any = raw
     name = ""
-    for key, index in steps:
-        if key:
-            name = f"{name}.{key}" if name else key
-            section = _field_type(section, key)
-            value = value.get(key) if isinstance(value, dict) else None
+    for step in path:
+        if isinstance(step, str):
+            name = f"{name}.{step}" if name else step
+            hint = _field_type(hint, step)
+            value = value.get(step) if isinstance(value, dict) else None
+        elif isinstance(value, dict):  # msgspec tells no key of a table that the user names
+            hint = _item_type(hint)
+            key, value = _refused_item(value, hint)
+            name += f".{key}"
         else:
-            name += f"[{index}]"
-            section = _item_type(section)
-            value = value[int(index)] if isinstance(value, list) and index.isdecimal() else None
-    if unknown:
-        key = unknown[1]
-        allowed = list(section.__struct_fields__) if hasattr(section, "__struct_fields__") else []
-        if len(key) > 60:
-            return f"unknown key {f'{name}.' if name else ''}{key[:57]}...; allowed here: {', '.join(allowed)}"
-        where = f"{name}.{key}" if name else key
-        return f"unknown key {where}{nearest(key, allowed)}; allowed here: {', '.join(allowed)}"
-    reason = reason[:1].lower() + reason[1:]
-    found = "" if value is None or isinstance(value, (dict, list)) else f", found {shown(value)}"
-    return f"{name or 'scenario'}: {reason}{found}{_choices(section)}"
+            name += "[...]" if step < 0 else f"[{step}]"
+            hint = _item_type(hint)
+            value = value[step] if isinstance(value, list) and 0 <= step < len(value) else None
+    if unknown := re.fullmatch(r"Object contains unknown field `(.*)`", reason, re.DOTALL):
+        return _unknown(unknown[1], name, bare(hint), root)
+    if missing := re.fullmatch(r"Object missing required field `(.*)`", reason):
+        section = bare(hint)
+        wanted = expected(_field_type(section, missing[1])) if hasattr(section, "__struct_fields__") else "a value"
+        return f"{name or 'scenario'}: missing required field `{missing[1]}`, {wanted}"
+    return _wrong(name or "scenario", value, hint)
 
 
-def nearest(word: str, allowed: list[str]) -> str:
+def _refused_item(values: dict[str, Any], hint: Any) -> tuple[str, Any]:
+    for key, value in values.items():
+        try:
+            msgspec.convert(value, hint)
+        except msgspec.ValidationError:
+            return key, value
+    return "...", None
+
+
+def _refused_key(values: dict[str, Any], hint: Any) -> str:
+    for key in values:
+        try:
+            msgspec.convert(key, hint)
+        except msgspec.ValidationError:
+            allowed = (
+                list(map(str, typing.get_args(bare(hint)))) if typing.get_origin(bare(hint)) is Literal else []
+            )
+            return f"{key!r}{choice(key, allowed)}" if allowed else f"{key!r}, expected {expected(hint)}"
+    return "of a kind that is not allowed"
+
+
+def located(reason: str) -> tuple[str, list[str | int]]:
+    """What msgspec says, and where: keys and indices from the root on; -1 is an index that it does not tell."""
+    found = re.fullmatch(r"(.*) - at (?:`key` in )?`(.*)`", reason, re.DOTALL)
+    if found is None:
+        return reason, []
+    steps = re.findall(r"\.([A-Za-z_]\w*)|\[(\d+|\.\.\.)\]", found[2])
+    return found[1], [key or (-1 if index == "..." else int(index)) for key, index in steps]
+
+
+def nearest(word: str, allowed: Sequence[str]) -> str:
     """ "; did you mean 'x'?" with the most similar of the allowed words, nothing if none is."""
-    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(word, allowed, n=1)
+    if not close and len(word) >= 3:
+        close = [each for each in allowed if each.startswith(word)][:1]
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-def _plain(hint: Any) -> Any:
-    """A type without Annotated and Optional around it."""
-    while True:
-        origin = typing.get_origin(hint)
-        if origin is Annotated:
-            hint = typing.get_args(hint)[0]
-        elif origin in (types.UnionType, typing.Union):
-            hint = next(arg for arg in typing.get_args(hint) if arg is not type(None))
-        else:
-            return hint
+def choice(word: str, allowed: Sequence[str], lead: str = " allowed: ") -> str:
+    """What a word should have been: the nearest of the allowed words, and all of them where they are few."""
+    near, every = nearest(word, allowed), ", ".join(map(repr, allowed))
+    if near and len(every) > _LONGEST_LIST:
+        return near
+    if len(every) > _LONGEST_LIST:
+        every = f"{every[: every.rfind(',', 0, _LONGEST_LIST)]}, ..."
+    return f"{near};{lead}{every}"
+
+
+# --- a key that is not known -----------------------------------------------------------------------------------
+
+
+def _unknown(key: str, name: str, section: Any, root: type) -> str:
+    allowed = list(getattr(section, "__struct_fields__", ()))
+    where = f"{name}.{key}" if name else key
+    if len(key) > 60:
+        return f"unknown key {name + '.' if name else ''}{key[:57]}...; {_allowed_here(allowed)}"
+    if where in _MEANT:
+        return f"unknown key {where}; {_MEANT[where]}"
+    near = nearest(key, allowed)
+    elsewhere = [place for place, other in _places(root) if other is not section and key in _keys(other)]
+    if elsewhere and not _is_near(key, allowed):
+        return f"unknown key {where}; {key} stands {' or '.join(elsewhere[:3])}"
+    every = _allowed_here(allowed)
+    return f"unknown key {where}{near}" + (f"; {every}" if not near or len(every) <= _LONGEST_LIST else "")
+
+
+def _allowed_here(allowed: Sequence[str]) -> str:
+    return f"allowed here: {', '.join(allowed)}"
+
+
+def _is_near(key: str, allowed: Sequence[str]) -> bool:
+    return bool(difflib.get_close_matches(key, allowed, n=1, cutoff=0.75))
+
+
+def _keys(section: Any) -> list[str]:
+    """The keys of a section that hold values."""
+    return [
+        key for key, hint in typing.get_type_hints(section, include_extras=True).items() if not section_in(hint)
+    ]
+
+
+def _places(root: type) -> Iterator[tuple[str, Any]]:
+    """Every section, with how a sentence says where it stands."""
+    found = [("", root)]
+    for path, section in found:
+        yield (f"in {path}" if path else "at the top of the file, before the first [section]"), section
+        for key, hint in typing.get_type_hints(section, include_extras=True).items():
+            inner = section_in(hint)
+            if inner is not None and all(inner is not known for _, known in found):
+                joined = f"{path.strip('[]')}.{key}" if path else key
+                found.append((f"[[{joined}]]" if is_several(hint) else f"[{joined}]", inner))
+
+
+# --- a value that is not allowed ------------------------------------------------------------------------------
+
+
+def _wrong(name: str, value: Any, hint: Any) -> str:
+    kind, key = bare(hint), name.rpartition(".")[2].partition("[")[0]
+    table = re.sub(r"\[[\d.]+\]", "", name)
+    if is_several(hint) and isinstance(value, dict):
+        return f"{name}: found [{table}], expected [[{table}]] in two pairs of brackets: there may be several"
+    if is_section(kind) and isinstance(value, list):
+        return f"{name}: found several tables [[{table}]], expected one: [{table}]"
+    if is_section(kind):
+        return f"{name}: found {shown(value)}, expected a table: [{table}] with its keys below"
+    if typing.get_origin(kind) is tuple and isinstance(value, str | int | float):
+        shape = f"{key} = [{_as_toml(value)}]" if typing.get_args(kind)[-1] is Ellipsis else expected(hint)
+        return f"{name}: found {shown(value)}, expected a list: {shape}"
+    if typing.get_origin(kind) is Literal:
+        return f"{name}: found {shown(value)}{choice(str(value), list(map(str, typing.get_args(kind))))}"
+    if typing.get_origin(kind) is dict and isinstance(value, dict):
+        return f"{name}: found the key {_refused_key(value, typing.get_args(kind)[0])}"
+    found = "" if isinstance(value, dict | list) and value else f" found {shown(value)},"
+    return f"{name}:{found} expected {expected(hint)}{_meant_number(key, value, kind)}"
+
+
+def _meant_number(key: str, value: Any, kind: Any) -> str:
+    """What a text that holds a number should have been."""
+    if not isinstance(value, str) or kind not in (int, float):
+        return ""
+    match = re.fullmatch(r"\s*([+-]?(?:\d+[.,]?\d*|[.,]\d+))\s*(\S.*?)?\s*", value)
+    if match is None:
+        return ""
+    number, unit = float(match[1].replace(",", ".")), match[2]
+    if unit is None:
+        return f" without quotes: {key} = {number:g}"
+    units = next(units for ending, units in _UNITS if key.endswith(ending))
+    if unit.lower() not in units:
+        return ", without its unit"
+    return f" without its unit: {key} = {number * units[unit.lower()]:.6g}"
+
+
+def _as_toml(value: Any) -> str:
+    return f'"{value}"' if isinstance(value, str) else str(value)
 
 
 def _field_type(section: Any, key: str) -> Any:
-    section = _plain(section)
-    if not hasattr(section, "__struct_fields__"):
-        return None
-    return _plain(typing.get_type_hints(section, include_extras=True).get(key))
+    section = bare(section)
+    if typing.get_origin(section) is dict:
+        return typing.get_args(section)[1]
+    return typing.get_type_hints(section, include_extras=True).get(key) if is_section(section) else None
 
 
-def _item_type(section: Any) -> Any:
-    args = typing.get_args(section)
-    return _plain(args[-1] if typing.get_origin(section) is dict else args[0]) if args else None
-
-
-def _choices(section: Any) -> str:
-    if typing.get_origin(section) is Literal:
-        return f"; allowed: {', '.join(map(repr, typing.get_args(section)))}"
-    return ""
+def _item_type(hint: Any) -> Any:
+    args = typing.get_args(bare(hint))
+    return (args[-1] if typing.get_origin(bare(hint)) is dict else args[0]) if args else None

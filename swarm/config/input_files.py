@@ -13,6 +13,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from swarm.config.toml_mistakes import toml_mistake
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
 from swarm.grid import MAX_CELLS
 
@@ -92,7 +93,9 @@ def read_text(path: Path, kind: FileKind, encoding: str = "utf-8") -> str:
     try:
         return read_bytes(path, kind).decode(encoding)
     except UnicodeDecodeError as error:
-        raise kind.error(f"{kind.what} {path} is not text: {error.reason} at byte {error.start}") from error
+        raise kind.error(
+            f"{kind.what} {path} is not text in {encoding.upper()}: {error.reason} at byte {error.start}"
+        ) from error
 
 
 def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
@@ -149,9 +152,9 @@ def parse_toml(text: str, source: str, error: type[SwarmError]) -> dict[str, Any
     if _DOTTED.search(words):
         raise error(f"{source}: not TOML that is read here: a key has more than {MAX_DEPTH} parts")
     try:
-        return tomllib.loads(text)
+        return tomllib.loads(text.removeprefix("\ufeff"))
     except ValueError as fault:  # a TOMLDecodeError, or a number of more digits than Python reads
-        raise error(f"{source}: not TOML: {fault}") from fault
+        raise error(f"{source}: not TOML: {toml_mistake(str(fault), text)}") from fault
 
 
 def shown(value: object) -> str:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections import Counter
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
-from swarm.config.explain import explain, nearest
+from swarm.config.explain import choice, explain, located, nearest
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import (
@@ -34,73 +37,131 @@ def load_scenario(path: Path) -> Scenario:
 
 def parse_scenario(text: str, source: str = "scenario", base: Path | None = None) -> Scenario:
     """As `load_scenario`, of a text. Relative paths in it are made relative to `base`, if given."""
-    raw = with_preset(parse_toml(text, source, ConfigError))
+    scenario, faults = read_scenario(text, source, base, most=1)
+    if scenario is None or faults:
+        raise ConfigError(faults[0])
+    return scenario
+
+
+def read_scenario(
+    text: str, source: str, base: Path | None = None, most: int = 50
+) -> tuple[Scenario | None, list[str]]:
+    """The scenario of a text, and what is wrong with it: at most so many sentences. None where not all keys could
+    be read."""
     try:
-        scenario = msgspec.convert(raw, Scenario)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{source}: {explain(str(error), raw, Scenario)}") from error
-    scenario = msgspec.structs.replace(scenario, cost=with_slope_csv(scenario.cost, source, base))
-    _check(scenario, source)
-    return scenario if base is None else anchored(scenario, base)
+        raw = with_preset(parse_toml(text, source, ConfigError))
+    except ConfigError as error:
+        return None, [str(error)]
+    faults: list[str] = []
+    taken_out: set[tuple[str | int, ...]] = set()
+    scenario: Scenario | None = None
+    while scenario is None and len(faults) < most:
+        try:
+            scenario = msgspec.convert(raw, Scenario)
+        except msgspec.ValidationError as error:
+            place, lacks = _place(str(error))
+            if not (lacks and place in taken_out):
+                faults.append(f"{source}: {explain(str(error), raw, Scenario)}")
+            # What lacks a key goes whole. An item of a list alone cannot: those after it would have other numbers.
+            place = place[:1] if lacks else place
+            taken_out.add(place)
+            if not _take_out(raw, place):
+                break
+    if scenario is None or faults:
+        return None, faults
+    try:
+        scenario = msgspec.structs.replace(scenario, cost=with_slope_csv(scenario.cost, source, base))
+    except ConfigError as error:
+        return None, [str(error)]
+    faults += islice(_faults(scenario, source), most)
+    return scenario if base is None else anchored(scenario, base), faults
 
 
-def _check(scenario: Scenario, source: str) -> None:
-    """Raise ConfigError where settings that are valid each do not fit together."""
+def _place(reason: str) -> tuple[tuple[str | int, ...], bool]:
+    """The key that msgspec complains of, from the root on, and whether it is missing."""
+    what, path = located(reason)
+    if named := re.fullmatch(r"Object (contains unknown|missing required) field `(.*)`", what, re.DOTALL):
+        return (*path, named[2]), named[1] == "missing required"
+    while path and not isinstance(path[-1], str):
+        path = path[:-1]
+    return tuple(path), False
+
+
+def _take_out(raw: dict[str, Any], place: tuple[str | int, ...]) -> bool:
+    """Remove a key, so that msgspec finds the next fault. False if there is none."""
+    parent: Any = raw
+    for step in place[:-1]:
+        parent = parent[step]
+    return bool(place) and parent.pop(place[-1], None) is not None
+
+
+def _faults(scenario: Scenario, source: str) -> Iterator[str]:
+    """Where settings that are valid each do not fit together."""
     count = sum(target.count for target in scenario.targets)
     if count > MOST_TARGETS:
-        raise ConfigError(f"{source}: targets: expected at most {MOST_TARGETS} in all, found {count}")
+        yield f"{source}: targets: expected at most {MOST_TARGETS} in all, found {count}"
     ids = scenario.target_ids
     doubled = sorted(id for id, times in Counter(ids).items() if times > 1)
     if doubled:
-        raise ConfigError(f"{source}: targets: two targets are called {doubled[0]!r}; give them other names")
+        yield f"{source}: targets: two targets are called {doubled[0]!r}; give them other names"
     rovers = Counter(id for rover in scenario.rovers for id in ids_of(rover))
     if rovers and rovers.most_common(1)[0][1] > 1:
-        raise ConfigError(f"{source}: rovers: two rovers are called {rovers.most_common(1)[0][0]!r}; rename one")
+        yield f"{source}: rovers: two rovers are called {rovers.most_common(1)[0][0]!r}; rename one"
     for id in ids:
         if split_rank(id)[1]:  # planner and standby of two targets would share an id
-            raise ConfigError(f"{source}: targets: {id!r} is what a standby of another target is called; rename it")
+            yield f"{source}: targets: {id!r} is what a standby of another target is called; rename it"
     for key, zones in (
         ("cost.zones", scenario.cost.zones),
         ("terrain.hidden.zones", scenario.terrain.hidden.zones),
     ):
         for n, zone in enumerate(zones):
-            _check_zone(zone, f"{source}: {key}[{n}]")
+            yield from _said(_check_zone, zone, f"{source}: {key}[{n}]")
     for n, target in enumerate(scenario.targets):
         if target.start is not None:
-            read_place(target.start, f"{source}: targets[{n}].start")
+            yield from _said(read_place, target.start, f"{source}: targets[{n}].start")
     for n, group in enumerate(scenario.groups):
         for place in group.cells:
-            read_place(place, f"{source}: groups[{n}].cells")
+            yield from _said(read_place, place, f"{source}: groups[{n}].cells")
     for plugin in plugins_of(scenario):
-        check_name(plugin, source)
-    check_cost(scenario.cost, source)
+        yield from _said(check_name, plugin, source)
+    yield from _said(check_cost, scenario.cost, source)
     if scenario.cost.directional:
-        _check_directional(scenario.planner, source)
-    names = [group.name for group in scenario.groups]
-    if len(set(names)) < len(names):
-        raise ConfigError(f"{source}: groups: two groups share a name in {', '.join(names)}")
+        yield from _said(_check_directional, scenario.planner, source)
+    yield from _group_faults(scenario, source)
+    for key in ("listen", "connect", "peers"):
+        for endpoint in getattr(scenario.network, key):
+            yield from _said(check_endpoint, endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
+
+
+def _said(check: Callable[..., object], *of: object) -> Iterator[str]:
+    """The sentence with which a check refuses what it is given, if it does."""
+    try:
+        check(*of)
+    except ConfigError as error:
+        yield str(error)
+
+
+def _group_faults(scenario: Scenario, source: str) -> Iterator[str]:
+    ids, names = scenario.target_ids, [group.name for group in scenario.groups]
+    doubled = [name for name, times in Counter(names).items() if times > 1]
+    if doubled:
+        yield f"{source}: groups: two groups are called {doubled[0]!r}; rename one"
     for name in names:
         if name.split(".")[0] == RESERVED_GROUP:
-            raise ConfigError(f"{source}: groups: {name!r} is not free: zones of operators are marks of that name")
+            yield f"{source}: groups: {name!r} is not free: zones of operators are marks of that name"
         longer = [other for other in names if other.startswith(f"{name}.")]
         if longer:  # the id of an author begins with its group and a point
-            raise ConfigError(
-                f"{source}: groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
-            )
+            yield f"{source}: groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
     for group in scenario.groups:
         for id in group.targets:
             if id not in ids:
-                raise ConfigError(
-                    f"{source}: groups: {group.name} chases {id!r}, which is no target{nearest(id, ids)}"
-                )
+                known = choice(id, ids, " there are ")
+                yield f"{source}: groups: {group.name} chases {id!r}, which is no target{known}"
         for key in ("reads", "writes"):
             for name in getattr(group, key):
                 if name != "*" and name not in names:
                     where = f"{source}: groups: {group.name}: {key}"
-                    raise ConfigError(f"{where} names {name!r}, which is no group{nearest(name, names)}")
-    for key in ("listen", "connect", "peers"):
-        for endpoint in getattr(scenario.network, key):
-            check_endpoint(endpoint, scenario.network.tls is not None, f"{source}: network.{key}")
+                    yield f"{where} names {name!r}, which is no group{nearest(name, names)}"
 
 
 _VALUES = {"factor": "factor", "pace": "pace_s_per_m"}
@@ -136,18 +197,21 @@ def _check_directional(planner: PlannerConfig, source: str) -> None:
 def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
     """Raise ConfigError on what is no endpoint, and on one beyond loopback without mutual TLS."""
     match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
-    if match is None or int(match[3]) > 65535:
+    if match is None:
         raise ConfigError(f"{where}: {endpoint!r} is not an endpoint such as tcp/127.0.0.1:7447 or tls/host:7447")
+    if int(match[3]) > 65535:
+        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint: a port is at most 65535")
     protocol, host = match[1], match[2].strip("[]")
     if protocol == "tls" and not has_tls:
         raise ConfigError(f"{where}: {endpoint} needs network.tls with ca, certificate and key")
-    if protocol == "tcp" and not _loopback(host):
+    if protocol == "tcp" and not is_loopback(host):
         raise ConfigError(
             f"{where}: {endpoint} leaves this machine in the clear; use tls/{host}:{match[3]} with network.tls"
         )
 
 
-def _loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine by name or address."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -33,9 +33,9 @@ def _table(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
         if _is_table(value) or _is_tables(value):
             inner.append((key, value))
         elif value is not None:
-            yield f"{_key(key)} = {_value(value)}"
+            yield f"{toml_key(key)} = {toml_value(value)}"
     for key, value in inner:
-        name = ".".join(map(_key, (*path, key)))
+        name = ".".join(map(toml_key, (*path, key)))
         for each in [value] if _is_table(value) else value:
             yield f"\n[{name}]" if _is_table(value) else f"\n[[{name}]]"
             yield from _table(each, (*path, key))
@@ -49,7 +49,8 @@ def _is_tables(value: Any) -> bool:
     return isinstance(value, list | tuple) and bool(value) and all(isinstance(each, Mapping) for each in value)
 
 
-def _key(key: str) -> str:
+def toml_key(key: str) -> str:
+    """A key, in quotes where TOML wants them."""
     return key if _BARE_KEY.fullmatch(key) else _string(key)
 
 
@@ -58,7 +59,8 @@ def _string(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _value(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """A value on one line."""
     match value:
         case bool():
             return "true" if value else "false"
@@ -71,7 +73,9 @@ def _value(value: Any) -> str:
         case datetime.date() | datetime.time():
             return value.isoformat()
         case Mapping():
-            inside = ", ".join(f"{_key(key)} = {_value(each)}" for key, each in value.items() if each is not None)
+            inside = ", ".join(
+                f"{toml_key(key)} = {toml_value(each)}" for key, each in value.items() if each is not None
+            )
             return f"{{ {inside} }}" if inside else "{}"
         case _:
-            return f"[{', '.join(map(_value, value))}]"
+            return f"[{', '.join(map(toml_value, value))}]"

@@ -19,7 +19,7 @@ from support.processes import eventually
 from support.zenohd import Zenohd
 
 from launch_scripts.deploy.certificates import issue
-from launch_scripts.launcher.options import free_ports
+from launch_scripts.ports import free_ports
 from swarm.bus.access_control import ROUTER, Bearer, bearer, common_name
 from swarm.bus.zenoh_config import session_config
 from swarm.config.scenario import NetworkConfig, TlsConfig

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.processes import eventually
 
-from launch_scripts.launcher.options import free_ports
+from launch_scripts.ports import free_ports
 from shared_map.cost_map import CostMap
 from shared_map.replication.filter import MarkFilter, author_of, readable_groups
 from shared_map.replication.replica import MapReplica

@@ -9,7 +9,7 @@ import pytest
 from support.live_swarm import folders_of_runs, swarm, write_scenario
 from support.plugin_pages import write_all_examples
 
-from launch_scripts.launcher.options import free_ports
+from launch_scripts.ports import free_ports
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

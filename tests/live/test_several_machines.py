@@ -14,7 +14,8 @@ from support.client_rig import run_info as client_run_info
 from support.live_swarm import Hands, swarm
 from support.processes import eventually
 
-from launch_scripts.launcher.options import as_process, free_ports, tls_of
+from launch_scripts.launcher.options import as_process, tls_of
+from launch_scripts.ports import free_ports
 from swarm.bus.bus import Asked, Event, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.client import BusError, connect

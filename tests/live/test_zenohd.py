@@ -14,7 +14,7 @@ from support.processes import eventually
 from support.zenohd import Zenohd, plugins
 
 from launch_scripts.deploy.certificates import issue
-from launch_scripts.launcher.options import free_ports
+from launch_scripts.ports import free_ports
 from shared_map.replication.marks import mark_set, statements
 from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.sync import MapSync

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from support.processes import eventually, session_of
 
-from launch_scripts.launcher.options import free_ports
+from launch_scripts.ports import free_ports
 from swarm.bus.bus import AskEnded, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.load import load_scenario

@@ -13,9 +13,9 @@ from launch_scripts.bench.whole_swarm.route_client import raw_answerer, route_cl
 from launch_scripts.bench.whole_swarm.size import Size, scenario_text
 from launch_scripts.bench.whole_swarm.stats_window import StatsSpan, StatsWindow, histogram, ticks
 from launch_scripts.bench.wire.remote import Far
-from launch_scripts.launcher.options import free_ports
 from launch_scripts.launcher.run_processes import cpu_s, in_session, machine_cpu_s, processes, pss_bytes
 from launch_scripts.launcher.up_process import UpProcess
+from launch_scripts.ports import free_ports
 from launch_scripts.process_table import processes_of
 from swarm.bus.bus import Heard
 from swarm.bus.endpoints import listening

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from launch_scripts.launcher.options import free_ports
+from launch_scripts.ports import free_ports
 from shared_map.cost_map import CostMap
 from shared_map.replication.mark_sets import packed
 from shared_map.replication.marks import Statements, mark_set

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch_scripts.command_line import complete
 from launch_scripts.commands.orders.vehicle import app as app
 from launch_scripts.commands.query import Where
 from launch_scripts.commands.roles import Joins, Part, run_role
@@ -27,7 +28,10 @@ _AGAIN_S = 0.2
 @app.command()
 @spread
 def add(
-    group: Annotated[str, typer.Option(help="The group of the scenario to which they belong.")],
+    group: Annotated[
+        str,
+        typer.Option(help="The group of the scenario to which they belong.", autocompletion=complete.group_names),
+    ],
     part: Part,
     tls: Tls,
     count: Annotated[int, typer.Option(min=1, help="How many vehicles.")] = 1,
@@ -57,7 +61,12 @@ def add(
 @app.command()
 @spread
 def remove(
-    names: Annotated[list[str], typer.Argument(help="Agents, such as extra, or vehicles, such as a0-03.")],
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            help="Agents, such as extra, or vehicles, such as a0-03.", autocompletion=complete.vehicle_ids
+        ),
+    ],
     where: Where,
     tls: Tls,
     as_json: AsJson = False,
@@ -105,6 +114,8 @@ def gone(
 
     Only a person can know: a robot whose program has died stands where it stands. Never say it of one that does.
     Between machines it takes the guest's own certificate.
+
+    swarm vehicle gone extra
     """
     from swarm.errors import BusError
     from swarm.grid import GridSpec

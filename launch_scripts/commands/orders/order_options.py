@@ -22,14 +22,18 @@ def checked(kind: type[M], fields: dict[str, Any]) -> M:
     """The order of these fields; those which are None are left out. Raises ConfigError."""
     import msgspec
 
+    from swarm.config.explain import explain
     from swarm.errors import ConfigError
-    from swarm.wire.codec import field_fault, schema_of_type
+    from swarm.wire.codec import schema_of_type
 
     given = {name: value for name, value in fields.items() if value is not None}
     try:
         return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
     except (msgspec.ValidationError, ValueError) as error:
-        raise ConfigError(f"the order is not possible: {field_fault(error, given)}") from None
+        said = str(error)
+        ours = not said.startswith(("Expected", "Invalid", "Object"))  # what fields say of each other
+        said = said.partition(" - at `$")[0] if ours else explain(said, given, kind)
+        raise ConfigError(f"the order is not possible: {said}") from None
 
 
 def give(orders: list[GiveOrder], where: Where, tls: Tls, as_json: bool, at: Place | None = None) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from launch_scripts.command_line import complete
 from launch_scripts.commands.orders.order_options import checked, give
 from launch_scripts.commands.query import Where
 from launch_scripts.commands.shared_options import AsJson, Tls, spread
@@ -23,6 +24,8 @@ def pause(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
 
     Vehicles drive to the middle of the cell that they are entering and stand there. Planners go on planning.
+
+    swarm pause
     """
     from swarm.wire.messages.orders import GiveOrder
 
@@ -32,7 +35,10 @@ def pause(where: Where, tls: Tls, as_json: AsJson = False) -> None:
 @app.command(rich_help_panel=_PANEL)
 @spread
 def resume(where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Let all go on after a pause."""
+    """Let all go on after a pause.
+
+    swarm resume
+    """
     from swarm.wire.messages.orders import GiveOrder
 
     give([GiveOrder(subject="pause", off=True)], where, tls, as_json)
@@ -41,11 +47,16 @@ def resume(where: Where, tls: Tls, as_json: AsJson = False) -> None:
 @app.command(rich_help_panel=_PANEL)
 @spread
 def group(
-    name: Annotated[str, typer.Argument(metavar="GROUP", help="The group.")],
+    name: Annotated[str, typer.Argument(metavar="GROUP", help="The group.", autocompletion=complete.group_names)],
     where: Where,
     tls: Tls,
     targets: Annotated[
-        list[str] | None, typer.Argument(metavar="[targets] TARGET...", help="The targets that it may chase.")
+        list[str] | None,
+        typer.Argument(
+            metavar="[targets] TARGET...",
+            help="The targets that it may chase.",
+            autocompletion=complete.target_ids,
+        ),
     ] = None,
     as_scenario: Annotated[bool, typer.Option("--as-scenario", help="Those that the scenario says.")] = False,
     as_json: AsJson = False,
@@ -71,7 +82,14 @@ def group(
 @app.command(name="set", rich_help_panel=_PANEL)
 @spread
 def set_(
-    key: Annotated[str, typer.Argument(metavar="KEY", help="A key of the scenario, such as time_scale.")],
+    key: Annotated[
+        str,
+        typer.Argument(
+            metavar="KEY",
+            help="A key of the scenario, such as time_scale.",
+            autocompletion=complete.words("swarm.order_book", "SETTINGS"),
+        ),
+    ],
     where: Where,
     tls: Tls,
     value: Annotated[float | None, typer.Argument(metavar="VALUE", help="Its new value.")] = None,
@@ -84,11 +102,15 @@ def set_(
 
     swarm set time_scale --as-scenario
     """
+    from swarm.config.explain import choice
     from swarm.errors import ConfigError
+    from swarm.order_book import SETTINGS
     from swarm.wire.messages.orders import GiveOrder
 
     if as_scenario == (value is not None):
         raise ConfigError("set: give either a value or --as-scenario")
+    if key not in SETTINGS:
+        raise ConfigError(f"set: {key!r} cannot change while the swarm runs{choice(key, list(SETTINGS))}")
     fields = {"subject": "set", "name": key, "value": value, "off": as_scenario}
     give([checked(GiveOrder, fields)], where, tls, as_json)
 
@@ -96,7 +118,10 @@ def set_(
 @app.command(rich_help_panel=_PANEL)
 @spread
 def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Print what is ordered and not taken back. Zones are in `swarm zone list`."""
+    """Print what is ordered and not taken back. Zones are in `swarm zone list`.
+
+    swarm orders --json
+    """
     import msgspec
 
     from swarm.bus.zenoh_bus import open_bus

@@ -6,12 +6,15 @@ from typing import Annotated, Any
 
 import typer
 
+from launch_scripts.command_line import complete
 from launch_scripts.commands.orders.order_options import checked, give
 from launch_scripts.commands.query import Where
 from launch_scripts.commands.shared_options import AsJson, Tls, spread
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-Id = Annotated[str, typer.Argument(metavar="ID", help="The target, such as t3.")]
+Id = Annotated[
+    str, typer.Argument(metavar="ID", help="The target, such as t3.", autocompletion=complete.target_ids)
+]
 At = Annotated[
     str, typer.Option(metavar="PLACE", help="Where it is: LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL.")
 ]
@@ -29,7 +32,13 @@ def add(
     at: At,
     where: Where,
     tls: Tls,
-    walk: Annotated[str, typer.Option(help="still, random, waypoints or evade, as in a scenario.")] = "waypoints",
+    walk: Annotated[
+        str,
+        typer.Option(
+            help="still, random, waypoints or evade, as in a scenario.",
+            autocompletion=complete.words("swarm.config.scenario", "Walk"),
+        ),
+    ] = "waypoints",
     speed: Annotated[float, typer.Option(help="Metres per second on level open ground.")] = 4.0,
     as_json: AsJson = False,
 ) -> None:
@@ -45,14 +54,20 @@ def add(
 @app.command()
 @spread
 def move(id: Id, at: At, where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Put a target somewhere else; it goes on from there."""
+    """Put a target somewhere else; it goes on from there.
+
+    swarm target move t3 --at cell:40,200
+    """
     _give({"name": id}, where, tls, as_json, at)
 
 
 @app.command()
 @spread
 def remove(id: Id, where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Remove a target. Its planner ends, and the vehicles that chased it chase others."""
+    """Remove a target. Its planner ends, and the vehicles that chased it chase others.
+
+    swarm target remove t3
+    """
     _give({"name": id, "off": True}, where, tls, as_json)
 
 

@@ -84,6 +84,8 @@ def add(
     if file is None:
         if layer is not None or crs is not None:
             raise ConfigError("zone add: --layer and --crs go with --file")
+        if polygon is None and polygon_m is None:
+            raise ConfigError("zone add: give --polygon, --polygon-m or --file; `swarm zone add -h` shows examples")
         _give(checked(ZoneOrder, fields), where, tls, as_json, places)
         return
     if polygon is not None or polygon_m is not None:
@@ -99,7 +101,10 @@ def add(
 def remove(
     name: Annotated[str, typer.Argument(metavar="NAME")], where: Where, tls: Tls, as_json: AsJson = False
 ) -> None:
-    """Open a zone again."""
+    """Open a zone again.
+
+    swarm zone remove bridge
+    """
     from swarm.wire.messages.orders import ZoneOrder
 
     _give(checked(ZoneOrder, {"action": "remove", "name": name}), where, tls, as_json)
@@ -108,7 +113,10 @@ def remove(
 @app.command(name="list")
 @spread
 def list_zones(where: Where, tls: Tls, as_json: AsJson = False) -> None:
-    """Print the zones that stand."""
+    """Print the zones that stand.
+
+    swarm zone list
+    """
     from launch_scripts.commands.run_frame import frame_of_run
     from swarm.bus.zenoh_bus import open_bus
     from swarm.orders import Operator

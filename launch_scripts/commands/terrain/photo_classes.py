@@ -47,6 +47,8 @@ def classify(
 ) -> None:
     """Say what a photo shows: water, forest, rock, grass, soil, road, built, snow.
 
+    swarm terrain classify dem.tif photo.tif --labels labels.toml --picture classes.png
+
     Without --labels by rules. With labels the classes are learnt from them,
     and two tables show what the labelled cells were taken for: by the rules,
     and by a model that had not seen the polygon it was asked about.

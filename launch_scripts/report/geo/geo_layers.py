@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -50,19 +51,79 @@ class Layer:
     features: list[Feature] = field(default_factory=list)
 
 
-def track_layers(tracks: RunTracks) -> list[Layer]:
-    """Where vehicles and targets went, and where targets were captured."""
-    vehicles = Layer("vehicle_tracks", "LineString", {"vehicle": "text", **_TIMED})
+def track_layers(tracks: RunTracks, groups: Mapping[str, str]) -> list[Layer]:
+    """Where vehicles and targets went, and where each stood that never moved: a line has a length.
+
+    groups  vehicle -> its group
+    """
+    vehicles = Layer("vehicle_tracks", "LineString", {"vehicle": "text", "group": "text", **_TIMED})
     targets = Layer("target_tracks", "LineString", {"target": "text", "piece": "int", **_TIMED})
-    captures = Layer("captures", "Point", {"target": "text", "at": "time"})
-    vehicles.features.extend(_moved(each, {"vehicle": each.id}) for each in tracks.vehicles if len(each.time_ns))
-    targets.features.extend(
-        _moved(each, {"target": each.id, "piece": each.piece}) for each in tracks.targets if len(each.time_ns)
+    standing = [
+        Layer(f"{lines.name.removesuffix('_tracks')}s_standing", "Point", lines.fields)
+        for lines in (vehicles, targets)
+    ]
+    named: tuple[list[tuple[Track, dict[str, Value]]], ...] = (
+        [(each, {"vehicle": each.id, "group": groups.get(each.id)}) for each in tracks.vehicles],
+        [(each, {"target": each.id, "piece": each.piece}) for each in tracks.targets],
     )
+    for lines, points, each_named in zip((vehicles, targets), standing, named, strict=True):
+        for track, values in each_named:
+            if not len(track.time_ns):
+                continue
+            moved = _moved(track, values)
+            if moved.values["length_m"] == 0:
+                points.features.append(Feature([track.xy_m[:1]], moved.values))
+            else:
+                lines.features.append(moved)
+    return [vehicles, targets, *(points for points in standing if points.features)]
+
+
+def capture_layer(tracks: RunTracks) -> Layer:
+    """Where targets were captured."""
+    captures = Layer("captures", "Point", {"target": "text", "at": "time"})
     captures.features.extend(
         Feature([each.xy_m], {"target": each.id, "at": _time(each.time_ns[0])}) for each in tracks.captures
     )
-    return [vehicles, targets, captures]
+    return captures
+
+
+def route_layer(tracks: RunTracks) -> Layer:
+    """The routes that vehicles began: over the middles of cells, straight on where they go straight on. One that
+    stays in its cell is none."""
+    grid = tracks.grid
+    layer = Layer(
+        "routes", "LineString",
+        {"vehicle": "text", "target": "text", "at": "time", "cost_s": "real", "certified_gap": "real",
+         "length_m": "real"},
+    )  # fmt: skip
+    for route in tracks.routes:
+        rows, cols = np.divmod(route.cells, grid.cols)
+        turns = np.ones(len(rows), bool)
+        turns[1:-1] = (np.diff(rows, 2) != 0) | (np.diff(cols, 2) != 0)
+        x_m = grid.west_m + (cols[turns] + 0.5) * grid.resolution_m
+        y_m = grid.north_m - (rows[turns] + 0.5) * grid.resolution_m
+        length_m = float(np.hypot(np.diff(x_m), np.diff(y_m)).sum())
+        if length_m > 0:
+            values: dict[str, Value] = {
+                "vehicle": route.vehicle,
+                "target": route.target,
+                "at": _time(np.int64(route.time_ns)),
+                "cost_s": route.cost_s,
+                "certified_gap": route.gap if math.isfinite(route.gap) else None,
+                "length_m": round(length_m, 2),
+            }
+            layer.features.append(Feature([np.stack([x_m, y_m], axis=1)], values))
+    return layer
+
+
+def marks_of_tracks(tracks: RunTracks) -> Layer:
+    """What was marked at the end, as `mark_layer`."""
+    grid, marks = tracks.grid, tracks.marks
+    shape = (grid.rows, grid.cols)
+    kinds, paces, stamps_ns = np.full(shape, 255, np.uint8), np.zeros(shape, np.float32), np.zeros(shape, np.int64)
+    for array, values in ((kinds, marks.kinds), (paces, marks.paces), (stamps_ns, marks.stamps_ns)):
+        array.reshape(-1)[marks.cells] = values
+    return mark_layer(grid, kinds, paces, stamps_ns)
 
 
 def _moved(track: Track, values: dict[str, Value]) -> Feature:
@@ -70,9 +131,6 @@ def _moved(track: Track, values: dict[str, Value]) -> Feature:
     steps_m = np.hypot(*np.diff(track.xy_m, axis=0).T)
     still = np.zeros(len(track.time_ns), bool)
     still[1:-1] = (steps_m[:-1] == 0) & (steps_m[1:] == 0)
-    xy_m, time_ns = track.xy_m[~still], track.time_ns[~still]
-    if len(xy_m) == 1:  # a line has two points
-        xy_m, time_ns = np.repeat(xy_m, 2, axis=0), np.repeat(time_ns, 2)
     values = {
         **values,
         "begins": _time(track.time_ns[0]),
@@ -80,7 +138,7 @@ def _moved(track: Track, values: dict[str, Value]) -> Feature:
         "samples": len(track.time_ns),
         "length_m": round(float(steps_m.sum()), 2),
     }
-    return Feature([xy_m], values, time_ns)
+    return Feature([track.xy_m[~still]], values, track.time_ns[~still])
 
 
 def mark_layer(
@@ -177,14 +235,14 @@ def _json_features(layers: list[Layer], frame: MapFrame) -> Iterator[dict[str, A
                     geometry = line(feature.parts[0], frame)
                 case "Point":
                     geometry = point(feature.parts[0], frame)
-            values = {name: _iso(value) for name, value in feature.values.items()}
+            values = {name: iso_time(value) for name, value in feature.values.items()}
             properties: dict[str, Any] = {"layer": layer.name, **values}
             if feature.time_ns is not None:
-                properties["times"] = [_iso(_time(each)) for each in feature.time_ns]
+                properties["times"] = [iso_time(_time(each)) for each in feature.time_ns]
             yield {"type": "Feature", "properties": properties, "geometry": geometry}
 
 
-def _iso(value: Value) -> Any:
+def iso_time(value: Value) -> Any:
     if isinstance(value, np.datetime64):
         moment = datetime.datetime.fromtimestamp(int(value.astype(np.int64)) / 1000, datetime.UTC)
         return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -201,7 +259,7 @@ def _gpkg(path: Path, layers: list[Layer], frame: MapFrame) -> None:
             f"--out {path}: a GeoPackage needs pyogrio: pip install 'terrain-swarm[vectors]'"
         ) from error
 
-    layers_of_lines = [layer for layer in layers if layer.shape == "LineString"]
+    layers_of_lines = [layer for layer in layers if any(each.time_ns is not None for each in layer.features)]
     partial = path.with_name(f"{path.stem}.part.gpkg")
     partial.unlink(missing_ok=True)
     try:

@@ -11,6 +11,9 @@ YELLOW, BLACK, GREY = "#FFD21F", "#1b1b1b", "#b8bcc0"
 INK, FAINT, RULE = "#22272e", "#6b7480", "#d5dade"
 
 MARKED_LETHAL, MARKED_SLOW = VIOLET, ORANGE
+LETHAL_GROUND, FORBIDDEN = "#39404a", YELLOW
+GROUPS = (GREEN, BLUE, PINK, SKY, BLACK)
+"""Of groups, in the scenario's order; then from the first again."""
 STATE_COLOURS = {
     VehicleState.FOLLOWING: GREEN,
     VehicleState.ARRIVED: BLUE,

@@ -1,14 +1,14 @@
-"""Plots of a run over time, beside the map."""
+"""Plots of a run, drawn from its report: for the picture, the page and comparisons."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from launch_scripts.report.pictures.palette import (
     BLUE,
-    DARK_GREEN,
     FAINT,
     GREEN,
     INK,
@@ -26,184 +25,305 @@ from launch_scripts.report.pictures.palette import (
     STATE_COLOURS,
     VIOLET,
 )
-from launch_scripts.report.recorder import Recorder
-from launch_scripts.report.samples import Sample, messages_per_s
-from swarm.runtime.stats import Histogram
+from launch_scripts.report.results.certified_gap import percent
+from launch_scripts.report.run_state.facts import duration
+
+Report = Mapping[str, Any]
+NO_GAP = 5e-7
+"""Gaps below this above the optimum are rounding errors of float32 sums."""
+_WIDE = 1.7
+_HALF = 0.5
 
 
-def draw_plots(figure: Figure, recorder: Recorder) -> None:
-    samples = recorder.samples.all()
-    left, width, height, gap = 0.648, 0.304, 0.107, 0.0556
-    axes = [figure.add_axes((left, 0.708 - n * (height + gap), width, height)) for n in range(5)]
-    end_s = max((sample.time_s for sample in samples), default=1.0) or 1.0
-    _plot_states(axes[0], samples)
-    _plot_totals(axes[1], samples, recorder)
-    _plot_gaps(axes[2], samples)
-    _plot_messages(axes[3], samples)
-    _plot_timings(axes[4], recorder)
-    for each in axes[:4]:
-        each.set_xlim(0, end_s)
-        each.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} s" if value else "0"))
-        each.tick_params(axis="both", length=0)
-        each.tick_params(axis="x", labelbottom=each is axes[3])
-        each.yaxis.set_major_locator(MaxNLocator(4, integer=each is not axes[2]))
-    for each in axes:
-        each.spines[["top", "right"]].set_visible(False)
+@dataclass(frozen=True)
+class Plot:
+    """draw  draws it, from a report, on axes whose title is set; False if the run did not measure it
+    over_time  whether its horizontal axis is the run's seconds
+    """
+
+    name: str
+    title: str
+    meaning: str
+    draw: Callable[[Axes, Report], bool]
+    over_time: bool = True
 
 
-def _plot_states(axes: Axes, samples: list[Sample]) -> None:
-    axes.set_title("Vehicles")
-    if not samples:
-        _nothing(axes)
-        return
-    time_s = [sample.time_s for sample in samples]
-    order = list(STATE_COLOURS)
-    counts = np.array([[sample.states[state] for sample in samples] for state in order])
-    axes.stackplot(time_s, counts, colors=[STATE_COLOURS[state] for state in order], linewidth=0)
-    axes.set_ylim(0, max(counts.sum(axis=0).max(), 1))
-    shown = [state for state, row in zip(order, counts, strict=True) if row.any()]
-    _legend_above(axes, [Patch(facecolor=STATE_COLOURS[state], label=state.name.lower()) for state in shown])
+def draw_plot(axes: Axes, plot: Plot, report: Report, *, titled: bool = True) -> None:
+    """Draw one plot and its axes."""
+    if titled:
+        axes.set_title(plot.title)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(axis="both", length=0)
+    if not plot.draw(axes, report):
+        axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=FAINT)
+        axes.set_yticks([])
+        axes.set_xticks([])
+    elif plot.over_time:
+        axes.set_xlim(0, max(report["series"]["t_s"], default=1.0) or 1.0)
+        axes.xaxis.set_major_locator(MaxNLocator(6))
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} s" if value else "0"))
 
 
-def _plot_totals(axes: Axes, samples: list[Sample], recorder: Recorder) -> None:
-    axes.set_title("Captures and marks")
-    marks = [(sample.time_s, sample.marks) for sample in samples if sample.marks is not None]
-    captures = [(sample.time_s, sample.captures) for sample in samples if sample.captures is not None]
-    if not marks and not captures:
-        _nothing(axes)
-        return
+def told(report: Report, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times and values of a series, where there are values."""
+    series = report.get("series", {})
+    pairs = [(t, v) for t, v in zip(series.get("t_s", []), series.get(name, []), strict=False) if v is not None]
+    times, values = np.array(pairs, np.float64).reshape(-1, 2).T
+    return times, values
+
+
+# --- over time --------------------------------------------------------------------------------------------------
+
+
+def _states(axes: Axes, report: Report) -> bool:
+    series = report["series"]
+    counts = {state: series.get(state.name.lower()) for state in STATE_COLOURS}
+    if not series["t_s"] or None in counts.values():
+        return False
+    shown = {state: np.array(row) for state, row in counts.items() if any(row)}
+    axes.stackplot(series["t_s"], *shown.values(), colors=[STATE_COLOURS[state] for state in shown], linewidth=0)
+    axes.set_ylim(0, max(sum(shown.values(), np.zeros(1)).max(), 1))
+    _whole(axes)
+    legend_above(axes, [Patch(facecolor=STATE_COLOURS[state], label=state.name.lower()) for state in shown])
+    return True
+
+
+def _totals(axes: Axes, report: Report) -> bool:
+    (mark_s, marks), (capture_s, captures) = told(report, "marks"), told(report, "captures")
     handles = []
-    if captures:
-        axes.step(*zip(*captures, strict=True), where="post", color=GREEN, linewidth=2.2)
-        axes.set_ylim(0, max(max(n for _, n in captures) * 1.08, 1))
-        axes.tick_params(axis="y", colors=DARK_GREEN)
-        handles.append(Line2D([], [], color=GREEN, linewidth=2.2, label="captures"))
-    if marks:
+    if len(captures):
+        axes.step(capture_s, captures, where="post", color=GREEN, linewidth=2.0)
+        axes.set_ylim(0, max(captures.max() * 1.08, 1))
+        _whole(axes)
+        handles.append(Line2D([], [], color=GREEN, linewidth=2.0, label="captures"))
+    if len(marks):
         right = axes.twinx()
-        right.plot(*zip(*marks, strict=True), color=VIOLET, linewidth=1.8)
-        right.set_ylim(0, max(max(n for _, n in marks) * 1.08, 1))
+        right.plot(mark_s, marks, color=VIOLET, linewidth=_WIDE, linestyle=(0, (4, 1.2)))
+        right.set_ylim(0, max(marks.max() * 1.08, 1))
         right.grid(False)
         right.tick_params(axis="y", colors=VIOLET, length=0)
-        right.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-        right.yaxis.set_major_formatter(FuncFormatter(_short))
+        _whole(right)
         right.spines[["top", "left", "right"]].set_visible(False)
-        handles.append(Line2D([], [], color=VIOLET, linewidth=1.8, label="marks (right)"))
-    _legend_above(axes, handles)
+        handles.append(Line2D([], [], color=VIOLET, linewidth=_WIDE, linestyle=(0, (3, 1)), label="marks (right)"))
+    legend_above(axes, handles)
+    return bool(handles)
 
 
-def _plot_gaps(axes: Axes, samples: list[Sample]) -> None:
-    axes.set_title("Gap to optimum, %")
-    series: dict[str, list[tuple[float, float]]] = {}
-    for sample in samples:
-        for id, gap in sample.gaps.items():
-            if np.isfinite(gap):  # of a route without a proven bound it is infinite
-                series.setdefault(id, []).append((sample.time_s, (gap - 1) * 100))
-    if not series:
-        _nothing(axes)
-        return
-    for points in series.values():
-        axes.plot(*zip(*points, strict=True), color=SKY, linewidth=0.7, alpha=0.7)
-    at: dict[float, list[float]] = {}
-    for points in series.values():
-        for when_s, gap in points:
-            at.setdefault(when_s, []).append(gap)
-    time_s = sorted(at)
-    values = [np.array(at[when_s]) for when_s in time_s]
-    axes.plot(time_s, [np.percentile(gaps, 95) for gaps in values], color=ORANGE, linewidth=1.4)
-    axes.plot(time_s, [gaps.mean() for gaps in values], color=BLUE, linewidth=2.2)
-    axes.set_ylim(0, max(float(np.percentile(np.concatenate(values), 99.5)) * 1.1, 0.1))
-    lines = (("mean", BLUE, 2.2), ("p95", ORANGE, 1.4), ("each target", SKY, 0.9))
-    _legend_above(axes, [Line2D([], [], color=c, linewidth=w, label=label) for label, c, w in lines])
+def _gaps(axes: Axes, report: Report) -> bool:
+    (time_s, mean), (p95_s, p95) = told(report, "certified_gap_mean"), told(report, "certified_gap_p95")
+    if not len(mean):
+        return False
+    mean, p95 = (np.maximum(values - 1, 0) * 100 for values in (mean, p95))
+    dots: dict[str, Any] = {"marker": "o", "markersize": 2.2} if len(mean) < 80 else {}
+    axes.fill_between(time_s, mean, p95, color=ORANGE, alpha=0.2, linewidth=0)
+    axes.plot(p95_s, p95, color=ORANGE, linewidth=1.3, clip_on=False, **dots)
+    axes.plot(time_s, mean, color=BLUE, linewidth=2.0, clip_on=False, **dots)
+    show_percent(axes, float(p95.max()))
+    if p95.max() < NO_GAP * 100:
+        _say(axes, "0%: each of these routes is proven optimal")
+    whole = report["certified_gap"]
+    legend_above(
+        axes,
+        [
+            Line2D([], [], color=BLUE, linewidth=2.0, label=f"mean {percent(whole['mean'])}"),
+            Line2D([], [], color=ORANGE, linewidth=1.3, label=f"p95 {percent(whole['p95'])}"),
+        ],
+    )
+    return True
 
 
-def _plot_messages(axes: Axes, samples: list[Sample]) -> None:
-    axes.set_title("Messages per second")
-    rates = messages_per_s(samples)
-    if not rates:
-        _nothing(axes)
-        return
-    time_s, rate = zip(*rates, strict=True)
+def _waiting(axes: Axes, report: Report) -> bool:
+    (wait_s, waiting), (stand_s, standing) = told(report, "waiting_at_once"), told(report, "standing_at_once")
+    if not len(waiting):
+        return False
+    axes.fill_between(wait_s, waiting, color=ORANGE, alpha=0.35, linewidth=0)
+    axes.plot(wait_s, waiting, color=ORANGE, linewidth=_WIDE)
+    axes.plot(stand_s, standing, color=BLUE, linewidth=1.4, linestyle=(0, (4, 1.2)))
+    axes.set_ylim(0, max(waiting.max(), standing.max(), 0.9) * 1.1)
+    if not waiting.any() and not standing.any():
+        _say(axes, "nobody waited")
+    legend_above(
+        axes,
+        [
+            Line2D([], [], color=ORANGE, linewidth=_WIDE, label="for a route"),
+            Line2D([], [], color=BLUE, linewidth=1.4, linestyle=(0, (3, 1)), label="with a route"),
+        ],
+    )
+    return True
+
+
+def _growing(axes: Axes, report: Report) -> bool:
+    time_s, growth_ms = told(report, "growth_ms_mean")
+    if not len(growth_ms):
+        return False
+    axes.plot(time_s, growth_ms, color=GREEN, linewidth=_WIDE)
+    axes.set_ylim(0, max(growth_ms.max() * 1.15, 1e-3))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _tick_ms(value) if value else "0"))
+    return True
+
+
+def _messages(axes: Axes, report: Report) -> bool:
+    time_s, rate = told(report, "messages_per_s")
+    if not len(rate):
+        return False
     axes.fill_between(time_s, rate, color=SKY, alpha=0.35, linewidth=0)
-    axes.plot(time_s, rate, color=BLUE, linewidth=1.8)
-    axes.set_ylim(0, max(rate) * 1.12 or 1)
-    axes.yaxis.set_major_formatter(FuncFormatter(_short))
+    axes.plot(time_s, rate, color=BLUE, linewidth=_WIDE)
+    axes.set_ylim(0, rate.max() * 1.12 or 1)
+    _whole(axes)
+    return True
 
 
-_TIMED = (
+# --- of all -----------------------------------------------------------------------------------------------------
+
+
+def _shares(axes: Axes, report: Report) -> bool:
+    """Share of the routes that are proven to be within so much of the optimum."""
+    excess = np.array(report.get("distributions", {}).get("followed_gap_excess", []), np.float64).reshape(-1, 2)
+    unproven = report["certified_gap"].get("unproven") or 0
+    routes = excess[:, 1].sum() + unproven
+    if not routes:
+        return False
+    least, most = 0.01, 100.0
+    edges = np.concatenate(
+        [[least], np.clip(100 * excess[:, 0], least, None), [max(most, 100 * excess[:, 0].max(initial=0))]]
+    )
+    below = np.concatenate([[0.0], np.cumsum(excess[:, 1]), [excess[:, 1].sum()]]) / routes * 100
+    at_least = below[edges <= least][-1]
+    below[edges <= least] = at_least
+    axes.set_xscale("log")
+    axes.fill_between(edges, below, step="post", color=BLUE, alpha=0.2, linewidth=0)
+    axes.step(edges, below, where="post", color=BLUE, linewidth=2.0)
+    axes.set_xlim(least, edges[-1])
+    axes.set_ylim(0, 105)
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}%"))
+    axes.xaxis.set_major_locator(LogLocator(numticks=6))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}%"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    legend_above(axes, [Line2D([], [], color=BLUE, linewidth=2.0, label=f"of {routes:,.0f} routes")])
+    return True
+
+
+TIMED = (
     ("growth_ms", "tree growth", GREEN),
     ("route_query_ms", "route query", BLUE),
     ("mark_to_tree_ms", "mark to tree", VIOLET),
 )
 
 
-def _plot_timings(axes: Axes, recorder: Recorder) -> None:
-    axes.set_title("How long it takes")
-    timed = [(label, colour, recorder.observed.histogram(name)) for name, label, colour in _TIMED]
-    timed = [(label, colour, histogram) for label, colour, histogram in timed if histogram.count]
+def _timings(axes: Axes, report: Report) -> bool:
+    distributions = report.get("distributions", {})
+    timed = [(label, colour, distributions.get(name), report[name]) for name, label, colour in TIMED]
+    timed = [row for row in timed if row[2]]
     if not timed:
-        _nothing(axes)
-        return
+        return False
     axes.set_xscale("log")
-    for row, (label, colour, histogram) in enumerate(reversed(timed)):
-        values, heights = density(histogram)
-        axes.fill_between(values, row, row + 0.8 * heights, color=colour, alpha=0.55, linewidth=0)
-        axes.plot(values, row + 0.8 * heights, color=colour, linewidth=1.2)
-        p50, p99 = (histogram.quantile(q) or 0.0 for q in (0.5, 0.99))
-        axes.plot([p50, p50], [row, row + 0.8], color=INK, linewidth=1.4)
-        text = f"{label}  p50 {duration(p50)}, p99 {duration(p99)}"
+    for row, (label, colour, counts, quantiles) in enumerate(reversed(timed)):
+        values, heights = density(counts)
+        axes.fill_between(values, row, row + _HALF * heights, color=colour, alpha=0.55, linewidth=0)
+        axes.plot(values, row + _HALF * heights, color=colour, linewidth=1.2)
+        p50 = quantiles["p50"] or values[0]
+        axes.plot([p50, p50], [row, row + _HALF], color=INK, linewidth=1.4)
+        text = f"{label}: p50 {duration(quantiles['p50'])}, p99 {duration(quantiles['p99'])}"
         axes.text(
-            1.0, row + 0.62, text, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=8.5,
+            0.995, row + 0.76, text, transform=axes.get_yaxis_transform(), ha="right", va="center", fontsize=8.5,
             color=INK, path_effects=halo(),
         )  # fmt: skip
-    low, high = axes.get_xlim()
-    axes.set_xlim(low, high * (high / low) ** 1.1)  # room for the labels
     axes.set_ylim(0, len(timed))
     axes.set_yticks([])
     axes.tick_params(axis="x", which="both", length=0)
-    axes.xaxis.set_major_locator(LogLocator(numticks=9))
-    axes.xaxis.set_major_formatter(
-        FuncFormatter(
-            lambda value, _: "" if value > high else f"{value:g} ms" if value < 1000 else f"{value / 1000:g} s"
-        )
-    )
+    axes.xaxis.set_major_locator(LogLocator(numticks=7))
+    axes.xaxis.set_major_formatter(FuncFormatter(_tick_ms))
     axes.xaxis.set_minor_formatter(NullFormatter())
+    return True
 
 
-def density(histogram: Histogram) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Values and heights (largest 1) of a histogram, smoothed over the logarithm of the value."""
-    buckets = {bucket: count for bucket, count in histogram.buckets.items() if bucket > -1000}
-    if not buckets:
+def density(counts: Sequence[Sequence[float]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Values and heights (largest 1) of [value, count] pairs, smoothed over the logarithm of the value."""
+    some = np.array([pair for pair in counts if pair[0] > 1e-9], np.float64).reshape(-1, 2)
+    if not len(some):
         return np.array([0.001, 0.002]), np.array([1.0, 0.0])
-    low, high = min(buckets) - 12, max(buckets) + 12
-    counts = np.zeros(high - low + 1)
-    for bucket, count in buckets.items():
-        counts[bucket - low] = count
-    kernel = np.exp(-0.5 * (np.arange(-8, 9) / 3.0) ** 2)
-    smooth = np.convolve(counts, kernel, mode="same")
-    return np.exp(np.arange(low, high + 1) * math.log(1.04)), smooth / smooth.max()
+    buckets = np.rint(np.log(some[:, 0]) / _BUCKET).astype(int)
+    low = buckets.min() - 12
+    heights = np.zeros(buckets.max() + 13 - low)
+    np.add.at(heights, buckets - low, some[:, 1])
+    smooth = np.convolve(heights, np.exp(-0.5 * (np.arange(-8, 9) / 3.0) ** 2), mode="same")
+    return np.exp((low + np.arange(len(heights))) * _BUCKET), smooth / smooth.max()
 
 
-def _legend_above(axes: Axes, handles: Iterable[Any]) -> None:
+_BUCKET = math.log(1.04)
+
+PLOTS = (
+    Plot("states", "Vehicles", "What the vehicles were doing.", _states),
+    Plot(
+        "totals",
+        "Captures and marks",
+        "Captures of all targets, and what vehicles found that the map did not know.",
+        _totals,
+    ),
+    Plot(
+        "gaps",
+        "Certified gap",
+        "How far above the optimum the routes that vehicles began can be at most: each comes with a proven lower "
+        "bound.",
+        _gaps,
+    ),
+    Plot(
+        "waiting",
+        "Waiting",
+        "How many vehicles waited at the same time: for a route, or with one, as where others pass.",
+        _waiting,
+    ),
+    Plot("growing", "Growing a tree", "Time of the last growth of a tree, mean over targets.", _growing),
+    Plot("messages", "Messages per second", "Of all processes together.", _messages),
+    Plot(
+        "shares",
+        "Routes within a gap",
+        "Share of the routes that are proven to be at most so far above the optimum.",
+        _shares,
+        over_time=False,
+    ),
+    Plot(
+        "timings",
+        "How long it takes",
+        "Distributions on a logarithmic scale; the line is the median.",
+        _timings,
+        over_time=False,
+    ),
+)
+"""All plots, in the order in which they are shown."""
+
+
+def show_percent(axes: Axes, most: float) -> None:
+    """A vertical axis of percentages from 0 to a little above the largest."""
+    axes.set_ylim(0, max(most * 1.12, 0.1))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}%"))
+
+
+def legend_above(axes: Axes, handles: Iterable[Any]) -> None:
     axes.legend(
-        handles=list(handles), loc="lower right", bbox_to_anchor=(1.0, 0.985), ncol=6, handlelength=1.0,
+        handles=list(handles), loc="lower right", bbox_to_anchor=(1.0, 0.985), ncol=6, handlelength=1.2,
         handletextpad=0.4, columnspacing=1.0, borderaxespad=0.2, fontsize=8.5,
     )  # fmt: skip
+
+
+def _whole(axes: Axes) -> None:
+    axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    axes.yaxis.set_major_formatter(FuncFormatter(_short))
+
+
+def _say(axes: Axes, text: str) -> None:
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=FAINT, fontsize=9)
 
 
 def _short(value: float, _: object = None) -> str:
     return f"{value / 1000:g}k" if abs(value) >= 1000 else f"{value:g}"
 
 
-def _nothing(axes: Axes) -> None:
-    axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=FAINT)
-    axes.set_yticks([])
-
-
-def duration(milliseconds: float | None) -> str:
-    """A number for a person to read."""
-    if milliseconds is None:
-        return "–"
-    return f"{milliseconds:.3g} ms" if milliseconds < 999.5 else f"{milliseconds / 1000:.3g} s"
+def _tick_ms(value: float, _: object = None) -> str:
+    return f"{value:g} ms" if value < 1000 else f"{value / 1000:g} s"
 
 
 def halo() -> list[Any]:

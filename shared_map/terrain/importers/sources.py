@@ -133,7 +133,7 @@ def _jacksboro_path() -> Path:
 
 def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     if not path.exists():
-        raise TerrainError(f"terrain {path} does not exist; give {FILE_KINDS}, or jacksboro or synthetic")
+        raise TerrainError(f"terrain {path} does not exist: no such file; give one, or jacksboro or synthetic")
     if path.is_dir():
         raise TerrainError(f"terrain {path} is a folder; give a file: {FILE_KINDS}")
     suffix = path.suffix.lower()

@@ -110,6 +110,20 @@ class BoundaryBus:
             for chunks, payload in samples
         ]
 
+    def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
+        heard: list[tuple[str, Message]] | None = None
+
+        def collect() -> bytes:
+            nonlocal heard
+            heard = self._bus.collected_together(topic)
+            return content_of([(key, content_of(message)) for key, message in heard])
+
+        content = self._crossing.read(f"collected together {topic.name}", collect)
+        if heard is not None:
+            return heard
+        samples = unpack(content, list[tuple[str, bytes]])
+        return [(key, decode(payload, topic.message)) for key, payload in samples]
+
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         self._says("unsubscribe", topic, fields)
         self._bus.unsubscribe(topic, **fields)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from launch_scripts import ports
 from launch_scripts.cli import main
 from launch_scripts.launcher import options
 from swarm.config.load import load_scenario
@@ -71,7 +72,7 @@ def test_the_launcher_never_imports_numba_or_rerun() -> None:
 def test_an_unknown_scenario_gets_the_nearest_name(run) -> None:  # type: ignore[no-untyped-def]
     code, out, err = run("up", "jaksboro")
     assert (code, out) == (2, "")
-    assert err.startswith("swarm: no scenario 'jaksboro' (did you mean 'jacksboro'?)")
+    assert err.startswith("swarm: no scenario 'jaksboro'; did you mean 'jacksboro'?")
 
 
 def test_a_misspelt_key_is_named_with_its_file_and_the_nearest_one(run, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
@@ -93,10 +94,8 @@ def test_a_scenario_file_that_is_not_there(run, tmp_path: Path) -> None:  # type
 
 def test_an_unknown_role_is_refused(run) -> None:  # type: ignore[no-untyped-def]
     code, _, err = run("up", "synthetic", "--only", "driver")
-    assert (code, err) == (
-        2,
-        "swarm: --only: no role 'driver'; the roles are router, keeper, monitor, planner, targets, agent\n",
-    )
+    roles = "'router', 'keeper', 'monitor', 'planner', 'targets', 'agent'"
+    assert (code, err) == (2, f"swarm: --only: no role 'driver'; the roles are {roles}\n")
 
 
 def test_a_planner_for_a_target_that_the_scenario_does_not_have(run) -> None:  # type: ignore[no-untyped-def]
@@ -124,7 +123,7 @@ def test_runs_where_nobody_may_write(run, tmp_path: Path) -> None:  # type: igno
 
 
 def test_nobody_there_to_ask(run) -> None:  # type: ignore[no-untyped-def]
-    (port,) = options.free_ports(1)
+    (port,) = ports.free_ports(1)
     code, _, err = run("status", "--connect", f"tcp/127.0.0.1:{port}")
     assert code == 4
     assert err.startswith(f"swarm: cannot reach a router at tcp/127.0.0.1:{port}")
@@ -159,9 +158,9 @@ def test_a_port_gives_the_live_view_the_two_after_it_and_0_picks_free_ones() -> 
     assert scenario.network.listen == scenario.network.connect == ("tcp/127.0.0.1:8000",)
     assert (scenario.monitor.grpc_port, scenario.monitor.web_port) == (8001, 8002)
     free = options.with_port(Scenario(), 0)
-    ports = {free.network.listen[0].rpartition(":")[2], str(free.monitor.grpc_port), str(free.monitor.web_port)}
-    assert len(ports) == 3
-    options.check_ports(free, ("router", "monitor"))
+    found = {free.network.listen[0].rpartition(":")[2], str(free.monitor.grpc_port), str(free.monitor.web_port)}
+    assert len(found) == 3
+    ports.check_ports(free, ("router", "monitor"))
 
 
 def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
@@ -175,8 +174,8 @@ def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
         monitor = msgspec.structs.replace(scenario.monitor, web_port=port)
         scenario = msgspec.structs.replace(scenario, monitor=monitor)
         with pytest.raises(BusError, match=f"port {port}, which the live view needs"):
-            options.check_ports(scenario, ("router", "monitor"))
-        options.check_ports(scenario, ("router", "agent"))
+            ports.check_ports(scenario, ("router", "monitor"))
+        ports.check_ports(scenario, ("router", "agent"))
 
 
 def test_a_run_has_one_folder_whenever_it_is_started_again(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
 def test_whoever_opens_the_view_late_has_all_of_it_soon(
     scenario: Scenario, terrain: Terrain, tmp_path: Path
 ) -> None:
-    """As if the server had dropped what is old: the newest ten seconds hold every component of all that is there."""
+    """As if the server had dropped what is old: its last ten seconds hold every component."""
     longer = msgspec.structs.replace(scenario, seconds=16.0)
     rig = Rig(longer, terrain, tmp_path / "run.rrd")
     rig.play(fake_run(terrain, hidden_truth(terrain), longer))

@@ -151,8 +151,9 @@ def test_no_target_has_two_labels_and_none_that_is_drawn_has_none(
 @given(
     st.lists(
         st.builds(
-            Alarm, kind=st.sampled_from([*KINDS, "new"]), about=st.sampled_from(["agent-a0", "agent-a9", "planner-t0"]),
-            text=st.just("."), since_s=st.just(1.0), over_s=st.none() | st.floats(0, 50),
+            Alarm, kind=st.sampled_from([*KINDS, "new"]),
+            about=st.sampled_from(["agent-a0", "agent-a9", "planner-t0"]), text=st.just("."),
+            since_s=st.just(1.0), over_s=st.none() | st.floats(0, 50),
             cell=st.none() | st.integers(0, 500), target=st.none() | st.sampled_from(["t0", "t9"]),
         ),
         max_size=40,

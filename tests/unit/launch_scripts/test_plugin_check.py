@@ -91,7 +91,7 @@ def test_what_is_wrong_is_found_and_said(kind: str, body: str, said: str, folder
 
 
 def test_a_kind_that_is_none_and_a_plugin_that_is_nowhere_are_refused() -> None:
-    with pytest.raises(ConfigError, match="no kind of plug-in 'eye': it is one of sensor, walk"):
+    with pytest.raises(ConfigError, match="no kind of plug-in 'eye'; allowed: 'sensor', 'walk'"):
         check_plugin("eye", "truth")
     assert check_plugin("sensor", "nowhere_at_all:Eye")[0].startswith("sensor: 'nowhere_at_all:Eye' could not be")
 

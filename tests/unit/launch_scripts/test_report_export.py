@@ -1,7 +1,8 @@
-"""`swarm report export`: tracks, captures and marks of a run, as another program reads them."""
+"""`swarm export`: what a run left, as another program reads it."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import datetime
 import json
@@ -9,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -18,9 +20,10 @@ from support.fake_run import fake_run
 from support.map_strategies import set_of
 
 from launch_scripts.cli import main
-from launch_scripts.report.geo.geo_layers import mark_layer
+from launch_scripts.report.begun_routes import BegunRoute
+from launch_scripts.report.geo.geo_layers import mark_layer, track_layers
 from launch_scripts.report.geo.geo_shapes import in_degrees
-from launch_scripts.report.geo.track_file import TRACKS_FILE, packed_tracks, read_tracks
+from launch_scripts.report.geo.track_file import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.recorder import Recorder
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.places import MapFrame
@@ -28,7 +31,7 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.errors import StoreError
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, walk
 from swarm.liveness import Peer
 from swarm.wire.statements import MarkKind
 
@@ -43,8 +46,10 @@ def recorder() -> Recorder:
         'name = "little"\nseed = 3\nseconds = 8.0\n[[targets]]\nname = "t"\ncount = 2\n[[groups]]\nvehicles = 4\n'
     )
     terrain = dataclasses.replace(terrain_of_pace(np.full((48, 64), 0.1, np.float32), 25.0), grid=GRID)
+    truth = np.array(terrain.pace_s_per_m)
+    truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
     recorder = Recorder(scenario, GRID)
-    for now_ns, told in fake_run(terrain, np.array(terrain.pace_s_per_m), scenario):
+    for now_ns, told in fake_run(terrain, truth, scenario):
         if isinstance(told, Peer):
             recorder.alive(told, True, BEGAN_NS + now_ns)
         else:
@@ -77,6 +82,12 @@ def swarm(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
         return int(end.code or 0)
 
 
+def read_layers(folder: Path) -> dict[str, list[Any]]:
+    return {
+        path.stem.partition("-")[2]: json.loads(path.read_text())["features"] for path in folder.glob("*.geojson")
+    }
+
+
 def test_a_geojson_has_every_place_and_time_in_wgs84(
     run: Path,
     recorder: Recorder,
@@ -84,13 +95,9 @@ def test_a_geojson_has_every_place_and_time_in_wgs84(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert (
-        swarm(monkeypatch, "report", "export", run.name, "--runs", run.parent, "--out", tmp_path / "r.geojson") == 0
-    )
+    assert swarm(monkeypatch, "export", run.name, "--runs", run.parent, "--out", tmp_path) == 0
     assert "4 vehicle_tracks" in capsys.readouterr().out
-    layers: dict[str, list[Any]] = {}
-    for feature in json.loads((tmp_path / "r.geojson").read_text())["features"]:
-        layers.setdefault(feature["properties"]["layer"], []).append(feature)
+    layers = read_layers(tmp_path)
     assert len(layers["captures"]) == len(recorder.captures) > 0
     lines = recorder.vehicle_tracks.lines()
     for feature in layers["vehicle_tracks"]:
@@ -105,22 +112,91 @@ def test_a_geojson_has_every_place_and_time_in_wgs84(
         assert times[0].timestamp() * NS_PER_S == pytest.approx(
             recorder.vehicle_tracks.times_ns()[said["vehicle"], 0][0]
         )
-    lethal, far, paced = sorted(
-        layers["marks"], key=lambda each: (each["properties"]["kind"], -each["properties"]["cells"])
+    marked = recorder.marked()
+    assert sum(each["properties"]["cells"] for each in layers["marks"]) == len(marked.cells) > 0
+    lethal = sum(each["properties"]["cells"] for each in layers["marks"] if each["properties"]["kind"] == "lethal")
+    assert lethal == (marked.kinds == MarkKind.LETHAL).sum() > 0
+    routes = {(each["properties"]["vehicle"], each["properties"]["at"]): each for each in layers["routes"]}
+    for told in recorder.routes.kept:
+        row, col = divmod(told.route.start, GRID.cols)
+        at = datetime.datetime.fromtimestamp(told.time_ns / 1e9, datetime.UTC).isoformat(timespec="milliseconds")
+        feature = routes[told.route.vehicle, at.replace("+00:00", "Z")]
+        there = np.array([GRID.centre_m(row * GRID.cols + col)])
+        assert feature["geometry"]["coordinates"][0] == pytest.approx(
+            in_degrees(there, MapFrame(GRID))[0], abs=1e-7
+        )
+        gap = told.route.cost_s / told.route.lower_bound_s
+        assert feature["properties"]["certified_gap"] == pytest.approx(gap)
+
+
+def test_what_never_moved_is_a_point_and_no_line_without_a_length(run: Path) -> None:
+    def track(id: str, *places: tuple[float, float]) -> Track:
+        return Track(id, 0, BEGAN_NS + np.arange(len(places)), np.array(places, float).reshape(-1, 2))
+
+    still = dataclasses.replace(
+        read_tracks(run / TRACKS_FILE),
+        vehicles=[track("a", (1.0, 2.0)), track("b", (1.0, 2.0), (1.0, 2.0)), track("c", (0.0, 0.0), (3.0, 4.0))],
+        targets=[track("t", (5.0, 5.0)), track("u")],
     )
-    assert [each["properties"]["cells"] for each in (lethal, far, paced)] == [3, 1, 2]
-    assert paced["properties"] | {"pace_s_per_m": 0.5} == {
-        "layer": "marks", "kind": "pace", "pace_s_per_m": 0.5, "cells": 2, "area_m2": 1250.0,
-        "oldest": "2023-11-14T22:13:21.000Z", "newest": "2023-11-14T22:13:21.000Z",
-    }  # fmt: skip
+    layers = {layer.name: layer for layer in track_layers(still, {"a": "g"})}
+    assert [each.values["vehicle"] for each in layers["vehicle_tracks"].features] == ["c"]
+    assert [each.values["length_m"] for each in layers["vehicle_tracks"].features] == [5.0]
+    assert [each.values["vehicle"] for each in layers["vehicles_standing"].features] == ["a", "b"]
+    assert [each.values["target"] for each in layers["targets_standing"].features] == ["t"]
+    assert layers["vehicles_standing"].features[0].values["group"] == "g"
+
+
+def test_a_table_has_a_row_per_place_with_degrees(
+    run: Path, recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert swarm(monkeypatch, "export", run, "--out", tmp_path, "--format", "csv", "--what", "captures") == 0
+    (path,) = tmp_path.iterdir()
+    rows = list(csv.DictReader(path.open()))
+    assert len(rows) == len(recorder.captures)
+    for row, capture in zip(rows, recorder.captures, strict=True):
+        x_m, y_m = GRID.west_m + capture.east_m, GRID.north_m - capture.south_m
+        assert [float(row["x_m"]), float(row["y_m"])] == pytest.approx([x_m, y_m], abs=1e-3)
+        (degrees,) = in_degrees(np.array([[x_m, y_m]]), MapFrame(GRID))
+        assert [float(row["lon"]), float(row["lat"])] == pytest.approx(degrees.tolist(), abs=1e-7)
+
+
+def test_no_route_that_leaves_the_map_harms_the_others(recorder: Recorder, tmp_path: Path) -> None:
+    routes = recorder.routes.kept
+    bad = [
+        msgspec.structs.replace(routes[0].route, start=GRID.cells, directions=b""),
+        msgspec.structs.replace(routes[0].route, start=0, directions=b"\0\1\2\3\4\5\6\7" * 100),
+    ]
+    recorder.routes.kept = [*(BegunRoute(BEGAN_NS, each) for each in bad), *routes]
+    try:
+        kept = tracks_in(packed_tracks(recorder), tmp_path)
+    finally:
+        recorder.routes.kept = routes
+    assert [route.vehicle for route in kept.routes] == [each.route.vehicle for each in routes]
+    assert [route.cells.tolist() for route in kept.routes] == [
+        walk(GRID, each.route.start, each.route.directions) for each in routes
+    ]
+
+
+def test_nothing_is_replaced_unless_asked(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("export", run, "--out", tmp_path / "new", "--what", "captures")
+    assert swarm(monkeypatch, *words) == 0
+    (path,) = (tmp_path / "new").iterdir()
+    path.write_text("mine")
+    assert swarm(monkeypatch, *words) == 2
+    assert f"{path} is there already; --force replaces it" in capsys.readouterr().err
+    assert path.read_text() == "mine"
+    assert swarm(monkeypatch, *words, "--force") == 0
+    assert path.read_text() != "mine"
 
 
 def test_another_program_reads_the_same_from_a_geopackage(
     run: Path, recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     raw = pytest.importorskip("pyogrio.raw", reason="the extra vectors is not installed")
-    out = tmp_path / "r.gpkg"
-    assert swarm(monkeypatch, "report", "export", run, "--out", out) == 0
+    out = tmp_path / f"{run.name}.gpkg"
+    assert swarm(monkeypatch, "export", run, "--format", "gpkg", "--out", tmp_path) == 0
     tracks = read_tracks(run / TRACKS_FILE)
     meta, _, shapes, values = raw.read(out, layer="vehicle_tracks")
     assert meta["crs"] == "EPSG:32632"
@@ -144,7 +220,9 @@ def test_another_program_reads_the_same_from_a_geopackage(
             (at,) = np.flatnonzero(track.time_ns // 10**6 == time_ms)
             assert np.frombuffer(shape, "<f8", offset=5) == pytest.approx(track.xy_m[at], abs=1e-6)
     meta, _, shapes, values = raw.read(out, layer="marks")
-    assert sorted(dict(zip(meta["fields"].tolist(), values, strict=True))["cells"].tolist()) == [1, 2, 3]
+    cells = dict(zip(meta["fields"].tolist(), values, strict=True))["cells"]
+    assert cells.sum() == len(recorder.marked().cells)
+    assert len(raw.read(out, layer="routes")[2]) == len(recorder.routes.kept)
     assert len(raw.read(out, layer="captures")[2]) == len(recorder.captures)
     assert swarm(monkeypatch, "map", "export", run / "map.sqlite", tmp_path / "marks.gpkg") == 0
     assert len(raw.read(tmp_path / "marks.gpkg", layer="marks")[2]) == 3
@@ -179,12 +257,14 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(
 ) -> None:
     (tmp_path / "empty").mkdir()
     for words, complaint in (
-        (("nowhere", "--out", tmp_path / "a.gpkg"), "there is no run 'nowhere'"),
-        ((run, "--out", tmp_path / "a.doc"), "write .geojson or .gpkg"),
-        ((run, "--out", tmp_path / "no" / "a.gpkg"), "cannot write there"),
-        ((tmp_path / "empty", "--out", tmp_path / "a.gpkg"), "has no tracks.npz: the run has not ended yet"),
+        (("nowhere",), "there is no run 'nowhere'"),
+        ((run, "--format", "doc"), "--format is 'doc'; expected one of geojson, gpkg, csv"),
+        ((run, "--what", "mark"), "--what is 'mark'; expected one of tracks, targets, captures, routes, marks"),
+        ((run, "--out", run / TRACKS_FILE), "is a file; expected a folder"),
+        ((tmp_path / "empty",), "has no tracks.npz: the run has not ended yet"),
+        ((run, "--gif"), "has no report.json"),
     ):
-        assert swarm(monkeypatch, "report", "export", *words) == 2
+        assert swarm(monkeypatch, "export", *words) == 2
         told = capsys.readouterr().err
         assert complaint in told
         assert told.count("\n") == 1

@@ -89,7 +89,11 @@ def test_options_become_a_dataclass_or_stay_a_table_and_what_is_made_already_is_
         ("eyes:NUMBER", {}, "'eyes:NUMBER' is 7; expected a class or a function"),
         ("eyes:Odd", {}, "Options of 'eyes:Odd' is neither a Struct nor a dataclass"),
         ("eyes:Wide", {"reach": 3}, "unknown key reach; did you mean 'reach_cells'?; allowed here: reach_cells"),
-        ("eyes:Wide", {"reach_cells": "x"}, "sensor_options of eyes:Wide: reach_cells: expected `int`, got `str`"),
+        (
+            "eyes:Wide",
+            {"reach_cells": "x"},
+            "sensor_options of eyes:Wide: reach_cells: found 'x', expected a whole number",
+        ),
         ("eyes:Loose", {"shares": 3}, "unknown key shares; did you mean 'share'?"),
         ("truth", {"x": 1}, "'truth' takes no options, found {'x': 1}"),
     ],

@@ -1,0 +1,66 @@
+"""What a check has found: a sentence for people, with how much it matters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+from swarm.errors import SwarmError
+
+Level = Literal["ok", "warning", "failure"]
+STYLES: dict[Level, str] = {"ok": "green", "warning": "yellow", "failure": "red"}
+
+
+class Finding(NamedTuple):
+    """One line of an answer.
+
+    level  failure: it cannot run so; warning: it runs, but not as one may think
+    about  a key of the scenario, or a part of the machine
+    text   what was found, what is expected, what to do
+    """
+
+    level: Level
+    about: str
+    text: str
+
+    @property
+    def sentence(self) -> str:
+        return f"{self.about}: {self.text}" if self.about else self.text
+
+    def fields(self) -> dict[str, str]:
+        return self._asdict()
+
+
+def failure(about: str, text: str) -> Finding:
+    return Finding("failure", about, text)
+
+
+def warning(about: str, text: str) -> Finding:
+    return Finding("warning", about, text)
+
+
+def ok(about: str, text: str) -> Finding:
+    return Finding("ok", about, text)
+
+
+def refused(about: str, check: Callable[..., Any], *of: Any) -> list[Finding]:
+    """The failure with which a check refuses what it is given, if it does."""
+    try:
+        check(*of)
+    except SwarmError as error:
+        return [failure(about, str(error).removeprefix(f"{about}: "))]
+    return []
+
+
+def counted(findings: Sequence[Finding], level: Level) -> str:
+    """How many there are of a level: "1 failure", "no warnings"."""
+    many = sum(finding.level == level for finding in findings)
+    return f"{many or 'no'} {level}{'' if many == 1 else 's'}"
+
+
+def as_fields(findings: Sequence[Finding]) -> dict[str, Any]:
+    """For `--json`."""
+    return {
+        "ok": not any(finding.level == "failure" for finding in findings),
+        "findings": [finding.fields() for finding in findings],
+    }

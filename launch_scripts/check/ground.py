@@ -1,0 +1,107 @@
+"""Whether the places that a scenario names lie on its terrain, on ground that can be driven, and can meet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from launch_scripts.check.findings import Finding, failure, warning
+from shared_map.arrays import Bools, Floats
+from shared_map.terrain.homes import homes_of
+from shared_map.terrain.layers import inflate, inflation_halves
+from shared_map.terrain.places import MapFrame
+from shared_map.terrain.terrain import Terrain
+from swarm.config.scenario import Scenario
+from swarm.errors import ConfigError
+from swarm.places import cell_of
+
+
+def check_places(scenario: Scenario, terrain: Terrain, truth: Floats) -> None:
+    """Raise ConfigError with the first of `places` that is a failure."""
+    for finding in places(scenario, terrain, truth):
+        if finding.level == "failure":
+            raise ConfigError(finding.sentence)
+
+
+def places(scenario: Scenario, terrain: Terrain, truth: Floats) -> Iterator[Finding]:
+    """Starts of targets and vehicles.
+
+    truth  float32 (rows, cols), s/m; inf is lethal
+    """
+    homes = homes_of(terrain.pace_s_per_m, truth)
+    yield from _targets(scenario, terrain, truth, homes)
+    yield from _vehicles(scenario, terrain, truth, homes)
+
+
+def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) -> Iterator[Finding]:
+    if all(target.start is None for target in scenario.targets):
+        return
+    grid, frame = terrain.grid, MapFrame(terrain.grid)
+    # As the process that moves them: a target keeps to cells where a vehicle fits.
+    halves = inflation_halves(terrain.vehicle_radius_m, grid.resolution_m)
+    closed = np.isinf(inflate(truth, halves) if halves else truth) | terrain.lethal
+    for n, target in enumerate(scenario.targets):
+        if target.start is None:
+            continue
+        key = f"targets[{n}].start"
+        try:
+            cell = cell_of(target.start, frame, key)
+        except ConfigError as error:
+            yield failure("", str(error))
+            continue
+        place = grid.row_col(cell)
+        shown = _shown(target.start, place)
+        if closed[place]:
+            yield failure(key, f"{shown} is lethal{_near(closed, place)}")
+        elif not homes[place]:
+            part = "the largest part of the terrain that can be driven"
+            yield failure(key, f"no way leads to {shown} from {part}, where vehicles start{_near(~homes, place)}")
+
+
+def _vehicles(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) -> Iterator[Finding]:
+    grid, frame = terrain.grid, MapFrame(terrain.grid)
+    closed = np.isinf(truth) | terrain.lethal
+    taken: dict[int, str] = {}
+    left = int(homes.sum())
+    for n, group in enumerate(scenario.groups):
+        key = f"groups[{n}].cells"
+        for given in group.cells:
+            try:
+                cell = cell_of(given, frame, key)
+            except ConfigError as error:
+                yield failure("", str(error))
+                continue
+            place = grid.row_col(cell)
+            shown = _shown(given, place)
+            if cell in taken:
+                yield failure(key, f"{shown} is given twice, here and in {taken[cell]}")
+            elif closed[place]:
+                yield failure(key, f"{shown} is lethal{_near(closed, place)}")
+            elif not homes[place]:
+                yield warning(key, f"{shown} is cut off from the largest part that can be driven")
+            else:
+                left -= 1
+            taken[cell] = key
+        left -= group.vehicles - len(group.cells)
+        if left < 0:
+            there = int(homes.sum())
+            yield failure(
+                f"groups[{n}].vehicles",
+                f"found {group.vehicles}, but only {there} cells are passable and connected, one for each vehicle",
+            )
+            return
+
+
+def _shown(given: object, place: tuple[int, int]) -> str:
+    return str(list(place)) if not isinstance(given, str) else f"{given!r}, {list(place)},"
+
+
+def _near(closed: Bools, place: tuple[int, int]) -> str:
+    """Where the nearest open cell is."""
+    free = np.flatnonzero(~closed)
+    if not len(free):
+        return ""
+    rows, cols = np.divmod(free, closed.shape[1])
+    best = int(np.argmin((rows - place[0]) ** 2 + (cols - place[1]) ** 2))
+    return f"; the nearest cell that will do is [{rows[best]}, {cols[best]}]"

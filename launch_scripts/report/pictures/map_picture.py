@@ -1,0 +1,239 @@
+"""The map of a run: where everything went, what was marked, where targets were captured."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from launch_scripts.report.geo.track_file import RunTracks, Track
+from launch_scripts.report.pictures.ground_picture import GroundPicture
+from launch_scripts.report.pictures.palette import (
+    BLACK,
+    FORBIDDEN,
+    GROUPS,
+    INK,
+    MARKED_LETHAL,
+    MARKED_SLOW,
+    RED,
+    YELLOW,
+)
+from launch_scripts.report.pictures.plots import halo
+from launch_scripts.report.pictures.scale_bar import round_length, said_length
+from shared_map.terrain.places import MapFrame
+from swarm.grid import GridSpec
+from swarm.wire.statements import MarkKind
+
+_SHOWN_LABELS = 30
+_MARK_PIXELS = 1 << 20
+Points = NDArray[np.float64]
+
+
+def draw_map(axes: Axes, ground: GroundPicture, tracks: RunTracks, report: Mapping[str, Any]) -> None:
+    """Draw a run on axes in kilometres east and south of the north-west corner."""
+    grid = tracks.grid
+    width_km, height_km = grid.cols * grid.resolution_m / 1000, grid.rows * grid.resolution_m / 1000
+    extent = (0.0, width_km, height_km, 0.0)
+    axes.imshow(ground.pixels, extent=extent, interpolation="antialiased")
+    axes.imshow(mark_overlay(tracks), extent=extent, interpolation="nearest", zorder=2)
+    groups = colours_of_groups(report)
+    _draw_vehicles(axes, tracks, groups, report)
+    _draw_targets(axes, tracks)
+    axes.set(xlim=(0, width_km), ylim=(height_km, 0))
+    axes.set_aspect("equal", anchor="NW")
+    axes.grid(False)
+    _draw_coordinates(axes, grid)
+    _draw_scale_bar(axes, width_km, height_km)
+    _draw_north(axes)
+    handles = _legend(ground, groups)
+    axes.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(0, -0.022), ncol=-(-len(handles) // 2), handlelength=1.5,
+        columnspacing=1.4, borderaxespad=0.3, handletextpad=0.5, borderpad=0, labelspacing=0.35,
+    )  # fmt: skip
+
+
+def colours_of_groups(report: Mapping[str, Any]) -> dict[str, str]:
+    """Group -> its colour, in the order of the report."""
+    return {group: GROUPS[n % len(GROUPS)] for n, group in enumerate(report.get("by_group") or {"": None})}
+
+
+def group_of(vehicle: str, report: Mapping[str, Any]) -> str:
+    """The group of a vehicle; the first where nobody knows it."""
+    row = (report.get("by_vehicle") or {}).get(vehicle) or {}
+    return str(row.get("group", next(iter(report.get("by_group") or {"": None}), "")))
+
+
+def in_km(track: Track, grid: GridSpec) -> Points:
+    """Kilometres east and south of the north-west corner."""
+    return np.stack([track.xy_m[:, 0] - grid.west_m, grid.north_m - track.xy_m[:, 1]], axis=1) / 1000
+
+
+def mark_overlay(tracks: RunTracks, known: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
+    """Marked cells, uint8 (rows, cols, 4); of a large grid blocks of cells in which any is marked.
+
+    known  which of the marks to draw; all by default
+    """
+    grid, marks = tracks.grid, tracks.marks
+    side = max(1, math.ceil(math.sqrt(grid.cells / _MARK_PIXELS)))
+    rows, cols = -(-grid.rows // side), -(-grid.cols // side)
+    overlay = np.zeros((rows * cols, 4), np.uint8)
+    row, col = np.divmod(marks.cells, grid.cols)
+    blocks, lethal = row // side * cols + col // side, marks.kinds == MarkKind.LETHAL
+    if known is not None:
+        blocks, lethal = blocks[known], lethal[known]
+    for some, colour, alpha in ((~lethal, MARKED_SLOW, 0.85), (lethal, MARKED_LETHAL, 0.95)):
+        overlay[blocks[some]] = [round(255 * part) for part in to_rgba(colour, alpha)]
+    return overlay.reshape(rows, cols, 4)
+
+
+def _draw_vehicles(axes: Axes, tracks: RunTracks, groups: Mapping[str, str], report: Mapping[str, Any]) -> None:
+    grid = tracks.grid
+    thin = 1 / max(1.0, len(tracks.vehicles) / 100) ** 0.5
+    members: dict[str, list[Points]] = {group: [] for group in groups}
+    for track in tracks.vehicles:
+        if len(track.time_ns):
+            members.setdefault(group_of(track.id, report), []).append(in_km(track, grid))
+    for group, lines in members.items():
+        if not lines:
+            continue
+        colour = groups.get(group, GROUPS[0])
+        _draw_strips(axes, lines, colour, 1.1 * thin, 1.9 * thin, zorder=3)
+        starts, ends = (np.array([line[n] for line in lines]) for n in (0, -1))
+        axes.scatter(
+            starts[:, 0], starts[:, 1], s=13 * thin**2, c="white", edgecolors=colour, linewidths=0.8, zorder=4
+        )
+        axes.scatter(ends[:, 0], ends[:, 1], s=26 * thin**2, c=colour, edgecolors="white", linewidths=0.7, zorder=5)
+
+
+def _draw_targets(axes: Axes, tracks: RunTracks) -> None:
+    grid = tracks.grid
+    pieces = [(track.id, in_km(track, grid)) for track in tracks.targets if len(track.time_ns)]
+    _draw_strips(axes, [line for _, line in pieces], RED, 2.0, 3.6, zorder=6)
+    if tracks.captures:
+        places = np.concatenate([in_km(track, grid) for track in tracks.captures])
+        axes.scatter(
+            places[:, 0], places[:, 1], marker="*", s=115, c=YELLOW, edgecolors=BLACK, linewidths=0.7, zorder=8
+        )
+    last = {id: line[-1] for id, line in pieces}
+    for id, (x, y) in last.items():
+        axes.scatter([x], [y], marker="D", s=48, c=RED, edgecolors="white", linewidths=1.1, zorder=9)
+        if len(last) <= _SHOWN_LABELS:
+            _label(axes, id, float(x), float(y), grid)
+
+
+def _draw_strips(
+    axes: Axes, strips: Sequence[Points], colour: str, width: float, casing: float, zorder: int
+) -> None:
+    strips = [strip for strip in strips if len(strip) > 1]
+    for line_colour, line_width, alpha in (("white", casing, 0.6), (colour, width, 1.0)):
+        axes.add_collection(
+            LineCollection(
+                strips,
+                colors=line_colour,
+                linewidths=line_width,
+                alpha=alpha,
+                zorder=zorder,
+                capstyle="round",
+                joinstyle="round",
+            )
+        )
+
+
+def _label(axes: Axes, text: str, x: float, y: float, grid: GridSpec) -> None:
+    """Annotates beside the place, on the side where the text fits."""
+    right = x * 1000 < 0.94 * grid.cols * grid.resolution_m
+    below = y * 1000 < 0.04 * grid.rows * grid.resolution_m
+    axes.annotate(
+        text, (x, y), xytext=(6 if right else -6, -6 if below else 5), textcoords="offset points", fontsize=9,
+        fontweight="bold", color=RED, zorder=10, path_effects=halo(), ha="left" if right else "right",
+        va="top" if below else "bottom",
+    )  # fmt: skip
+
+
+def _draw_coordinates(axes: Axes, grid: GridSpec) -> None:
+    """Degrees along the west and south border, where the terrain has a place."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+    if grid.crs == "local":
+        return
+    frame = MapFrame(grid)
+    side_m = grid.resolution_m
+    east_km, south_km = (np.linspace(0, n * side_m / 1000, 200) for n in (grid.cols, grid.rows))
+    _, lon = frame.to_degrees(grid.west_m + east_km * 1000, np.full(200, grid.north_m - grid.rows * side_m))
+    lat, _ = frame.to_degrees(np.full(200, grid.west_m), grid.north_m - south_km * 1000)
+    lon = np.unwrap(lon, period=360)
+    for set_ticks, km, degrees, names in (
+        (axes.set_xticks, east_km, lon, "EW"),
+        (axes.set_yticks, south_km[::-1], lat[::-1], "NS"),
+    ):
+        ticks = _round_steps(float(degrees.min()), float(degrees.max()), 4)
+        texts = [_degrees(value, names) for value in ticks]
+        set_ticks(np.interp(ticks, degrees, km), texts, fontsize=7.5)
+    axes.tick_params(axis="both", length=2.5, width=0.7, pad=2, labelsize=7.5)
+    for text in axes.get_yticklabels():
+        text.set(rotation=90, va="center")
+
+
+def _degrees(value: float, names: str) -> str:
+    value = (value + 180) % 360 - 180
+    return f"{abs(value):.6g}° {names[0] if value >= 0 else names[1]}"
+
+
+def _round_steps(low: float, high: float, many: int) -> list[float]:
+    """About so many round values from low to high."""
+    step = round_length((high - low) / many * 1.6)
+    first = math.ceil(low / step)
+    return [n * step for n in range(first, math.floor(high / step) + 1)]
+
+
+def _draw_scale_bar(axes: Axes, width_km: float, height_km: float) -> None:
+    length_km = round_length(width_km / 5)
+    x0, y0 = 0.03 * width_km, height_km * 0.965
+    for colour, width in (("white", 6.0), (INK, 3.0)):
+        axes.plot([x0, x0 + length_km], [y0, y0], color=colour, linewidth=width, solid_capstyle="butt", zorder=11)
+    axes.annotate(
+        said_length(length_km * 1000), (x0, y0), xytext=(0, 5), textcoords="offset points", ha="left",
+        fontsize=9.5,
+        fontweight="bold", zorder=11, path_effects=halo(),
+    )  # fmt: skip
+
+
+def _draw_north(axes: Axes) -> None:
+    axes.annotate(
+        "N", xy=(0.968, 0.985), xytext=(0.968, 0.915), xycoords="axes fraction", ha="center", va="center",
+        fontsize=10, fontweight="bold", zorder=11, path_effects=halo(),
+        arrowprops={"arrowstyle": "-|>,head_width=0.22,head_length=0.45", "color": INK, "linewidth": 1.6,
+                    "path_effects": halo()},
+    )  # fmt: skip
+
+
+def _legend(ground: GroundPicture, groups: Mapping[str, str]) -> list[Any]:
+    handles: list[Any] = [
+        Line2D([], [], color=colour, linewidth=1.6, marker="o", markersize=5, markerfacecolor=colour,
+               markeredgecolor="white", markeredgewidth=0.6,
+               label="vehicle" if len(groups) == 1 else f"vehicle of {group}")
+        for group, colour in list(groups.items())[: len(GROUPS)]
+    ]  # fmt: skip
+    handles += [
+        Line2D([], [], color=RED, linewidth=2, marker="D", markersize=6, markeredgecolor="white", label="target"),
+        Line2D([], [], color="none", marker="*", markersize=12, markerfacecolor=YELLOW, markeredgecolor=BLACK,
+               markeredgewidth=0.7, label="capture"),
+        Patch(facecolor=MARKED_LETHAL, label="marked lethal"),
+        Patch(facecolor=MARKED_SLOW, label="marked slow"),
+    ]  # fmt: skip
+    of_ground = {
+        "hidden": Patch(facecolor="none", edgecolor=BLACK, linestyle=":", label="hidden from the map"),
+        "lethal": Patch(facecolor="#8b9097", edgecolor="#d7dbe0", hatch="xxxxx", linewidth=0,
+                        label="lethal ground"),
+        "forbidden": Patch(facecolor="#5d5d5d", edgecolor=FORBIDDEN, hatch="/////", linewidth=0.8,
+                           label="forbidden zone"),
+    }  # fmt: skip
+    return [*handles, *(patch for name, patch in of_ground.items() if name in ground.drawn)]

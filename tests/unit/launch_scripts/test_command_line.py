@@ -1,0 +1,223 @@
+"""Completion, help and exit codes of the whole command: every sub-command, found by walking its tree."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer._completion_classes import BashComplete  # what a shell asks: there is no public name for it
+
+from launch_scripts.check import machine
+from launch_scripts.cli import command, main
+from launch_scripts.launcher.options import find_scenario
+from launch_scripts.report.results.run_folder import begin_run
+from swarm.config.scenario import Walk
+
+
+def offered(*words: str) -> list[str]:
+    """What the shell is offered after these words; the last is not finished."""
+    shell = BashComplete(command(), {}, "swarm", "_SWARM_COMPLETE")
+    return [item.value for item in shell.get_completions(list(words[:-1]), words[-1])]
+
+
+def commands(group: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command with the words that call it."""
+    group = command() if group is None else group
+    yield path, group
+    for name in group.list_commands(None) if hasattr(group, "list_commands") else ():
+        yield from commands(group.get_command(None, name), (*path, name))
+
+
+EVERY = list(commands())
+
+
+def test_every_command_is_there() -> None:
+    names = {" ".join(path) for path, _ in EVERY}
+    assert {"up", "new", "check", "doctor", "map inspect", "deploy certs", "bench swarm", "zone add"} <= names
+    assert len(names) > 60
+
+
+def test_every_command_completes_its_options_and_its_sub_commands() -> None:
+    for path, each in EVERY:
+        declared = {name for param in each.params for name in param.opts if name.startswith("--")}
+        assert declared | {"--help"} <= {*offered(*path, "--"), "--help"}, path
+        assert declared <= set(offered(*path, "--")), path
+        if hasattr(each, "list_commands"):
+            assert each.list_commands(None) == [name for name in offered(*path, "") if not name.startswith("-")], (
+                path
+            )
+
+
+def test_every_command_answers_to_h_as_to_help(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for path, each in EVERY:
+        if hasattr(each, "list_commands") or path[0] in ("up", "new", "check", "doctor"):
+            said = []
+            for option in ("-h", "--help"):
+                monkeypatch.setattr(sys, "argv", ["swarm", *path, option])
+                assert main() == 0
+                said.append(capsys.readouterr().out)
+            assert said[0] == said[1], path
+            assert f"Usage: {' '.join(['swarm', *path])} " in said[0]
+            assert max(map(len, said[0].splitlines())) <= 80
+        # The others inherit it.
+        assert each.context_settings.get("help_option_names", ["-h"])[0] == "-h", path
+
+
+def test_every_command_that_does_something_shows_an_example() -> None:
+    silent = [
+        " ".join(path)
+        for path, each in EVERY
+        if not hasattr(each, "list_commands") and f"swarm {' '.join(path)}" not in (each.help or "")
+    ]
+    assert silent == []
+
+
+@pytest.fixture
+def newest_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    for name in ("20260101-000000-aaaa", "20260102-000000-bbbb"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        assert begin_run(tmp_path / "runs" / name, find_scenario("synthetic"), name) == []
+    (tmp_path / "mine.toml").write_text("[[targets]]\nname = 'deer'\ncount = 2\n[[groups]]\nname = 'red'\n")
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "alps.toml").write_text("")
+    return tmp_path
+
+
+def test_values_are_completed_with_what_is_there(newest_run: Path) -> None:
+    assert offered("up", "ja") == ["jacksboro"]
+    assert offered("check", "m") == ["mine.toml", "maps/"] or offered("check", "m") == ["maps/", "mine.toml"]
+    assert offered("simulate", "maps/a") == ["maps/alps.toml"]
+    assert offered("simulate", "ma") == ["maps/", "maze"]
+    assert offered("up", "jacksboro", "--only", "p") == ["planner"]
+    assert offered("compare", "2026") == ["20260102-000000-bbbb", "20260101-000000-aaaa"]
+    assert "LAST" in offered("compare", "")
+    assert offered("report", "export", "L") == ["LAST"]
+    assert offered("new", "x.toml", "--walk", "w") == ["waypoints"]
+    assert offered("new", "x.toml", "--terrain", "s") == ["synthetic"]
+    assert offered("new", "x.toml", "--preset", "h") == ["hiker"]
+    assert set(offered("target", "add", "x", "--walk", "")) >= set(Walk.__args__[:4])
+    assert offered("set", "pl") == ["planner.cpu_budget", "planner.push_s"]
+    assert offered("plugins", "check", "se") == ["sensor"]
+    assert offered("chaos", "--blow", "k") == ["kill"]
+    assert offered("terrain", "info", "x.tif", "--elevation-encoding", "terra") == ["terrain-rgb", "terrarium"]
+
+
+def test_ids_come_from_the_scenario_that_is_named_or_from_the_newest_run(newest_run: Path) -> None:
+    assert offered("planner", "mine.toml", "--target", "") == ["deer0", "deer1"]
+    assert offered("agent", "mine.toml", "--id", "a") == ["a0", "a1", "a2", "a3"]
+    assert offered("route", "--target", "") == find_scenario("synthetic").target_ids
+    assert offered("target", "move", "t") == find_scenario("synthetic").target_ids
+    assert offered("vehicle", "stop", "a0-0")[:2] == ["a0-00", "a0-01"]
+    assert offered("group", "") == ["all"]
+
+
+def test_nothing_is_offered_where_nothing_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "broken.toml").write_text("seed = ")
+    assert offered("planner", "broken.toml", "--target", "") == []
+    assert offered("compare", "") == []
+    assert offered("route", "--target", "") == []
+    assert offered("check", "nowhere/x") == []
+
+
+def test_the_shell_gets_its_words_from_the_command_itself(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through `main`, as the shell's function calls it."""
+    monkeypatch.setattr(sys, "argv", ["swarm"])
+    for name, value in {"_SWARM_COMPLETE": "complete_bash", "COMP_WORDS": "swarm map i", "COMP_CWORD": "2"}.items():
+        monkeypatch.setitem(os.environ, name, value)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert not ended.value.code
+    assert capsys.readouterr().out.split() == ["inspect", "import"]
+
+
+# --- swarm doctor -------------------------------------------------------------------------------------------------
+
+
+def doctor(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["swarm", "doctor", *words])
+    monkeypatch.setenv("COLUMNS", "80")
+    code = main()
+    return code, capsys.readouterr().out
+
+
+def test_doctor_looks_at_everything_and_says_how_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, said = doctor(monkeypatch, capsys)
+    assert code == 0
+    for about in machine.CHECKS:
+        assert f" {about} " in said, said
+    assert "two sessions met on 127.0.0.1" in " ".join(said.split())
+    assert said.splitlines()[-1].startswith("no failures, ")
+    assert not list(tmp_path.iterdir()), "it leaves nothing behind"
+
+
+@pytest.mark.parametrize(
+    ("about", "replaced", "value", "level", "words"),
+    [
+        ("python", "platform.python_version", lambda: "3.9.1", "failure", "3.9.1, expected >=3.11"),
+        ("packages", "_version", lambda package: None, "failure", "numba is missing (>=0.63)"),
+        ("packages", "_version", lambda package: "0.1", "failure", "eclipse-zenoh is 0.1, expected ==1.10.2"),
+        ("cores", "os.sched_getaffinity", lambda pid: {0}, "warning", "1: processes take turns"),
+        ("cores", "os.getloadavg", lambda: (99.0, 1.0, 1.0), "warning", "load of 99.0"),
+        ("memory", "available_bytes", lambda: 1 << 28, "warning", "0.3 GB are free"),
+        ("memory", "available_bytes", lambda: None, "warning", "not known"),
+        ("open files", "resource.getrlimit", lambda which: (256, 8192), "warning", "`ulimit -n 4096`"),
+        ("shared memory", "os.access", lambda path, mode: False, "warning", "mount a tmpfs"),
+        ("clock", "_clock_state", lambda: 5, "warning", "not synchronised"),
+        ("clock", "_clock_state", lambda: 0, "ok", "synchronised"),
+        ("disk", "shutil.disk_usage", lambda path: (1, 1, 1 << 20), "warning", "are free in"),
+    ],
+)
+def test_what_doctor_finds_says_what_to_do(
+    about: str,
+    replaced: str,
+    value: object,
+    level: str,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    owner, _, name = replaced.rpartition(".")
+    if name == "disk_usage":
+        import collections
+
+        value = lambda path: collections.namedtuple("Usage", "free")(1 << 20)  # noqa: E731
+    monkeypatch.setattr(getattr(machine, owner) if owner else machine, name, value)
+    found = machine.CHECKS[about](about, tmp_path)
+    assert (found.level, found.about) == (level, about)
+    assert words in found.text
+
+
+def test_a_folder_that_cannot_be_written_is_a_failure_and_the_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(machine, "CHECKS", {"disk": machine.CHECKS["disk"]})
+    (tmp_path / "file").write_text("")
+    code, said = doctor(monkeypatch, capsys, "--runs", str(tmp_path / "file"))
+    assert code == 1
+    assert "is not a folder" in " ".join(said.split())
+    code, said = doctor(monkeypatch, capsys, "--runs", str(tmp_path), "--json")
+    assert (code, '"ok": true' in said) == (0, True)
+
+
+def test_a_check_that_fails_itself_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(about: str, runs: Path) -> object:
+        raise OSError("no such thing here")
+
+    monkeypatch.setattr(machine, "CHECKS", {"clock": broken})
+    assert [tuple(found) for found in machine.examine(tmp_path)] == [
+        ("warning", "clock", "cannot be looked at: no such thing here")
+    ]

@@ -1,0 +1,174 @@
+"""Plausible mistakes at the command line and in scenario files: each is answered with what to do, in a line or two.
+
+The table was written before anybody looked at the answers. A mistake is made in this process, and no process of a
+swarm may start because of one.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import shlex
+import socket
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import pytest
+
+from launch_scripts import ports
+from launch_scripts.check import needs
+from launch_scripts.cli import main
+from launch_scripts.commands import query
+from launch_scripts.deploy.certificates import issue
+from launch_scripts.launcher import preload
+from launch_scripts.launcher.local_swarm import LocalSwarm
+from launch_scripts.launcher.warm_up import WarmUp
+from launch_scripts.ports import free_ports
+from launch_scripts.process_table import certificate_names
+from swarm.config.load import load_scenario
+
+MISTAKES: list[dict[str, Any]] = tomllib.loads(
+    Path(__file__).with_name("mistakes.toml").read_text(encoding="utf-8")
+)["mistake"]
+
+TINY = '[terrain]\nsource = "synthetic"\nrows = 24\ncols = 24\nrelief_m = 1\n'
+LAKE = TINY + '[[cost.zones]]\nkind = "forbidden"\nmask = "lake.png"\n'
+RING = TINY + '[[cost.zones]]\nkind = "forbidden"\nmask = "ring.png"\n'
+
+WORDS_OF_LIBRARIES = re.compile(
+    r"Traceback|`(int|float|str|bool|array|object|null|struct)|[Ee]xpected `|Object contains|Usage:|[╭│╰]|Errno|"
+    r"msgspec|TOMLDecode|Invalid value|Missing (argument|option)|Got unexpected|ValidationError|\$\.|CPLE_|ZError"
+)
+LONGEST_ANSWER = 400
+"""Characters; two lines of a wide terminal."""
+
+
+def port_taken(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    taken = socket.socket()
+    request.addfinalizer(taken.close)
+    taken.bind(("127.0.0.1", 0))
+    taken.listen()
+    endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+    path = folder / "tiny.toml"
+    path.write_text(f'{TINY}[network]\nlisten = ["{endpoint}"]\nconnect = ["{endpoint}"]\n')
+    return {}
+
+
+def free_port(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    return {"PORT": str(free_ports(1)[0])}
+
+
+def photo(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    import rasterio
+    from rasterio.transform import from_origin
+
+    pixels = np.random.default_rng(1).integers(0, 255, (3, 24, 24), np.uint8)
+    shape = {"height": 24, "width": 24, "count": 3, "dtype": "uint8", "photometric": "RGB"}
+    place = {"crs": "EPSG:32632", "transform": from_origin(400000, 5000000, 10, 10)}
+    with rasterio.open(folder / "photo.tif", "w", driver="GTiff", **shape, **place) as file:
+        file.write(pixels)
+    return {}
+
+
+def hill(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    np.savez(folder / "hill.npz", elevation=np.ones((24, 24), np.float32), resolution_m=10.0)
+    return {}
+
+
+def certificates_of_another(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    certificates_but_one(folder, request)
+    issue(folder / "certs", "planner.t", [], 9)
+    issue(folder / "others", "operator.0", [], 9)
+    (folder / "certs/ca.pem").write_bytes((folder / "others/ca.pem").read_bytes())
+    return {}
+
+
+def certificates_but_one(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    for name in certificate_names(load_scenario(folder / "tiny.toml")):
+        if name != "planner.t":
+            issue(folder / "certs", name, ["localhost"] * name.startswith("router"), 9)
+    return {}
+
+
+def latin_1(folder: Path, request: pytest.FixtureRequest) -> dict[str, str]:
+    (folder / "s.toml").write_bytes('name = "H\u00fcgel"\n'.encode("latin-1"))
+    return {}
+
+
+GIVEN: dict[str, Callable[[Path, pytest.FixtureRequest], dict[str, str]]] = {
+    each.__name__: each
+    for each in (port_taken, free_port, photo, hill, certificates_of_another, certificates_but_one, latin_1)
+}
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    import PIL.Image
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "notes.txt").write_text("Dear diary, = today\n")
+    (tmp_path / "tiny.toml").write_text(TINY + "[[groups]]\nvehicles = 3\n")
+    row, col = np.mgrid[:24, :24]
+    away = np.maximum(abs(row - 12), abs(col - 12))
+    PIL.Image.fromarray(np.where(away <= 2, 255, 0).astype(np.uint8)).save(tmp_path / "lake.png")
+    PIL.Image.fromarray(np.where(away == 2, 255, 0).astype(np.uint8)).save(tmp_path / "ring.png")
+    return tmp_path
+
+
+def _no_process(*args: object, **options: object) -> NoReturn:
+    raise AssertionError("a process was started")
+
+
+def name_of(mistake: dict[str, Any]) -> str:
+    text = " ".join([mistake.get("do", ""), mistake.get("toml", ""), mistake.get("given", "")])
+    return re.sub(r"\W+", "-", text.replace("\\n", " ")).strip("-")[:60]
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=name_of)
+def test_a_mistake_is_answered_with_what_to_do(
+    mistake: dict[str, Any],
+    place: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+) -> None:
+    monkeypatch.setattr(LocalSwarm, "start", _no_process)
+    monkeypatch.setattr(preload, "start_forkserver", lambda *args: None)
+    monkeypatch.setattr(WarmUp, "begin", lambda self: None)
+    monkeypatch.setattr(query, "_CONNECT_S", 0.3)
+    # Neither who else listens here nor how large this machine is has a part in it.
+    if mistake.get("given") != "port_taken":
+        monkeypatch.setattr(ports, "_taken", lambda host, port: False)
+    monkeypatch.setattr(needs, "this_machine", lambda runs: needs.Machine(64, None, None))
+    if "toml" in mistake:
+        text = mistake["toml"].replace("\\n", "\n")
+        for name, begin in (("TINY", TINY), ("LAKE", LAKE), ("RING", RING)):
+            text = text.replace(name, begin)
+        (place / "s.toml").write_text(text)
+    given = GIVEN[mistake["given"]](place, request) if "given" in mistake else {}
+    line = mistake.get("do", "check s.toml")
+    for word, value in given.items():
+        line = line.replace(word, value)
+    monkeypatch.setattr(sys, "argv", ["swarm", *shlex.split(line)])
+    try:
+        code = main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    said = "".join(capsys.readouterr())
+    assert code != 0, said
+    for word in mistake["answer"]:
+        assert word.lower() in said.lower(), f"{word!r} is not in {said!r}"
+    assert WORDS_OF_LIBRARIES.search(said) is None, said
+    assert len(said.splitlines()) <= 2, said
+    assert len(said) <= LONGEST_ANSWER, said
+
+
+def test_there_are_a_hundred_mistakes() -> None:
+    assert len(MISTAKES) >= 100
+    assert len({name_of(mistake) for mistake in MISTAKES}) > 100, "they differ"
