@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from launch_scripts.launcher.options import with_follow
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.alarms import FADES_S, alarm_marks
 from launch_scripts.monitor.movers.details import target_details, target_labels, vehicle_details
@@ -26,6 +28,9 @@ from launch_scripts.report.run_state.state import TargetLine
 from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import MonitorConfig
+from swarm.errors import ConfigError
 from swarm.grid import walk
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -137,6 +142,7 @@ def test_who_points_at_a_target_reads_how_its_chase_goes() -> None:
 ids = st.sampled_from(["t0", "t1", "t2", "t3"])
 
 
+@settings(deadline=None)
 @given(st.sets(ids), st.sets(ids), st.dictionaries(ids, st.floats(0, 120)))
 def test_no_target_has_two_labels_and_none_that_is_drawn_has_none(
     posed: set[str], lost: set[str], seen: dict[str, float]
@@ -148,6 +154,7 @@ def test_no_target_has_two_labels_and_none_that_is_drawn_has_none(
         assert pins[id] == id
 
 
+@settings(deadline=None)
 @given(
     st.lists(
         st.builds(
@@ -246,6 +253,7 @@ def on_tree(parents: list[int], start: int) -> list[int]:
     return way
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.DataObject) -> None:
     """Against the slow twin: all edges of all routes."""
@@ -292,6 +300,28 @@ def test_a_place_outside_the_grid_is_taken_for_the_nearest_cell() -> None:
     grid = hill(10, 20).grid
     assert cell_at(grid, 15.0, 25.0) == 2 * 20 + 1
     assert cell_at(grid, -1.0, 1e6) == 9 * 20
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"), [("a0-99", "; did you mean 'a0-"), ("t3x", "; did you mean 't"), ("\x1b[31m", "; there are")]
+)
+def test_whom_nobody_knows_the_camera_cannot_follow(name: str, hint: str) -> None:
+    scenario = parse_scenario('[[targets]]\nname = "t"\ncount = 5\n[[groups]]\nvehicles = 40\n')
+    with pytest.raises(ConfigError) as refused:
+        with_follow(scenario, name)
+    sentence = str(refused.value)
+    assert sentence.startswith(f"--follow: no vehicle or target {name!r}")
+    assert hint in sentence
+    assert sentence.endswith("; there are t0 to t4 and a0-00 to a1-14")
+
+
+def test_the_camera_follows_whom_the_option_names_rather_than_the_scenario() -> None:
+    scenario = parse_scenario('[[targets]]\nname = "t"\ncount = 5\n[monitor]\nfollow = "t2"\n')
+    assert with_follow(scenario, None).monitor.follow == "t2"
+    assert with_follow(scenario, "t1").monitor.follow == "t1"
+    lost = msgspec.structs.replace(scenario, monitor=MonitorConfig(follow="nobody"))
+    with pytest.raises(ConfigError, match=r"^monitor\.follow: no vehicle or target 'nobody'"):
+        with_follow(lost, None)
 
 
 # --- how much and how often -----------------------------------------------------------------------------------
