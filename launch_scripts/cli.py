@@ -16,7 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from launch_scripts.command_line import complete, usage
-from launch_scripts.command_line.families import CONTEXT, Family, rooted
+from launch_scripts.command_line.families import CONTEXT, Family, rooted, worded
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
 from launch_scripts.commands import afterwards, before, chaos, query, roles
 from launch_scripts.commands.orders import orders
@@ -210,6 +210,7 @@ def _up(
         namespace=namespace,
         tls=None if tls is None else tls.config(),
     )
+    scenario = options.with_follow(scenario, run.follow)
     monitor = msgspec.structs.replace(scenario.monitor, live=scenario.monitor.live and not run.no_live)
     scenario = msgspec.structs.replace(
         scenario,
@@ -299,7 +300,7 @@ app.add_typer(orders.app)
 @cache
 def command() -> Any:
     """The command with all of its sub-commands."""
-    return typer.main.get_command(app)
+    return worded(typer.main.get_command(app))
 
 
 def main() -> int:
