@@ -29,6 +29,10 @@ def compare(
             metavar="RUN...", help="Folders of runs, or their names in --runs.", autocompletion=complete.runs
         ),
     ],
+    out: Annotated[
+        Path | None, typer.Option(help="Also write plots: .html, a page with plots and tables, or .png.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file of --out.")] = False,
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> None:
@@ -37,10 +41,12 @@ def compare(
     Where a run listened is left out: free ports differ each time.
 
     swarm compare 20261122-154115-44bb LAST
+
+    swarm compare RUN RUN RUN --out compared.html
     """
     from launch_scripts.commands.compare import compare_runs
 
-    compare_runs(run, runs, as_json)
+    compare_runs(run, runs, as_json, out, force)
 
 
 @app.command(rich_help_panel=LEFT)
