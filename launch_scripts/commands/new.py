@@ -13,6 +13,8 @@ import typer
 
 from launch_scripts.check import settings
 from swarm.config.commented import commented
+from swarm.config.describe import expected
+from swarm.config.input_files import shown
 from swarm.config.load import BUILT_IN_TERRAINS, read_scenario
 from swarm.errors import ConfigError, StoreError
 
@@ -91,18 +93,25 @@ def _asked(path: Path, choices: Choices, ask: Callable[..., Any] = typer.prompt)
         name, default = field.name, getattr(_DEFAULTS, field.name)
         if getattr(choices, name) is not None or (name == "photo" and choices.terrain in BUILT_IN_TERRAINS):
             continue
+        kind, shown_default = type(default), default != _NONE
         while True:
-            answer = ask(
-                _QUESTIONS[name], default=default, type=type(default), err=True, show_default=default != ""
-            )
+            answer = ask(_QUESTIONS[name], default=str(default), err=True, show_default=shown_default)
             try:
-                _checked(path, answered := replace(choices, **{name: answer}))
+                _checked(path, answered := replace(choices, **{name: _read(answer, kind)}))
             except ConfigError as error:
                 typer.echo(f"  {error}", err=True)
                 continue
             choices = answered
             break
     return choices
+
+
+def _read(answer: object, kind: type[Any]) -> Any:
+    """What somebody typed, as text or number. Raises ConfigError."""
+    try:
+        return kind(answer)
+    except ValueError as error:
+        raise ConfigError(f"found {shown(answer)}, expected {expected(kind)}") from error
 
 
 def _checked(path: Path, choices: Choices) -> None:

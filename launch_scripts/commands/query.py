@@ -244,3 +244,29 @@ def top(
     from launch_scripts.commands.running.top import top as show
 
     show(where.network(tls), where, each=each, once=once, as_json=as_json)
+
+
+@app.command(rich_help_panel=_PANEL)
+@spread
+def metrics(
+    where: Where,
+    tls: Tls,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="On loopback; 0 picks one.")] = 9464,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Print a dashboard for Grafana, as JSON, and exit.")
+    ] = False,
+) -> None:
+    """Serve the figures of a running swarm to Prometheus, until Ctrl-C. It only listens.
+
+    swarm metrics --port 9464
+
+    swarm metrics --dashboard > swarm.json
+
+    `swarm up --metrics-port 9464` does the same for as long as the run lasts.
+    """
+    from launch_scripts.commands import metrics as command
+
+    if dashboard:
+        typer.echo(command.dashboard())
+    else:
+        command.serve_metrics(where.network(tls), port)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import secrets
 import time
 from pathlib import Path
@@ -15,7 +16,7 @@ from shared_map.terrain.importers.sources import is_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import explain, nearest
-from swarm.config.input_files import FileKind, check_bytes
+from swarm.config.input_files import FileKind, check_bytes, shown
 from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TerrainConfig, TlsConfig
 from swarm.errors import ConfigError, StoreError
@@ -28,7 +29,7 @@ def find_scenario(name: str, preset: str | None = None) -> Scenario:
     """Loads a built-in scenario by name, or one from a file. A file of elevation stands for a scenario on it that
     says nothing else, but the preset of its cost."""
     path = Path(name)
-    if path.is_file() and is_terrain(path):
+    if os.path.isfile(name) and is_terrain(path):
         return Scenario(name=path.stem, terrain=TerrainConfig(source=name), cost=cost_of_preset(preset))
     if preset is not None:
         raise ConfigError(f"--preset goes with a terrain file: in the scenario {name} set cost.preset")
@@ -38,12 +39,13 @@ def find_scenario(name: str, preset: str | None = None) -> Scenario:
 def scenario_path(name: str) -> Path:
     """The file of a built-in scenario, or the one named. Raises ConfigError where there is none."""
     path = Path(name)
-    if path.is_file():
+    # These say no of a name that no file can have. A device or a pipe is refused by its reader.
+    if os.path.exists(name) and not os.path.isdir(name):
         return path
     built_in = SCENARIOS / f"{name}.toml"
-    if "/" not in name and built_in.is_file():
+    if "/" not in name and os.path.isfile(built_in):
         return built_in
-    if path.is_dir():
+    if os.path.isdir(name):
         within = sorted(each.name for each in path.glob("*.toml"))[:5]
         hint = f"; in it are {', '.join(within)}" if within else ""
         raise ConfigError(f"no scenario {name!r}: it is a folder, expected a .toml file{hint}")
@@ -56,7 +58,7 @@ def scenario_path(name: str) -> Path:
     if path.suffix in (".tif", ".tiff", ".hgt", ".asc", ".npz"):
         raise ConfigError(f"no terrain {name!r}: no such file")
     raise ConfigError(
-        f"no scenario {name!r}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"
+        f"no scenario {shown(name)}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"
     )
 
 

@@ -89,7 +89,7 @@ def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(tmp_path: P
 def test_a_name_that_the_router_would_not_know_is_refused_before_anything_is_made(tmp_path: Path) -> None:
     told = run("certs", tmp_path / "certs", "keeper.0", "car1")
     assert isinstance(told.exception, ConfigError)
-    assert "'car1' is no name of a process: ROLE.ID or agent.GROUP.ID" in str(told.exception)
+    assert "'car1' is no name of a process: write ROLE.ID or agent.GROUP.ID" in str(told.exception)
     assert not (tmp_path / "certs").exists()
 
 
