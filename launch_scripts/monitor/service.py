@@ -1,6 +1,7 @@
 """The monitor's shell: draws what it hears of the swarm, frame by frame.
 
-It only listens. It may be late, stalled, killed or absent; no process waits for it.
+It listens, and asks planners for the costs that its layers show. It may be late, stalled, killed or absent; no
+process waits for it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import rerun as rr
 from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.ground.ground_view import GroundView
+from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.ground.zones import Area
 from launch_scripts.monitor.movers.movers_view import MoversView
@@ -30,10 +32,10 @@ from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED, Counters
 from swarm.wire.messages.base import Nothing
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, STATS, Topic
+from swarm.wire.topics import BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, STATS, Topic
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +46,7 @@ FRAME_HZ = 10.0
 _DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0}
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
 _ENDED_KEPT = 4096
+_ANSWER_S = 5.0
 _ANNOUNCE_NS = NS_PER_S // 2
 _LAST_WORD_NS = NS_PER_S // 2
 """So long after a process went its last figures are waited for, which say whether it was asked to end."""
@@ -57,6 +60,7 @@ class MonitorService:
     recording  watches the file of the recording, if there is one
     truth      the true ground, where this process knows it
     zones      of the scenario
+    layers     tabs of the view; the photo if there are none
     """
 
     def __init__(
@@ -72,6 +76,7 @@ class MonitorService:
         recording: RecordingWatch | None = None,
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
+        layers: Sequence[Layer] = (),
     ) -> None:
         self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
         self.over = False
@@ -93,7 +98,10 @@ class MonitorService:
         self._drawing = Drawing(rec, self._target_ids)
         self._movers = MoversView(rec, self._mesh, setup.scenario, self.recorder, self.counters, replica.filter)
         legend = self._movers.looks.legend()
-        self._ground = GroundView(rec, self._mesh, terrain, cost_map, replica, truth, zones, legend)
+        shown = layers or [PHOTO]
+        self._ground = GroundView(
+            rec, self._mesh, terrain, cost_map, replica, shown, self._target_ids, truth, zones, legend
+        )
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
@@ -123,8 +131,11 @@ class MonitorService:
             return
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if isinstance(event, Replied) and isinstance(event.message, Stats):
-            self.recorder.heard(event.message, {}, now_ns)
+        match event:
+            case Replied(message=Stats() as stats):
+                self.recorder.heard(stats, {}, now_ns)
+            case Replied(message=CostReply() as costs):
+                self._ground.hear_costs(costs, now_ns)
         if not isinstance(event, Heard):
             return
         self.recorder.heard(event.message, event.fields, now_ns)
@@ -149,6 +160,9 @@ class MonitorService:
         self._drawing.set_time(self._frame, self._seconds())
         self._watch_recording(now_ns)
         self._ground.tick(now_ns)
+        if (target := self._ground.samples.next_target(now_ns)) is not None:
+            request = self._ground.samples.request
+            self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
         self._movers.tick(now_ns)
         self._draw_plots(now_ns)
 

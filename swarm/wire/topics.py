@@ -271,7 +271,7 @@ ROUTE = Topic(
 )  # fmt: skip
 COST = Topic(
     "cost", "target/{target}/cost", CostReply, "cost-to-go of a batch of cells", "asked",
-    access(serve="planner:target", ask="agent targets rover"),
+    access(serve="planner:target", ask="agent targets monitor rover"),
     request=CostRequest, published=False,
 )  # fmt: skip
 STATUS = Topic(

@@ -158,8 +158,8 @@ def test_a_port_gives_the_live_view_the_two_after_it_and_0_picks_free_ones() -> 
     assert scenario.network.listen == scenario.network.connect == ("tcp/127.0.0.1:8000",)
     assert (scenario.monitor.grpc_port, scenario.monitor.web_port) == (8001, 8002)
     free = options.with_port(Scenario(), 0)
-    ports = {free.network.listen[0].rpartition(":")[2], str(free.monitor.grpc_port), str(free.monitor.web_port)}
-    assert len(ports) == 3
+    found = {free.network.listen[0].rpartition(":")[2], str(free.monitor.grpc_port), str(free.monitor.web_port)}
+    assert len(found) == 3
     ports.check_ports(free, ("router", "monitor"))
 
 
