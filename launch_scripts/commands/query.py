@@ -22,7 +22,8 @@ app = typer.Typer()
 
 _PANEL = "Ask a running swarm"
 _CONNECT_S = 3.0
-_STATUS_LISTEN_S = 1.5
+_STATUS_LISTEN_S, _STATUS_MOST_S = 1.5, 4.0
+"""`swarm status` listens for so long; longer while a process that has answered has not said how it is."""
 
 
 @dataclass(frozen=True)
@@ -208,8 +209,10 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     with open_bus(where.network(tls)) as bus:
         watch = StatusWatch(bus, inbox.post)
         began_s = time.monotonic()
-        while (spent_s := time.monotonic() - began_s) < _STATUS_LISTEN_S or not watch.answered:
-            if (event := inbox.take(max(_STATUS_LISTEN_S - spent_s, 0.1))) is not None:
+        while (spent_s := time.monotonic() - began_s) < _STATUS_MOST_S:
+            if spent_s >= _STATUS_LISTEN_S and watch.whole:
+                break
+            if (event := inbox.take(0.1)) is not None:
                 watch.take(event, clock.now_ns())
         told = watch.status(clock.now_ns())
     if told is None:

@@ -30,6 +30,8 @@ from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.run_folder import begin_run
+from launch_scripts.report.run_state import facts
+from launch_scripts.report.run_state.state import RunState
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
@@ -301,17 +303,16 @@ class _Run:
                 self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if self._terminal.due():
             state = watcher.recorder.summary(watcher.now_ns())
-            self._terminal.show(self._title(watcher, state.elapsed_s), state)
+            self._terminal.show(self._title(watcher, state), state)
 
-    def _title(self, watcher: Watcher, elapsed_s: float) -> str:
+    def _title(self, watcher: Watcher, state: RunState) -> str:
         """How far the run is, on its own clock, which everybody shows: start-up counts, its time is added."""
         if self._up_at_s is None:
-            every = len(self._swarm.running)
-            up = every - len(self._missing(watcher))
-            return f"{self._scenario.name}: starting, {up} of {every} processes are up, {elapsed_s:.0f} s"
+            up = facts.fact("processes_well").shown(state)
+            return f"{self._scenario.name}: starting, {up} processes are up, {state.elapsed_s:.0f} s"
         end_s = self._up_at_s + self._scenario.seconds
         live = f", live view {watcher.live_view}" if watcher.live_view else ""
-        return f"{self._scenario.name}: {elapsed_s:.0f} of {end_s:.0f} s{live}"
+        return f"{self._scenario.name}: {state.elapsed_s:.0f} of {end_s:.0f} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:

@@ -224,7 +224,8 @@ def shown_in(text: str) -> dict[str, str]:
 
 def rows_in(text: str) -> list[list[str]]:
     """The rows of the table of targets."""
-    rows = [[cell.strip() for cell in re.split("[|│┃]", line.strip("|│┃ \n"))] for line in text.splitlines()]
+    cells = (re.split(r" *[|│┃] *| {2,}", line.strip("|│┃ \n")) for line in text.splitlines())
+    rows = [[cell.strip() for cell in row if cell.strip()] for row in cells]
     labels = [column.label for column in facts.TARGET_FACTS if column.always]
     heads = [n for n, row in enumerate(rows) if row[: len(labels)] == labels]
     (head,) = heads
@@ -237,9 +238,9 @@ def alarms_in(text: str, state: RunState) -> set[str]:
     return {line for line in (alarm.line(state.grid) for alarm in state.standing_alarms) if line in text}
 
 
-def printed(what: Any) -> str:
-    console = Console(file=io.StringIO(), width=250)
-    console.print(what)
+def table_of(state: RunState) -> str:
+    console = Console(file=io.StringIO(), width=250, height=80)
+    console.print(live_table(state, f"time {facts.fact('elapsed_s').shown(state)}", console))
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
@@ -264,7 +265,7 @@ def test_no_fact_that_is_shown_in_two_places_differs(
     console = Console(file=io.StringIO(), width=250)
     print_status(status, console)
     texts = {
-        "table": printed(live_table(state, f"time {facts.fact('elapsed_s').shown(state)}")),
+        "table": table_of(state),
         "view": watched.logged.summary,
         "status": console.file.getvalue(),  # type: ignore[attr-defined]
     }
@@ -306,7 +307,7 @@ def test_no_fact_that_is_shown_in_two_places_differs(
     simulation.finish()
     watched.monitor.stop(watched.now_ns)
     report, end = simulation.report(_SHOWN_S), simulation.recorder.summary(watched.now_ns)
-    assert shown_in(watched.logged.summary) == shown_in(printed(live_table(end, f"time {end.elapsed_s:.0f} s")))
+    assert shown_in(watched.logged.summary) == shown_in(table_of(end))
     assert watched.logged.last("states") == [float(number) for number in report["states"].values()]
     captures, marks = watched.logged.last("captures_and_marks")
     assert (captures, round(marks * 100)) == (report["captures"], report["marks"])

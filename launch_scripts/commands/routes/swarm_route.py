@@ -167,8 +167,10 @@ def _show_route(answer: Answer, reply: RouteReply) -> None:
     rest = f", and then {found.remaining_s:.1f} s" if found.remaining_s > 0 else ""
     many = len(found.directions)
     typer.echo(f"{many} steps, {found.length_m:.0f} m: {_strides(found.directions)}{rest}")
-    age = f"tree {reply.tree_age_ms:.0f} ms old, map version {reply.map_version}"
-    typer.echo(f"{age}, answered in {answer.took_ms:.1f} ms")
+    grown = (
+        f"tree grown whole {reply.tree_age_ms / 1e3:.1f} s ago and kept up since, map version {reply.map_version}"
+    )
+    typer.echo(f"{grown}, answered in {answer.took_ms:.1f} ms")
     _show_pose(reply)
 
 

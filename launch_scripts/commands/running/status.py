@@ -20,11 +20,13 @@ from launch_scripts.report.run_state.state import RunState
 from shared_map.terrain.places import MapFrame
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
+from swarm.config.agents import agent_of
 from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Beat, RunInfo, Stats
+from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.topics import RUN, STATS
 
 _TAG, _GONE = "status-run", "status-gone"
@@ -83,6 +85,16 @@ class StatusWatch:
                 self._told.append((now_ns, event))
                 if isinstance(event, Disappeared):  # perhaps before it said anything to us
                     self._ask_gone()
+
+    @property
+    def whole(self) -> bool:
+        """Whether every process that has answered has also said what it counts, and every agent where it drives."""
+        told = [event.message for _, event in self._told if isinstance(event, Heard)]
+        counted = {(each.role, each.id) for each in told if isinstance(each, Stats)}
+        drives = {agent_of(each.ids[0]) for each in told if isinstance(each, Fleet) and each.ids}
+        return self.answered and all(
+            (info.role, info.id) in counted and (info.role != "agent" or info.id in drives) for info in self._found
+        )
 
     def status(self, now_ns: int) -> Status | None:
         """What was told so far; None if nobody has answered."""

@@ -5,11 +5,12 @@ Who shows a fact takes its label and its text from here, so that it reads the sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from launch_scripts.report.results.certified_gap import CertifiedGap, gap_text, percent
+from launch_scripts.report.run_state.alarms import Alarm
 from launch_scripts.report.run_state.state import RunState, TargetLine
 
 NONE = "-"
@@ -208,14 +209,36 @@ def lines(state: RunState) -> list[str]:
     return found
 
 
+_SAID_SINGLY = 2
+"""Of more alarms of one kind there is one line for all: on a slow machine every process is behind."""
+_NAMED = 3
+
+
 def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
-    """The alarms that last, the most serious first, in lines for people; then how many are left out.
+    """The alarms that last, the most serious first, in lines for people; then how many lines are left out.
 
     over  also what is over
     """
     alarms = state.alarms if over else state.standing_alarms
-    found = [alarm.line(state.grid) for alarm in alarms[:most]]
-    return [*found, f"... {len(alarms) - most} more"] if len(alarms) > most else found
+    kinds: dict[tuple[str, bool], list[Alarm]] = {}
+    for alarm in alarms:
+        kinds.setdefault((alarm.kind, alarm.lasts), []).append(alarm)
+    found: list[str] = []
+    for of_kind in kinds.values():
+        if len(of_kind) > _SAID_SINGLY:
+            found.append(_together(of_kind))
+        else:
+            found += [alarm.line(state.grid) for alarm in of_kind]
+    return [*found[:most], f"... {len(found) - most} more"] if len(found) > most else found
+
+
+def _together(alarms: Sequence[Alarm]) -> str:
+    """Many alarms of one kind in a line."""
+    first = min(alarms, key=lambda alarm: (alarm.since_s is None, alarm.since_s or 0.0))
+    names = list(dict.fromkeys(alarm.about for alarm in alarms))
+    others = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    lasting = "the first " if first.lasts else "over, the first "
+    return f"{first.label}: {len(alarms)} times, {', '.join(names[:_NAMED])}{others}, {lasting}{first.when}"
 
 
 def for_report(state: RunState) -> dict[str, Any]:

@@ -45,7 +45,6 @@ class TargetLine:
     routes_served: int | None = None
     strategy: str | None = None
     tracker: str | None = None
-    full_growth_age_s: float | None = None
 
     @property
     def title(self) -> str:
@@ -196,7 +195,6 @@ def _lines(
                 routes_served=observed.of_job("planner", id, "routes_served"),
                 strategy=None if status is None else status.strategy,
                 tracker=None if status is None else status.tracker,
-                full_growth_age_s=None if status is None else status.tree_age_ms / 1e3,
             )
         )
     return tuple(lines)

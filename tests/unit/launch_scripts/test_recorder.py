@@ -12,6 +12,7 @@ import pytest
 from launch_scripts.launcher.live_table import plain_line
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.certified_gap import CertifiedGap
+from launch_scripts.report.run_state import facts
 from launch_scripts.report.samples import Sample, Samples
 from launch_scripts.report.tracks import Tracks
 from swarm.clock import NS_PER_S
@@ -24,7 +25,7 @@ from swarm.wire.fields import ZERO_BUCKET, pack_column
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Beat, Note, Stats
+from swarm.wire.messages.processes import Alarm, Beat, Note, Stats
 from swarm.wire.messages.targets import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, VehicleState
 from swarm.wire.statements import MarkKind
@@ -331,6 +332,7 @@ def test_the_live_table_has_a_line_per_target(recorder: Recorder) -> None:
         pose("t0", 100.0, 100.0, 1),
         fleet("a0.1", {"a0-00": (130.0, 140.0), "a0-01": (500.0, 100.0)}),
         status("t0", 1.02),
+        stats("planner", "t0", counts={"growths": 3, "window_growths": 2}),
         msgspec.structs.replace(stats("agent", "a0"), histograms_by={GAPS_TO: {"t0": {ZERO_BUCKET: 3}}}),
         msgspec.structs.replace(stats("targets", "d0"), counts_by={CAPTURES_OF: {"t1": 2}}),
     )
@@ -458,3 +460,37 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recor
     day = record(12_000, 40_000, 2)
     assert day < 1.5 * hour
     assert len(recorder.captures) == recorder.captures.maxlen
+
+
+def told(kind: str, about: str, since_s: float, over_s: float | None = None) -> Alarm:
+    over_ns = None if over_s is None else int(over_s * NS_PER_S)
+    return Alarm(
+        kind=kind, about=about, text=f"{about} it is", since_ns=int(since_s * NS_PER_S), over_ns=over_ns, cell=97
+    )
+
+
+def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in_one_line() -> None:
+    recorder = Recorder(scenario(), GRID, 0)
+    at_s = 60.0
+    hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}, at_s), at_s=at_s)
+    for role, id in recorder.model.plan.crew:
+        recorder.alive(Peer(role, id, 1), True, int(at_s * NS_PER_S))
+        late = [told("behind", f"{role}-{id}", 12.0)]
+        hits = [told("collision", "a0-00 a0-01", 31.0, 31.0), told("x", "y", 3.0)] if role == "targets" else []
+        hear(recorder, msgspec.structs.replace(stats(role, id, at_s=at_s), alarms=[*late, *hits]), at_s=at_s)
+    state = recorder.summary(int(at_s * NS_PER_S))
+    assert facts.alarm_lines(state, 9) == [
+        "x: y it is, row 1, col 1, since 3 s",
+        "behind: 6 times, agent-a0, agent-a1, keeper-0 and 3 more, the first since 12 s",
+    ]
+    assert facts.alarm_lines(state, 9, over=True)[2] == "collision: a0-00 a0-01 it is, row 1, col 1, at 31 s"
+    recorder.alive(Peer("planner", "t1", 1), False, int(at_s * NS_PER_S))
+    gone = recorder.summary(int((at_s + 1) * NS_PER_S))
+    assert facts.alarm_lines(gone, 9)[0] == "down: planner-t1 is gone, since 60 s"
+    silent = recorder.summary(int((at_s + 5) * NS_PER_S))
+    assert {alarm.about for alarm in silent.alarms if alarm.kind == "silent"} == {
+        f"{role}-{id}" for role, id in recorder.model.plan.crew if id != "t1"
+    }
+    ended = msgspec.structs.replace(stats("planner", "t1", at_s=at_s, gauges={"ended": 1.0}))
+    hear(recorder, ended, at_s=at_s + 1)
+    assert not [alarm for alarm in recorder.summary(int((at_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
