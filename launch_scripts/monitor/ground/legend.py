@@ -101,7 +101,7 @@ def _swatch(look: Look) -> Image.Image:
         case "line":
             draw.line((0, radius, width, radius), colour, 2 * thick)
         case "ball":
-            draw.ellipse(square, colour)
+            draw.ellipse(square, colour, _TEXT, _FINE // 2)
         case "ring":
             draw.ellipse(square, None, colour, thick)
         case "box":
