@@ -27,7 +27,7 @@ def make_blueprint(mesh: TerrainMesh, shown: Sequence[Layer] = (PHOTO,), *, vehi
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/summary", name="Now"),
                 _plot("captures_and_marks", "Captures and marks"),
-                _plot("gap", "Gap to optimum of each target, %", legend=False),
+                _plot("gap", "Certified gap of the routes to each target, mean, %", legend=False),
                 rrb.Tabs(
                     _plot("messages", "Messages per second", legend=False),
                     _plot("growth_ms", "Growth of the trees, ms", legend=False),

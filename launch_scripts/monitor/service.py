@@ -21,7 +21,6 @@ from launch_scripts.monitor.movers.movers_view import MoversView
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.report.recorder import RECORDED, Recorder
-from launch_scripts.report.samples import messages_per_s
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
@@ -32,13 +31,16 @@ from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED, Counters
+from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
+from swarm.wire.topics import BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, STATS, Topic
 
 log = logging.getLogger(__name__)
 
+_GONE = "gone"
+"""Tag of the question what processes that are gone have counted."""
 FRAME_HZ = 10.0
 """How often the view is drawn."""
 _DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0}
@@ -108,6 +110,7 @@ class MonitorService:
         self._ended: set[Peer] = set()
         """Processes which said in their last figures that they end as they were asked to."""
         self._last_sample_s = -1.0
+        self._figures_due_ns = 0
 
     def start(self, now_ns: int) -> None:
         self._started_ns = now_ns
@@ -116,6 +119,8 @@ class MonitorService:
             if topic is not MARKS:
                 self._bus.subscribe(topic, self._post, every_s=every_s)
         self._bus.watch_alive(self._post)
+        self._bus.ask(STATS, Nothing(), self._post, tag=_GONE)
+        self.recorder.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
         self._sync.start(now_ns)
         self._drawing.set_time(0, 0.0)
         self._begin_drawing()
@@ -126,8 +131,11 @@ class MonitorService:
             return
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
-        if isinstance(event, Replied) and isinstance(event.message, CostReply):
-            self._ground.hear_costs(event.message, now_ns)
+        match event:
+            case Replied(message=CostReply() as costs):
+                self._ground.hear_costs(costs, now_ns)
+            case Replied(message=Stats() as stats):
+                self.recorder.heard(stats, {}, now_ns)
         if not isinstance(event, Heard):
             return
         self.recorder.heard(event.message, event.fields, now_ns)
@@ -160,6 +168,9 @@ class MonitorService:
 
     def stop(self, now_ns: int) -> None:
         self._tell_gone(now_ns)
+        self.recorder.finish(now_ns)
+        self._figures_due_ns = now_ns
+        self._draw_plots(now_ns)  # the last that the recording shows is how the run ended
         self.over = True
         self._member.publish_stats(now_ns)
 
@@ -218,11 +229,12 @@ class MonitorService:
 
     def _draw_plots(self, now_ns: int) -> None:
         samples = self.recorder.samples.newest
-        if not samples or samples[-1].time_s == self._last_sample_s:
+        if samples and samples[-1].time_s != self._last_sample_s:
+            self._last_sample_s = samples[-1].time_s
+            self._drawing.plots(samples[-1], samples[-1].messages_per_s)
+        if now_ns < self._figures_due_ns:  # by our own clock: a swarm that says nothing any more is news, too
             return
-        self._last_sample_s = samples[-1].time_s
-        rates = messages_per_s(samples)
-        self._drawing.plots(samples[-1], rates[-1][1] if rates else None)
+        self._figures_due_ns = now_ns + NS_PER_S
         summary = self.recorder.summary(now_ns)
         self._movers.summarised(summary)
         self._drawing.summary(summary_markdown(self._setup, summary))
