@@ -35,6 +35,9 @@ from swarm.wire.messages.planning import CostReply, PlannerStatus
 
 _WINDOWS_NS = NS_PER_S
 _LAYER_NS = 5 * NS_PER_S
+_ALL_NAMED, _NAMED_SHARE = 4, 0.12
+"""So many windows all have names. Of more, those of a share of the terrain's width: in a small one stands its
+target, which has a name."""
 _ZONES_AGAIN_NS = 10 * NS_PER_S
 _NEAREST_NS = 8 * NS_PER_S
 
@@ -191,4 +194,11 @@ class GroundView:
             (target, Window(*self._windows[target])) for target in sorted(self._windows) if self._windows[target]
         )
         parts = {target: w for target, w in told if not w.empty and w.cells < self._cells}
-        self._drawing.windows(window_outlines(self._mesh, list(parts.values())), list(parts))
+        grid = self._mesh.grid
+        least = _NAMED_SHARE * max(grid.rows, grid.cols)
+        few = len(parts) <= _ALL_NAMED
+        names = [
+            f"window of {target}" if few or max(w.row1 - w.row0, w.col1 - w.col0) >= least else None
+            for target, w in parts.items()
+        ]
+        self._drawing.windows(window_outlines(self._mesh, list(parts.values())), names)
