@@ -132,10 +132,10 @@ class MonitorService:
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
         match event:
-            case Replied(message=CostReply() as costs):
-                self._ground.hear_costs(costs, now_ns)
             case Replied(message=Stats() as stats):
                 self.recorder.heard(stats, {}, now_ns)
+            case Replied(message=CostReply() as costs):
+                self._ground.hear_costs(costs, now_ns)
         if not isinstance(event, Heard):
             return
         self.recorder.heard(event.message, event.fields, now_ns)

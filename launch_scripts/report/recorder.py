@@ -197,7 +197,8 @@ class Recorder:
         if seconds is None and self.model.first_ns is not None and self.last_ns is not None:
             seconds = (self.last_ns - self.model.first_ns) / NS_PER_S
         observed, total = self.observed, self.observed.total
-        state = self.summary(self.last_ns or 0)
+        # Later come the words of a run that ends: nobody tracks targets any more, which is no alarm.
+        state = self.summary(self.tracked.moved_ns or self.last_ns or 0)
         rates = [rate for _, rate in messages_per_s(self.samples.all())]
         fields = {
             "scenario": self.scenario.name,

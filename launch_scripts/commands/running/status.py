@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from launch_scripts.commands.run_frame import frame_of_members
+from launch_scripts.launcher.live_table import targets_table
 from launch_scripts.report.results.certified_gap import gaps_to
 from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.model import HEARD, RunModel
@@ -127,11 +128,8 @@ def print_status(status: Status, console: Console) -> None:
     for line in facts.alarm_lines(state, _SHOWN_ALARMS, over=True):
         console.print(line, style="yellow", highlight=False, soft_wrap=True)
     if state.targets:
-        labels, rows = facts.table(state, whole=True)
-        table = Table(*labels, pad_edge=False)
-        for target, row in zip(state.targets, rows, strict=True):
-            table.add_row(*row, style="yellow" if target.lost or not target.planner_up else None)
-        console.print(table)
+        console.print(targets_table(state, len(state.targets)))
+        console.print(_planning(state))
     for id, planner in sorted(status.model.observed.status.items()):
         cell = _target_cell(planner, frame)
         if frame is not None and cell is not None:
@@ -145,7 +143,7 @@ def print_status(status: Status, console: Console) -> None:
 
 
 def _processes(status: Status) -> Table:
-    crew = Table("process", "up", "messages out", "in", "dropped", pad_edge=False)
+    crew = _table("process", "up", "messages out", "in", "dropped")
     for info in status.members:
         stats = status.model.observed.newest_stats(info.role, info.id)
         counts = {} if stats is None else stats.counts
@@ -154,6 +152,22 @@ def _processes(status: Status) -> Table:
         leading = {True: ", leads", False: ", stands by", None: ""}[status.leads.get((info.role, info.id))]
         crew.add_row(f"{info.role}-{info.id}{leading}", facts.seconds(up_s), *(facts.count(n) for n in told))
     return crew
+
+
+def _planning(state: RunState) -> Table:
+    """What of the targets no other table has: beside the rest it would be wider than a terminal."""
+    columns = [facts.TARGET_FACTS[0], *(column for column in facts.TARGET_FACTS if not column.always)]
+    shown = _table(*(column.label for column in columns))
+    for line in state.targets:
+        shown.add_row(*(column.shown(line) for column in columns), style="yellow" if line.lost else None)
+    return shown
+
+
+def _table(*labels: str) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for n, label in enumerate(labels):
+        table.add_column(label, justify="right" if n else "left")
+    return table
 
 
 def status_fields(status: Status) -> dict[str, Any]:
