@@ -63,7 +63,7 @@ def until_complete(screenshot: Callable[[], bytes], folder: Path, within_s: floa
     deadline_s = time.monotonic() + within_s
     while True:
         picture = b""
-        with contextlib.suppress(BrowserError):
+        with contextlib.suppress(BrowserError, TimeoutError):
             picture = screenshot()
         if picture and complete(picture):
             return picture

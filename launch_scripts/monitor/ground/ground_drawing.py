@@ -82,13 +82,13 @@ class GroundDrawing:
         """Logs lines as thick as what leads along them."""
         self._rec.log(f"{layer}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
 
-    def windows(self, outlines: Floats, targets: Sequence[str]) -> None:
-        """Logs the outline of each target's window, with its name in the south."""
+    def windows(self, outlines: Floats, names: Sequence[str | None]) -> None:
+        """Logs outlines of windows, with their names in the south; None has no name."""
         self._rec.log("world/windows", rr.LineStrips3D.from_fields(strips=outlines))
-        if len(targets) <= _NAMES_SHOWN:
-            names = [f"window of {target}" for target in targets]
-            places = outlines[:, 5 * SIDE_POINTS // 2] if len(outlines) else np.empty((0, 3), np.float32)
-            self._rec.log("world/windows/names", _texts(places, names, [WINDOW]))
+        named = [n for n, name in enumerate(names) if name is not None][:_NAMES_SHOWN]
+        places = outlines[named, 5 * SIDE_POINTS // 2] if named else np.empty((0, 3), np.float32)
+        texts = [name for name in names if name is not None][:_NAMES_SHOWN]
+        self._rec.log("world/windows/names", _texts(places, texts, [WINDOW]))
 
     def _zones(self, whose: str, zones: Sequence[Area], *, static: bool) -> None:
         parts = [borders(self._mesh, [area]) for area in zones]

@@ -34,7 +34,10 @@ from swarm.grid import Window
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 
 _WINDOWS_NS = NS_PER_S
-_REFRESH_NS = NS_PER_S
+_LAYER_NS = 5 * NS_PER_S
+_ALL_NAMED, _NAMED_SHARE = 4, 0.12
+"""So many windows all have names. Of more, those of a share of the terrain's width: in a small one stands its
+target, which has a name."""
 _ZONES_AGAIN_NS = 10 * NS_PER_S
 _NEAREST_NS = 8 * NS_PER_S
 
@@ -45,7 +48,8 @@ class _Tiles:
     pictures is drawn once for all.
 
     layer      whose tiles these are
-    every_ns   how often tiles that are out of date are drawn
+    every_ns   how often tiles that are out of date are drawn; if none is, one is sent again, as a viewer that joins
+               late has only what the server still holds
     at_once    how many at most
     """
 
@@ -57,6 +61,13 @@ class _Tiles:
 
     def __post_init__(self) -> None:
         self.stale: dict[int, None] = {}
+        self._next = 0
+
+    def refresh(self, tiles: int) -> None:
+        """One of so many tiles is out of date if none was."""
+        if not self.stale:
+            self.stale[self._next] = None
+            self._next = (self._next + 1) % tiles
 
 
 class GroundView:
@@ -91,8 +102,8 @@ class GroundView:
         self._shown, self._target_ids = list(layers), list(targets)
         tiled = (
             _Tiles(PHOTO, colours.photo_of, NS_PER_S, 80),
-            _Tiles(COST, colours.cost_of, 3 * NS_PER_S, 40),
-            _Tiles(KNOWN, colours.known_of, 3 * NS_PER_S, 40),
+            _Tiles(COST, colours.cost_of, _LAYER_NS, 80),
+            _Tiles(KNOWN, colours.known_of, _LAYER_NS, 80),
         )
         self._layers = [each for each in tiled if each.layer in layers]
         self._targets = [layer for layer in layers if layer.target is not None]
@@ -104,7 +115,6 @@ class GroundView:
         self._windows: dict[str, tuple[int, ...]] = {}
         """Target -> the window that its planner grew last."""
         self._windows_new, self._windows_due_ns = False, 0
-        self._refresh_due_ns, self._next_refresh = 0, 0
 
     def begin(self) -> None:
         """Draws all of it."""
@@ -143,24 +153,15 @@ class GroundView:
             changed = dict.fromkeys(self._mesh.tiles_touching(window))
             for layer in self._layers:
                 layer.stale.update(changed)
-        if now_ns >= self._refresh_due_ns:
-            self._refresh(now_ns)
         self._draw_ordered(now_ns)
         for layer in self._layers:
-            if layer.stale and now_ns >= layer.due_ns:
+            if now_ns >= layer.due_ns:
                 layer.due_ns = now_ns + layer.every_ns
+                layer.refresh(self._mesh.tiles)
                 self._draw_tiles(layer, layer.at_once)
         if self._windows_new and now_ns >= self._windows_due_ns:
             self._windows_new, self._windows_due_ns = False, now_ns + _WINDOWS_NS
             self._draw_windows()
-
-    def _refresh(self, now_ns: int) -> None:
-        """Sends one tile of each layer again: a viewer which joins late has only what the server still holds."""
-        self._refresh_due_ns = now_ns + _REFRESH_NS
-        for layer in self._layers:
-            if not layer.stale:
-                layer.stale[self._next_refresh] = None
-        self._next_refresh = (self._next_refresh + 1) % self._mesh.tiles
 
     def _draw_tiles(self, layer: _Tiles, most: int) -> None:
         for tile in list(layer.stale)[:most]:
@@ -193,4 +194,11 @@ class GroundView:
             (target, Window(*self._windows[target])) for target in sorted(self._windows) if self._windows[target]
         )
         parts = {target: w for target, w in told if not w.empty and w.cells < self._cells}
-        self._drawing.windows(window_outlines(self._mesh, list(parts.values())), list(parts))
+        grid = self._mesh.grid
+        least = _NAMED_SHARE * max(grid.rows, grid.cols)
+        few = len(parts) <= _ALL_NAMED
+        names = [
+            f"window of {target}" if few or max(w.row1 - w.row0, w.col1 - w.col0) >= least else None
+            for target, w in parts.items()
+        ]
+        self._drawing.windows(window_outlines(self._mesh, list(parts.values())), names)

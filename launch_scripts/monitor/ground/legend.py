@@ -17,7 +17,8 @@ from launch_scripts.report.pictures import palette
 BACKGROUND = (17, 22, 28)
 WIDTH_PX, HEIGHT_PX = 1840, 156
 _TEXT = (223, 227, 232)
-_ROWS, _ROW_PX, _TOP_PX = 5, 29, 20
+_ROWS = ((4, 25), (5, 21))
+"""Rows, and how large their text is: more and smaller ones where columns would not fit."""
 _SIZE_PX, _SWATCH_PX, _GAP_PX = 21, (40, 18), 30
 _LEFT_PX, _SCALE_PX = 14, 420
 _FINE = 4
@@ -68,18 +69,25 @@ def legend_picture(entries: tuple[Look, ...], scale: Scale | None = None) -> byt
     """A PNG of `WIDTH_PX` x `HEIGHT_PX`."""
     image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), BACKGROUND)
     draw = ImageDraw.Draw(image)
-    font = ImageFont.load_default(_SIZE_PX)
     left = float(_LEFT_PX)
     if scale is not None:
         _draw_scale(image, draw, scale)
         left += _SCALE_PX + 2 * _GAP_PX
-    for first in range(0, len(entries), _ROWS):
-        column = entries[first : first + _ROWS]
+    for rows, size in _ROWS:
+        font = ImageFont.load_default(size)
+        columns = [entries[first : first + rows] for first in range(0, len(entries), rows)]
+        widths = [
+            _SWATCH_PX[0] + 12 + max(font.getlength(entry.meaning) for entry in column) + _GAP_PX
+            for column in columns
+        ]
+        if left + sum(widths) <= WIDTH_PX:
+            break
+    for column, width in zip(columns, widths, strict=True):
         for row, entry in enumerate(column):
-            middle = _TOP_PX + row * _ROW_PX
+            middle = round((row + 0.5) * HEIGHT_PX / rows)
             image.paste(_swatch(entry), (round(left), middle - _SWATCH_PX[1] // 2))
             draw.text((left + _SWATCH_PX[0] + 12, middle), entry.meaning, _TEXT, font, anchor="lm")
-        left += _SWATCH_PX[0] + 12 + max(font.getlength(entry.meaning) for entry in column) + _GAP_PX
+        left += width
     file = io.BytesIO()
     image.save(file, "PNG")
     return file.getvalue()
@@ -101,7 +109,7 @@ def _swatch(look: Look) -> Image.Image:
         case "line":
             draw.line((0, radius, width, radius), colour, 2 * thick)
         case "ball":
-            draw.ellipse(square, colour)
+            draw.ellipse(square, colour, _TEXT, _FINE // 2)
         case "ring":
             draw.ellipse(square, None, colour, thick)
         case "box":

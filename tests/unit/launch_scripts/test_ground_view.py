@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from launch_scripts.monitor.ground.ground_colours import (
     STILL_HIDDEN_SLOW,
     GroundColours,
 )
+from launch_scripts.monitor.ground.ground_view import GroundView
 from launch_scripts.monitor.ground.layers import COST, KNOWN, PHOTO, legends, nearest_legend, to_target_legend
 from launch_scripts.monitor.ground.legend import HEIGHT_PX, WIDTH_PX
 from launch_scripts.monitor.ground.map_margin import map_margin, said_heights
@@ -37,14 +39,17 @@ from launch_scripts.monitor.ground.zones import (
     title_places,
 )
 from launch_scripts.monitor.movers.looks import Looks
+from shared_map.cost_map import CostMap
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import Window
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.marks import MarkSet
+from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.statements import MarkKind
 
 ALL = Window(0, 0, 40, 50)
@@ -212,3 +217,27 @@ def test_every_layer_has_a_legend(groups: list[str]) -> None:
         assert image.size == (WIDTH_PX, HEIGHT_PX)
         right_edge = np.asarray(image)[:, -4:]
         assert len(np.unique(right_edge.reshape(-1, 3), axis=0)) == 1, "nothing is cut off"
+
+
+def test_of_many_windows_only_large_ones_have_names(tmp_path: Path) -> None:
+    terrain = flat()
+    mesh, cost_map, replica = TerrainMesh(terrain), CostMap(terrain), MapReplica(terrain.grid)
+    rec = rr.RecordingStream("names", recording_id="r")
+    rec.set_sinks(rr.FileSink(str(tmp_path / "names.rrd"), write_footer=False))
+    drawn: list[list[str | None]] = []
+    view = GroundView(rec, mesh, terrain, cost_map, replica, [PHOTO], ["t0"])
+    view._drawing.windows = lambda outlines, names: drawn.append(list(names))  # type: ignore[method-assign]
+    for count, named in ((3, {"t0", "t1", "t2"}), (6, {"t5"})):
+        for n in range(count):
+            window = [0, 0, 30, 30] if n == 5 else [n, n, n + 3, n + 3]
+            view.hear_status(
+                PlannerStatus(
+                    target=f"t{n}", incarnation=1, stamp_ns=0, strategy="auto", target_cell=0, map_version=0,
+                    tree_age_ms=0.0, window=window, growths=0, window_growths=0, growth_ms=1.0, routes_served=0,
+                    following=0, gap_mean=None, gap_p95=None, gap_max=None,
+                )
+            )  # fmt: skip
+        view.tick(len(drawn) * 2 * NS_PER_S)
+        assert {name for name in drawn[-1] if name} == {f"window of {target}" for target in named}
+        assert len(drawn[-1]) == count
+    rec.disconnect()
