@@ -16,7 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from launch_scripts.command_line import complete, usage
-from launch_scripts.command_line.families import CONTEXT, Family, rooted
+from launch_scripts.command_line.families import CONTEXT, Family, rooted, worded
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
 from launch_scripts.commands import afterwards, before, chaos, query, roles
 from launch_scripts.commands.orders import orders
@@ -299,7 +299,7 @@ app.add_typer(orders.app)
 @cache
 def command() -> Any:
     """The command with all of its sub-commands."""
-    return typer.main.get_command(app)
+    return worded(typer.main.get_command(app))
 
 
 def main() -> int:

@@ -24,10 +24,10 @@ from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Beat, RunInfo
-from swarm.wire.topics import RUN
+from swarm.wire.messages.processes import Beat, RunInfo, Stats
+from swarm.wire.topics import RUN, STATS
 
-_TAG = "status-run"
+_TAG, _GONE = "status-run", "status-gone"
 _ASK_S = 1.0
 _NO_GRID = GridSpec(1, 1, 1.0)
 _SHOWN_ALARMS = 12
@@ -65,6 +65,12 @@ class StatusWatch:
             bus.subscribe(topic, post, every_s=every_s)
         bus.watch_alive(post)
         bus.ask(RUN, Nothing(), post, tag=_TAG, timeout_s=_ASK_S)
+        self._bus, self._post = bus, post
+        self._ask_gone()
+
+    def _ask_gone(self) -> None:
+        """Ask what processes that are gone have said last."""
+        self._bus.ask(STATS, Nothing(), self._post, tag=_GONE, timeout_s=_ASK_S)
 
     def take(self, event: Event, now_ns: int) -> None:
         """Take in one event."""
@@ -73,8 +79,10 @@ class StatusWatch:
                 self._found.append(info)
             case AskEnded(tag=tag) if tag == _TAG:
                 self.answered = True
-            case Heard() | Appeared() | Disappeared():
+            case Heard() | Appeared() | Disappeared() | Replied(message=Stats()):
                 self._told.append((now_ns, event))
+                if isinstance(event, Disappeared):  # perhaps before it said anything to us
+                    self._ask_gone()
 
     def status(self, now_ns: int) -> Status | None:
         """What was told so far; None if nobody has answered."""
@@ -91,7 +99,7 @@ class StatusWatch:
         leads: dict[tuple[str, str], bool] = {}
         for told_ns, event in self._told:
             match event:
-                case Heard(message=message):
+                case Heard(message=message) | Replied(message=message):
                     if isinstance(message, Beat):
                         leads[message.role, message.id] = message.leads
                     model.heard(message, told_ns)
@@ -109,8 +117,9 @@ def print_status(status: Status, console: Console) -> None:
         console.print("no run yet: only routers answer", highlight=False)
     else:
         time = facts.fact("elapsed_s")
-        head = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells, "
-        console.print(f"{head}{time.label} {time.shown(state)}", highlight=False, soft_wrap=True)
+        head = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells"
+        console.print(head, highlight=False, soft_wrap=True)
+        console.print(f"{time.label} {time.shown(state)}", highlight=False)
         if frame is not None and frame.grid.crs != "local":
             console.print(f"terrain: {extent_of(frame, 'latlon')}", highlight=False)
         for line in facts.lines(state):

@@ -356,6 +356,7 @@ def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_i
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
     hear(recorder, status("t0", 1.0), at_s=60.0)  # the last words of a run that takes long to end
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
+    assert [alarm["about"] for alarm in recorder.report()["alarms"] if alarm["kind"] == "target-lost"] == ["t0"]
     hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}), at_s=60.0)
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0", "t1"]
     hear(recorder, pose("t0", 100.0, 100.0, 2), pose("t1", 100.0, 100.0, 2), at_s=61.0)
