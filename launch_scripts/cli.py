@@ -210,6 +210,7 @@ def _up(
         namespace=namespace,
         tls=None if tls is None else tls.config(),
     )
+    scenario = options.with_follow(scenario, run.follow)
     monitor = msgspec.structs.replace(scenario.monitor, live=scenario.monitor.live and not run.no_live)
     scenario = msgspec.structs.replace(
         scenario,

@@ -212,7 +212,12 @@ def _measured(scenario: Scenario, seconds: float, path: Path) -> dict[str, Any]:
     frames = int((seconds + _WARM_UP_S) * FRAME_HZ)
     told = list(_MadeUpSwarm(scenario, terrain).frames(frames))
     mesh = TerrainMesh(terrain)
-    sinks = Sinks("bench", path, scenario.monitor, make_blueprint(mesh, vehicles=scenario.vehicle_count))
+    sinks = Sinks(
+        "bench",
+        path,
+        scenario.monitor,
+        make_blueprint(mesh, vehicles=scenario.vehicle_count),
+    )
     network = MemoryNetwork(Scheduler(ManualClock(0)), PerfectLinks())
     setup = RoleSetup(scenario, "bench", "monitor", "0", 1, 0)
     service = MonitorService(setup, terrain, network.bus("monitor"), lambda event: None, sinks.streams, mesh=mesh)

@@ -122,5 +122,9 @@ class RunOptions:
         int | None,
         typer.Option(min=0, max=65535, help="Serve figures to Prometheus on this port of loopback; 0 picks one."),
     ] = None
+    follow: Annotated[
+        str | None,
+        typer.Option(metavar="ID", help="The camera follows this vehicle or target, as a0-07."),
+    ] = None
     plain: Annotated[bool, typer.Option("--plain", help="Plain lines instead of the live table.")] = False
     as_json: AsJson = False

@@ -13,17 +13,20 @@ from launch_scripts.monitor.ground.map_margin import said_heights
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.movers.levels import level_for
 from launch_scripts.monitor.movers.looks import HINT
-from launch_scripts.monitor.movers.mover_drawing import mover_overrides
+from launch_scripts.monitor.movers.mover_drawing import FOLLOWED_ENTITY, mover_overrides
 
 
-def make_blueprint(mesh: TerrainMesh, shown: Sequence[Layer] = (PHOTO,), *, vehicles: int = 100) -> rrb.Blueprint:
+def make_blueprint(
+    mesh: TerrainMesh, shown: Sequence[Layer] = (PHOTO,), *, vehicles: int = 100, follow: str | None = None
+) -> rrb.Blueprint:
     """Layers of the 3D view on the left, each with its legend; figures, plots and the log on the right.
 
     vehicles  how many there are, which decides how much is drawn of each
+    follow    vehicle or target that the camera follows
     """
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Tabs(*(_layer(mesh, layer, vehicles) for layer in shown), active_tab=0),
+            rrb.Tabs(*(_layer(mesh, layer, vehicles, follow) for layer in shown), active_tab=0),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/summary", name="Now"),
                 _plot("captures_and_marks", "Captures and marks"),
@@ -47,7 +50,7 @@ def make_blueprint(mesh: TerrainMesh, shown: Sequence[Layer] = (PHOTO,), *, vehi
     )
 
 
-def _layer(mesh: TerrainMesh, layer: Layer, vehicles: int) -> rrb.Vertical:
+def _layer(mesh: TerrainMesh, layer: Layer, vehicles: int, follow: str | None) -> rrb.Vertical:
     """A tab: the swarm on the ground of one layer, and the legend beneath it."""
     legend = rrb.Spatial2DView(
         origin=f"/legend/{layer.name}",
@@ -55,30 +58,44 @@ def _layer(mesh: TerrainMesh, layer: Layer, vehicles: int) -> rrb.Vertical:
         background=rrb.Background(color=BACKGROUND),
         visual_bounds=rrb.VisualBounds2D(x_range=(0, WIDTH_PX), y_range=(0, HEIGHT_PX)),
     )
-    return rrb.Vertical(_view_3d(mesh, layer, vehicles), legend, row_shares=[5.4, 1], name=layer.title)
+    return rrb.Vertical(_view_3d(mesh, layer, vehicles, follow), legend, row_shares=[5.4, 1], name=layer.title)
 
 
-def _view_3d(mesh: TerrainMesh, layer: Layer, vehicles: int) -> rrb.Spatial3DView:
+def _view_3d(mesh: TerrainMesh, layer: Layer, vehicles: int, follow: str | None) -> rrb.Spatial3DView:
     middle = (mesh.width_m / 2, -mesh.depth_m / 2, float(mesh.heights_m.mean()))
     far = max(mesh.width_m, mesh.depth_m)
-    contents = ["+ $origin/**", "- $origin/layers/**"]
+    contents = ["+ /world/**", "- /world/layers/**"]
     if layer is not PHOTO:
         contents += [f"- /{PHOTO.entity}/**", f"+ /{layer.entity}/**"]
     if layer.target is not None:
         contents += ["- /world/routes/**", f"+ /world/routes/{layer.target}"]
     return rrb.Spatial3DView(
-        origin="/world",
+        origin=f"/{FOLLOWED_ENTITY}" if follow else "/world",
         contents=contents,
-        name=f"{layer.title}, {said_heights(mesh.stretch)}; {HINT}",
+        name=", ".join((layer.title, said_heights(mesh.stretch), f"following {follow}" if follow else HINT)),
         background=rrb.Background(color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=(middle[0] - 0.05 * far, middle[1] - 0.84 * far, middle[2] + 0.62 * far),
-            look_target=(middle[0], middle[1] - 0.19 * far, middle[2]),
-            eye_up=(0, 0, 1),
-        ),
+        eye_controls=_followed(far) if follow else _overview(middle, far),
         overrides=mover_overrides(level_for(vehicles)),
+    )
+
+
+def _overview(middle: tuple[float, float, float], far: float) -> rrb.EyeControls3D:
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=(middle[0] - 0.05 * far, middle[1] - 0.84 * far, middle[2] + 0.62 * far),
+        look_target=(middle[0], middle[1] - 0.19 * far, middle[2]),
+        eye_up=(0, 0, 1),
+    )
+
+
+def _followed(far: float) -> rrb.EyeControls3D:
+    """The followed one is the origin of the view: the world moves below it."""
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=(-0.02 * far, -0.16 * far, 0.11 * far),
+        look_target=(0, 0, 0),
+        eye_up=(0, 0, 1),
     )
 
 

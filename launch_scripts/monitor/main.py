@@ -35,7 +35,8 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_bus(setup.scenario.network, patient=True))
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
-        blueprint = make_blueprint(mesh, layers, vehicles=setup.scenario.vehicle_count)
+        scenario = setup.scenario
+        blueprint = make_blueprint(mesh, layers, vehicles=scenario.vehicle_count, follow=scenario.monitor.follow)
         sinks = Sinks(recording_id, path, config, blueprint)
         stack.callback(sinks.close)
         service = MonitorService(

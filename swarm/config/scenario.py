@@ -497,6 +497,7 @@ class MonitorConfig(Section, frozen=True, kw_only=True):
 
     show_target    the target of whose cost-to-go there is a picture; the first if empty
     height_factor  how many times as high as they are heights are drawn; chosen by the relief if absent
+    follow         vehicle or target that the camera follows; none if absent
     """
 
     live: bool = True
@@ -504,6 +505,7 @@ class MonitorConfig(Section, frozen=True, kw_only=True):
     web_port: Annotated[int, Meta(ge=0, le=65535)] = 9090
     show_target: str = ""
     height_factor: Annotated[float, Meta(gt=0, le=100)] | None = None
+    follow: str | None = None
 
 
 class Scenario(Section, frozen=True, kw_only=True):

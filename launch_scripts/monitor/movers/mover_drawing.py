@@ -47,7 +47,8 @@ def mover_overrides(level: Level) -> dict[Any, Any]:
 class MoverDrawing:
     """Logs all that moves to one recording stream."""
 
-    def __init__(self, rec: rr.RecordingStream | Streams, looks: Looks, level: Level) -> None:
+    def __init__(self, rec: rr.RecordingStream | Streams, looks: Looks, level: Level, follows: bool) -> None:
+        self._follows = follows
         self._rec = rec
         self._looks = looks
         self._level = level
@@ -62,6 +63,9 @@ class MoverDrawing:
         self._style("world/targets/poles", None, _screen(2.2))
         self._style("world/targets/sighted", SIGHTED_COLOUR, _screen(1.2))
         self._style("world/alarms/poles", None, _screen(1.8))
+        halo = rr.Points3D([(0, 0, 0)], colors=[_LABEL_COLOUR], radii=[_screen(self._level.radius_px + 2.5)])
+        if self._follows:
+            self._rec.log(FOLLOWED_ENTITY + "/halo", halo, static=True)
         for entity in ("world/vehicles/names", "world/targets/names", "world/targets/sighted/names"):
             shown = rr.Points3D.from_fields(colors=[_LABEL_COLOUR], radii=[_screen(0.1)], show_labels=True)
             self._rec.log(entity, shown, static=True)
@@ -128,12 +132,8 @@ class MoverDrawing:
         self._rec.log("world/alarms/marks", balls)
 
     def followed(self, position: Floats) -> None:
-        """Where the vehicle or target is that the camera follows: a halo, and what the camera looks at."""
-        halo = rr.Points3D.from_fields(
-            positions=position, colors=np.array([[255, 255, 255]], np.uint8),
-            radii=[_screen(self._level.radius_px + 3.0)],
-        )  # fmt: skip
-        self._rec.log(FOLLOWED_ENTITY, halo)
+        """Where the vehicle or target is that the camera follows: an entity whose origin moves, with a halo."""
+        self._rec.log(FOLLOWED_ENTITY, rr.Transform3D.from_fields(translation=position))
 
 
 def _arrow(strips: Strips) -> pa.Array:

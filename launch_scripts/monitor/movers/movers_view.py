@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+
 import rerun as rr
 
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.alarms import alarm_marks
 from launch_scripts.monitor.movers.details import target_details
 from launch_scripts.monitor.movers.levels import level_for
 from launch_scripts.monitor.movers.looks import Looks
 from launch_scripts.monitor.movers.mover_drawing import MoverDrawing
+from launch_scripts.monitor.movers.points import Points, alarm_tops, followed_point
+from launch_scripts.monitor.movers.strips import poles
 from launch_scripts.monitor.movers.targets_view import TargetsView
 from launch_scripts.monitor.movers.vehicles_view import VehiclesView, trails_of
 from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.run_state.state import RunState
+from launch_scripts.report.vehicle_columns import VehicleColumns
 from shared_map.replication.filter import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.config.scenario import Scenario
@@ -42,11 +48,13 @@ class MoversView:
         filter: MarkFilter,
     ) -> None:
         self._recorder = recorder
+        self._mesh = mesh
         self._counters = counters
         level = level_for(scenario.vehicle_count)
         self.looks = looks = Looks([group.name for group in scenario.groups], scenario.target_ids)
-        self._drawing = MoverDrawing(rec, looks, level)
+        self._drawing = MoverDrawing(rec, looks, level, scenario.monitor.follow is not None)
         self._vehicles = VehiclesView(self._drawing, mesh, scenario, level, looks)
+        self._follow = scenario.monitor.follow
         self._targets = TargetsView(self._drawing, mesh, looks, trails_of(scenario, mesh, level))
         self._sightings = Sightings(filter)
         self._bodies = Bodies(mesh.grid)
@@ -55,6 +63,8 @@ class MoversView:
         """Target -> a sentence about it."""
         self._crew: frozenset[tuple[str, str]] = frozenset()
         """(role, id) of the processes that the run needs; of others that went, vehicles have left."""
+        self._alarmed = False
+        """Whether any alarm is drawn."""
         self._fleets_new = False
 
     def begin(self) -> None:
@@ -76,17 +86,29 @@ class MoversView:
                     self._counters.count("routes_unreadable")
 
     def summarised(self, summary: RunState) -> None:
-        """Takes what the figures say of targets, so that all places say the same."""
+        """Takes what the figures say, so that all places say the same; draws alarms where they are."""
         self._details = {line.id: target_details(line) for line in summary.targets}
-        plan = self._recorder.model.plan
+        plan, observed = self._recorder.model.plan, self._recorder.observed
         self._crew = frozenset(plan.crew_now(plan.targets_now(self._recorder.book)))
+        marks = alarm_marks(
+            summary.alarms, summary.elapsed_s, observed.targets(), observed.vehicles(), self._mesh.grid
+        )
+        if marks or self._alarmed:
+            self._alarmed = bool(marks)
+            places_m = {str(n): (mark.east_m, mark.south_m) for n, mark in enumerate(marks)}
+            points = Points(list(places_m), alarm_tops(self._mesh, places_m))
+            strips = poles(self._mesh, points)
+            texts = [mark.text for mark in marks]
+            self._drawing.alarms(points.positions, strips, [mark.colour for mark in marks], texts)
 
     def tick(self, now_ns: int) -> None:
         """Draws what is due in one frame."""
         observed = self._recorder.observed
         if self._fleets_new:
             self._fleets_new = False
-            self._vehicles.draw(observed.driven(self._crew, now_ns), observed.groups, now_ns)
+            vehicles = observed.driven(self._crew, now_ns)
+            self._vehicles.draw(vehicles, observed.groups, now_ns)
+            self._draw_followed(vehicles)
         self._sightings.expire(now_ns)
         lost = self._recorder.tracked.lost(now_ns)
         # A target that an operator removed is in no table either.
@@ -96,3 +118,14 @@ class MoversView:
         self._bodies.take_changed()
         self._bodies.complaints.clear()
         self._targets.draw_bodies(self._bodies.reports, now_ns)
+
+    def _draw_followed(self, vehicles: VehicleColumns) -> None:
+        """Draws the vehicle or target that the camera follows, where it is now; nothing while nobody knows."""
+        if self._follow is None:
+            return
+        place_m = self._recorder.observed.targets().get(self._follow)
+        n = bisect_left(vehicles.ids, self._follow)
+        if n < len(vehicles) and vehicles.ids[n] == self._follow:
+            place_m = float(vehicles.east_m[n]), float(vehicles.south_m[n])
+        if place_m is not None:
+            self._drawing.followed(followed_point(self._mesh, place_m))

@@ -40,6 +40,19 @@ def target_points(mesh: TerrainMesh, places_m: Places) -> Points:
     return Points(list(places_m), mesh.place(east_south[:, 0], east_south[:, 1], 2.2 * mesh.scale_m))
 
 
+def alarm_tops(mesh: TerrainMesh, places_m: Places) -> Floats:
+    """Above what they are about, higher than targets."""
+    tops: Floats = target_points(mesh, places_m).positions + np.array([0, 0, 2.4 * mesh.scale_m], np.float32)
+    return tops
+
+
+def followed_point(mesh: TerrainMesh, place_m: tuple[float, float]) -> Floats:
+    """A place on the ground, float32 (3,)."""
+    east_south = np.array([place_m], np.float32)
+    point: Floats = mesh.place(east_south[:, 0], east_south[:, 1], 0.1 * mesh.scale_m)[0]
+    return point
+
+
 def sighting_points(mesh: TerrainMesh, seen: Mapping[str, Sighted]) -> tuple[Points, Floats]:
     """Where targets were seen last, and the radii within which they were, float32 (n,)."""
     radii_m = np.array([each.uncertainty_m for each in seen.values()], np.float32)
@@ -54,7 +67,7 @@ def body_points(mesh: TerrainMesh, bodies: Sequence[Body]) -> tuple[Points, Floa
 
 def label_places(mesh: TerrainMesh, targets: Points) -> Floats:
     """Places of the targets' names: above them."""
-    names: Floats = targets.positions + np.array([0, 0, 4.2 * mesh.scale_m], np.float32)
+    names: Floats = targets.positions + np.array([0, 0, 3.2 * mesh.scale_m], np.float32)
     return names
 
 

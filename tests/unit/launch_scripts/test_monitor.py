@@ -34,11 +34,12 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError, StoreError
 from swarm.liveness import Peer
+from swarm.wire.fields import pack_column
 from swarm.wire.messages.bodies import Body
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.targets import Sighted
-from swarm.wire.messages.vehicles import Followed
+from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import FOLLOWED, NOTE, TOPICS
 
 
@@ -92,6 +93,87 @@ def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: T
     textures = [rows[f"/world/ground/{tile}"] for tile in range(tiles)]
     assert min(textures) >= 1
     assert max(textures) >= 2, "marks change the photo"
+
+
+def components(path: Path, entity: str, since_s: float = 0.0) -> dict[str, list[Any]]:
+    """Component -> its rows from a time on."""
+    found: dict[str, list[Any]] = {}
+    for chunk in chunks(path):
+        if str(chunk.entity_path) != entity or chunk.is_static:
+            continue
+        batch = chunk.to_record_batch()
+        at_s = [each.value / NS_PER_S for each in batch.column("sim_time")]
+        for name in set(batch.schema.names) - {"sim_time", "tick", "log_time", "log_tick"}:
+            rows = [row for t, row in zip(at_s, batch.column(name).to_pylist(), strict=True) if t >= since_s]
+            found.setdefault(name.rpartition(":")[2], []).extend(row for row in rows if row is not None)
+    return {name: rows for name, rows in found.items() if rows}
+
+
+def test_an_instance_has_three_components_of_which_one_says_who_it_is(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    """Of more than three the viewer tells only their number, when one points at it."""
+    rig = Rig(scenario, terrain, tmp_path / "run.rrd")
+    rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
+    rig.close()
+    for entity, sentence in (("/world/vehicles", "vehicle"), ("/world/targets/balls", "target")):
+        parts = components(tmp_path / "run.rrd", entity)
+        parts = {name: rows for name, rows in parts.items() if not name.endswith("RowId")}
+        assert set(parts) == {"positions", "colors", sentence}
+        assert len(parts[sentence][-1]) == len(parts["positions"][-1])
+    assert any(
+        " on its way to t" in line for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
+    )
+
+
+def test_whoever_opens_the_view_late_has_all_of_it_soon(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    """As if the server had dropped what is old: its last ten seconds hold every component."""
+    longer = msgspec.structs.replace(scenario, seconds=16.0)
+    rig = Rig(longer, terrain, tmp_path / "run.rrd")
+    rig.play(fake_run(terrain, hidden_truth(terrain), longer))
+    rig.close()
+    for entity in ("/world/vehicles", "/world/targets/balls", "/world/targets/names", "/world/routes/t0"):
+        whole, late = (components(tmp_path / "run.rrd", entity, since_s).keys() for since_s in (0.0, 6.0))
+        assert whole == late, entity
+
+
+def test_guests_have_a_box_and_vehicles_that_left_are_gone(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    def fleet(ids: list[str], seq: int) -> tuple[int, Fleet]:
+        n, now_ns = len(ids), seq * NS_PER_S // 2
+        places = pack_column(np.linspace(100, 900, n), "<f4")
+        return now_ns, Fleet(
+            author="x.1", group="all", region=0, seq=seq, stamp_ns=now_ns, ids=ids, target_ids=[],
+            cells=pack_column([0] * n, "<u4"), east_m=places, south_m=places,
+            heading_rad=pack_column([0.0] * n, "<f4"), states=bytes(n), targets=bytes([255] * n),
+        )  # fmt: skip
+
+    rig = Rig(scenario, terrain, tmp_path / "run.rrd")
+    rig.play([fleet(["a0-00", "x-00", "x-01"], 1), fleet(["a0-00", "x-01"], 2), fleet(["a0-00"], 3)])
+    rig.close()
+    drawn = {
+        entity: [len(row) for row in components(tmp_path / "run.rrd", entity)[part]]
+        for entity, part in (
+            ("/world/vehicles", "positions"), ("/world/guests", "positions"), ("/world/guests/frames", "centers"),
+        )
+    }  # fmt: skip
+    assert drawn["/world/vehicles"] == [1, 1, 1]
+    assert drawn["/world/guests"] == drawn["/world/guests/frames"] == [2, 1, 0]
+
+
+@pytest.mark.parametrize("name", ["a0-03", "t1"])
+def test_the_camera_follows_a_vehicle_or_a_target(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path, name: str
+) -> None:
+    following = msgspec.structs.replace(scenario, monitor=MonitorConfig(live=False, follow=name))
+    rig = Rig(following, terrain, tmp_path / "run.rrd")
+    rig.play(fake_run(terrain, hidden_truth(terrain), following))
+    rig.close()
+    led = [tuple(row[0]) for row in components(tmp_path / "run.rrd", "/world/followed")["translation"]]
+    assert len(set(led)) > 2, "it moves"
 
 
 def test_a_window_is_drawn_when_it_changes_and_not_each_time_that_it_is_told(

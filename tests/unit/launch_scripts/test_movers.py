@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from launch_scripts.launcher.options import with_follow
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.alarms import FADES_S, alarm_marks
 from launch_scripts.monitor.movers.details import target_details, target_labels, vehicle_details
 from launch_scripts.monitor.movers.due import Due
 from launch_scripts.monitor.movers.levels import LEVELS, level_for
-from launch_scripts.monitor.movers.looks import HUES, LOST_COLOUR, Looks, shaded
+from launch_scripts.monitor.movers.looks import ALARM_COLOUR, HUES, LOST_COLOUR, Looks, shaded
 from launch_scripts.monitor.movers.points import cell_at, label_places, target_points, vehicle_points
 from launch_scripts.monitor.movers.routes import RouteLines, RouteNow, cells_along
 from launch_scripts.monitor.movers.strips import Trails, poles, rings
 from launch_scripts.report.results.certified_gap import CertifiedGap
+from launch_scripts.report.run_state.alarms import KINDS, Alarm
 from launch_scripts.report.run_state.state import TargetLine
 from launch_scripts.report.vehicle_columns import VehicleColumns, gathered
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import MonitorConfig
+from swarm.errors import ConfigError
 from swarm.grid import walk
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -136,6 +144,7 @@ def test_who_points_at_a_target_reads_how_its_chase_goes() -> None:
 ids = st.sampled_from(["t0", "t1", "t2", "t3"])
 
 
+@settings(deadline=None)
 @given(st.sets(ids), st.sets(ids), st.dictionaries(ids, st.floats(0, 120)))
 def test_no_target_has_two_labels_and_none_that_is_drawn_has_none(
     posed: set[str], lost: set[str], seen: dict[str, float]
@@ -145,6 +154,51 @@ def test_no_target_has_two_labels_and_none_that_is_drawn_has_none(
     assert pins.keys() | sightings.keys() == posed | seen.keys()
     for id in posed - lost:
         assert pins[id] == id
+
+
+@settings(deadline=None)
+@given(
+    st.lists(
+        st.builds(
+            Alarm, kind=st.sampled_from([*KINDS, "new"]),
+            about=st.sampled_from(["agent-a0", "agent-a9", "planner-t0"]), text=st.just("."),
+            since_s=st.just(1.0), over_s=st.none() | st.floats(0, 50),
+            cell=st.none() | st.integers(0, 500), target=st.none() | st.sampled_from(["t0", "t9"]),
+        ),
+        max_size=40,
+    ),
+)  # fmt: skip
+def test_alarms_are_marked_where_they_are_and_fade_once_they_are_over(alarms: list[Alarm]) -> None:
+    grid = hill(20, 20).grid
+    vehicles = columns([VehicleState.FOLLOWING, VehicleState.STRANDED], [0, -1], ["t0"])
+    marks = alarm_marks(alarms, 50.0, {"t0": (30.0, 40.0)}, vehicles, grid)
+    assert len(marks) <= 24
+    places = [(mark.east_m, mark.south_m) for mark in marks]
+    assert len(places) == len(set(places)), "no text lies on another"
+    assert all(0 <= east_m <= 200 and 0 <= south_m <= 200 for east_m, south_m in places)
+    lasting = [alarm for alarm in alarms if alarm.lasts and alarm.cell is not None and alarm.cell < grid.cells]
+    red = [mark for mark in marks if mark.colour == ALARM_COLOUR]
+    assert red or not lasting
+    seen = [each for each in alarms if each.over_s is None or each.over_s >= 50 - FADES_S]
+    texts = {"stranded: a0-01", *(f"{each.label}: {each.about}" for each in seen)}
+    assert {mark.text for mark in marks} <= texts
+    if not seen:
+        assert [mark.text for mark in marks] == ["stranded: a0-01"]
+
+
+def test_an_alarm_has_the_place_of_its_cell_its_target_or_its_agents_vehicles() -> None:
+    grid = hill(20, 20).grid
+    vehicles = columns([VehicleState.FOLLOWING] * 3, [0, 0, 0], ["t0"])
+
+    def place(**about: Any) -> list[tuple[float, float]]:
+        alarm = Alarm(kind="down", text=".", since_s=0.0, **about)
+        marks = alarm_marks([alarm], 9.0, {"t0": (30.0, 40.0)}, vehicles, grid)
+        return [(mark.east_m, mark.south_m) for mark in marks]
+
+    assert place(about="x", cell=21, target="t0") == [(15.0, 15.0)]
+    assert place(about="planner-t0", target="t0") == [(30.0, 40.0)]
+    assert place(about="agent-a0") == [(55.0, 20.0)]
+    assert place(about="keeper-0") == place(about="agent-a7") == place(about="planner-t9", target="t9") == []
 
 
 # --- places and lines -----------------------------------------------------------------------------------------
@@ -201,6 +255,7 @@ def on_tree(parents: list[int], start: int) -> list[int]:
     return way
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.DataObject) -> None:
     """Against the slow twin: all edges of all routes."""
@@ -247,6 +302,28 @@ def test_a_place_outside_the_grid_is_taken_for_the_nearest_cell() -> None:
     grid = hill(10, 20).grid
     assert cell_at(grid, 15.0, 25.0) == 2 * 20 + 1
     assert cell_at(grid, -1.0, 1e6) == 9 * 20
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"), [("a0-99", "; did you mean 'a0-"), ("t3x", "; did you mean 't"), ("\x1b[31m", "; there are")]
+)
+def test_whom_nobody_knows_the_camera_cannot_follow(name: str, hint: str) -> None:
+    scenario = parse_scenario('[[targets]]\nname = "t"\ncount = 5\n[[groups]]\nvehicles = 40\n')
+    with pytest.raises(ConfigError) as refused:
+        with_follow(scenario, name)
+    sentence = str(refused.value)
+    assert sentence.startswith(f"--follow: no vehicle or target {name!r}")
+    assert hint in sentence
+    assert sentence.endswith("; there are t0 to t4 and a0-00 to a1-14")
+
+
+def test_the_camera_follows_whom_the_option_names_rather_than_the_scenario() -> None:
+    scenario = parse_scenario('[[targets]]\nname = "t"\ncount = 5\n[monitor]\nfollow = "t2"\n')
+    assert with_follow(scenario, None).monitor.follow == "t2"
+    assert with_follow(scenario, "t1").monitor.follow == "t1"
+    lost = msgspec.structs.replace(scenario, monitor=MonitorConfig(follow="nobody"))
+    with pytest.raises(ConfigError, match=r"^monitor\.follow: no vehicle or target 'nobody'"):
+        with_follow(lost, None)
 
 
 # --- how much and how often -----------------------------------------------------------------------------------
