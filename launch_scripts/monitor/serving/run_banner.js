@@ -39,20 +39,23 @@
 
   const inside = (bytes, number) => fields(bytes).filter(([n]) => n === number).map(([, value]) => value);
 
-  // Seconds of the run that the viewer has taken in: the newest time of its recording. Null if it does not tell.
+  // Seconds of the run that the viewer has taken in: the newest time of its recording. Null while it has none, NaN if
+  // it does not tell, as another version of the viewer may not.
   function taken_s() {
+    if (!window._handle) return null;
     try {
-      for (const recording of inside(window._handle.viewer_state(), 3))
+      const recordings = inside(window._handle.viewer_state(), 3);
+      for (const recording of recordings)
         for (const timeline of inside(recording, 2)) {
           const [id] = inside(timeline, 1), [range] = inside(timeline, 3);
           if (new TextDecoder().decode(inside(id, 1)[0]) !== "sim_time" || !range) continue;
           const [newest] = inside(range, 2);
           if (newest !== undefined) return Number(newest) / 1e9;
         }
+      return recordings.length ? NaN : null;
     } catch (error) {
-      // not started yet, or another version of the viewer
+      return NaN;
     }
-    return null;
   }
 
   function say(text) {
@@ -62,14 +65,15 @@
 
   function tell(how) {
     const taken = taken_s();
-    const behind = taken !== null && run.at_s - taken > BEHIND_S;
+    const behind = run.at_s - (taken ?? 0) > BEHIND_S;
     late = behind ? late + 1 : 0;
     const seconds = (value) => `${value.toFixed(0)} s`;
     if (how) {
-      const shown = behind ? ` This page has come to ${seconds(taken)} only.` : "";
+      const shown = behind && taken !== null ? ` This page has come to ${seconds(taken)} only.` : "";
       const whole = run.recording ? ` To see the whole run: ${run.recording}` : "";
       say(`${how} ${seconds(run.at_s)}.${shown}${whole}`);
-    } else if (late >= LOOKS)
+    } else if (late >= LOOKS && taken === null) say(`This page is loading; the run is at ${seconds(run.at_s)}.`);
+    else if (late >= LOOKS)
       say(
         `This page is behind: it has come to ${seconds(taken)}, and the run is at ${seconds(run.at_s)}. ` +
           "The browser draws too slowly for it (does it draw without a graphics card?)",
