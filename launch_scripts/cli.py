@@ -16,7 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from launch_scripts.command_line import complete, usage
-from launch_scripts.command_line.families import CONTEXT, Family, rooted
+from launch_scripts.command_line.families import CONTEXT, Family, rooted, worded
 from launch_scripts.command_line.panels import ADMIN, LEFT, NETWORK, ORDER, PART, PREPARE, RUN
 from launch_scripts.commands import afterwards, before, chaos, query, roles
 from launch_scripts.commands.orders import orders
@@ -186,16 +186,19 @@ def _up(
     rank: int | None = None,
     run_id: str | None = None,
 ) -> None:
+    from launch_scripts.launcher.busy_line import busy_loading
     from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY, start_forkserver
 
     # Beside the imports below and the terrain, which take as long.
     start_forkserver(ROLES_AND_KERNELS if not only or "planner" in only else ROLES_ONLY)
 
-    import msgspec
+    with busy_loading(as_json=run.as_json, plain=run.plain):
+        import msgspec
 
-    from launch_scripts.launcher import options
-    from launch_scripts.launcher.up import UpOptions, run_swarm
-    from launch_scripts.process_table import ROLES
+        from launch_scripts.launcher import options
+        from launch_scripts.launcher.up import run_swarm
+        from launch_scripts.launcher.up_options import UpOptions
+        from launch_scripts.process_table import ROLES
 
     scenario = options.find_scenario(name)
     if run.port is not None:
@@ -297,7 +300,7 @@ app.add_typer(orders.app)
 @cache
 def command() -> Any:
     """The command with all of its sub-commands."""
-    return typer.main.get_command(app)
+    return worded(typer.main.get_command(app))
 
 
 def main() -> int:
@@ -319,6 +322,11 @@ def main() -> int:
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
+    except SystemExit as leaving:
+        # So typer leaves at a Ctrl-C, without a word.
+        if isinstance(getattr(leaving.__context__, "__cause__", None), KeyboardInterrupt):
+            print("swarm: stopped", file=sys.stderr)
+        raise
     except BrokenPipeError:
         _leave_output()
         return 0

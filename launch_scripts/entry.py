@@ -19,4 +19,7 @@ def main() -> int:
             file=sys.stderr,
         )
         return 1
+    except KeyboardInterrupt:
+        print("swarm: stopped", file=sys.stderr)
+        return 130
     return run()

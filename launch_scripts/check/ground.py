@@ -21,7 +21,7 @@ def check_places(scenario: Scenario, terrain: Terrain, truth: Floats) -> None:
     """Raise ConfigError with the first of `places` that is a failure."""
     for finding in places(scenario, terrain, truth):
         if finding.level == "failure":
-            raise ConfigError(finding.sentence)
+            raise ConfigError(f"scenario {scenario.name}: {finding.sentence}")
 
 
 def places(scenario: Scenario, terrain: Terrain, truth: Floats) -> Iterator[Finding]:

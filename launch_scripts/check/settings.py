@@ -140,4 +140,4 @@ def check_start(scenario: Scenario, *, joins: bool) -> None:
         found += [*files_named(scenario), *meets(scenario)]
     for finding in found:
         error = TerrainError if finding.about.startswith("terrain") else ConfigError
-        raise error(finding.sentence)
+        raise error(f"scenario {scenario.name}: {finding.sentence}")

@@ -3,14 +3,66 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import typer
 from typer.core import TyperGroup
 
+from launch_scripts.command_line.usage import kind_of
+
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 """Of every command: what it inherits from the first."""
+_UNBOUNDED = 2**53
+"""A limit that a number in JSON has; it says nothing to a reader."""
+
+
+def worded(command: Any) -> Any:
+    """The command, whose help says in words what a value is, instead of types of Python, and whose paragraphs are
+    as wide as the terminal."""
+    command.help = "\n\n".join(map(_one_line, (command.help or "").split("\n\n"))) or None
+    for param in command.params:
+        _word(param)
+    as_typer_makes = command.get_help_option
+    command.get_help_option = lambda ctx: _word(as_typer_makes(ctx))
+    for inner in getattr(command, "commands", {}).values():
+        worded(inner)
+    return command
+
+
+def _one_line(paragraph: str) -> str:
+    """Prose without its line ends; examples and tables keep theirs."""
+    lines = paragraph.splitlines()
+    kept = any(line.startswith((" ", "\b", "[", "swarm ")) for line in lines)
+    return paragraph if kept else " ".join(lines)
+
+
+def _word(param: Any) -> Any:
+    if param is None or isinstance(param.display_type_rich, partial):
+        return param
+    param.display_type_rich = partial(_value_of, param, param.display_type_rich)
+    param._get_number_range_help_str = partial(_range_of, param)
+    return param
+
+
+def _value_of(param: Any, as_typer_says: Callable[..., str], ctx: Any) -> str:
+    """How help shows a value."""
+    kind = kind_of(param)
+    if kind is bool or param.param_type_name == "argument":
+        return ""  # the name of an argument stands beside it
+    if param.metavar is not None or param.type_descriptor.choices:
+        return as_typer_says(ctx=ctx).strip("<>")
+    return {int: "N", float: "NUMBER"}.get(kind, "PATH" if param.type_descriptor.is_path else "TEXT")
+
+
+def _range_of(param: Any) -> str | None:
+    low, high = getattr(param, "min", None), getattr(param, "max", None)
+    if low is None and high is None:
+        return None
+    if high is None or high >= _UNBOUNDED:
+        return f"at least {low:g}"
+    return f"at most {high:g}" if low is None else f"{low:g} to {high:g}"
 
 
 class Family(TyperGroup):
@@ -31,7 +83,7 @@ class Family(TyperGroup):
     def group(self) -> Any:
         """The group itself. Imports it."""
         if self._group is None:
-            self._group = typer.main.get_command(importlib.import_module(self.module).app)
+            self._group = worded(typer.main.get_command(importlib.import_module(self.module).app))
         return self._group
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:

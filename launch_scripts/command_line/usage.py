@@ -55,7 +55,7 @@ def _of_value(error: Any, ctx: Any) -> str:
 
 
 def _expected(param: Any, cause: Sequence[Any]) -> str:
-    kinds = [descriptor_of(param)]
+    kinds = [kind_of(param)]
     words = {float: "a number", int: "a whole number"}.get(kinds[0], "something else")
     lowest, highest = getattr(param, "min", None), getattr(param, "max", None)
     if lowest is not None and highest is not None:
@@ -69,7 +69,7 @@ def _expected(param: Any, cause: Sequence[Any]) -> str:
     return words
 
 
-def descriptor_of(param: Any) -> Any:
+def kind_of(param: Any) -> Any:
     """The type of one value of an option or argument."""
     hint = param.type_descriptor.annotation
     return typing.get_args(hint)[0] if typing.get_origin(hint) in (list, tuple) else hint

@@ -29,6 +29,10 @@ def compare(
             metavar="RUN...", help="Folders of runs, or their names in --runs.", autocompletion=complete.runs
         ),
     ],
+    out: Annotated[
+        Path | None, typer.Option(help="Also write plots: .html, a page with plots and tables, or .png.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file of --out.")] = False,
     runs: Runs = Path("runs"),
     as_json: AsJson = False,
 ) -> None:
@@ -37,10 +41,12 @@ def compare(
     Where a run listened is left out: free ports differ each time.
 
     swarm compare 20261122-154115-44bb LAST
+
+    swarm compare RUN RUN RUN --out compared.html
     """
     from launch_scripts.commands.compare import compare_runs
 
-    compare_runs(run, runs, as_json)
+    compare_runs(run, runs, as_json, out, force)
 
 
 @app.command(rich_help_panel=LEFT)
@@ -63,11 +69,16 @@ def export(
     what: Annotated[
         list[str] | None,
         typer.Option(
-            help="tracks, targets, captures, routes or marks; may be given several times; all by default."
+            help="tracks, targets, captures, routes or marks; may be given several times; all by default.",
+            autocompletion=complete.words("launch_scripts.report.geo.run_export", "WHAT"),
         ),
     ] = None,
     format: Annotated[
-        str, typer.Option(help="geojson or csv, a file per layer; gpkg, one file with all layers.")
+        str,
+        typer.Option(
+            help="geojson or csv, a file per layer; gpkg, one file with all layers.",
+            autocompletion=complete.words("launch_scripts.report.geo.run_export", "FORMATS"),
+        ),
     ] = "geojson",
     out: Annotated[
         Path | None, typer.Option(help="Folder to write to; by default export/ in the run's folder.")

@@ -11,36 +11,57 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.launcher.terminal import REPORTED
+from launch_scripts.report.files import write_file
 from launch_scripts.report.results.compare import (
     LeftRun,
     Row,
     circumstances_that_differ,
     figures,
+    remarks,
     settings_that_differ,
     text_of,
 )
 from launch_scripts.report.results.run_folder import SCENARIO_FILE, find_run, read_report
 from swarm.config.input_files import FileKind, parse_toml, read_text
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, StoreError
+
+_PLOTTED = (".html", ".png")
 
 
-def compare_runs(names: Sequence[str], runs: Path, as_json: bool) -> None:
-    """Print what differs between the scenarios of runs, and their figures. Raises ConfigError or StoreError."""
+def compare_runs(names: Sequence[str], runs: Path, as_json: bool, out: Path | None, force: bool) -> None:
+    """Print what differs between the scenarios of runs, and their figures. Raises ConfigError or StoreError.
+
+    out  a page or a picture that is written, too
+    """
     if len(names) < 2:
         raise ConfigError("compare takes two runs or more, such as two folders in runs/")
+    if out is not None:
+        _check_out(out, force)
     found = [_left(name, runs) for name in names]
     settings, made = settings_that_differ(found), circumstances_that_differ(found)
     numbers = figures(found, REPORTED)
     if as_json:
         sections = {"scenario": settings, "made": made, "figures": numbers}
         told = {name: dict(rows) for name, rows in sections.items()}
-        print(json.dumps({"runs": [run.name for run in found], **told}, indent=2, default=str))
-        return
+        named = {"runs": [run.name for run in found], "remarks": remarks(found)}
+        print(json.dumps({**named, **told}, indent=2, default=str))
+    else:
+        _print(found, settings, made, numbers)
+    if out is not None:
+        tables = [("Settings that differ", settings), ("Versions and machines", made), ("Figures", numbers)]
+        _plot(out, found, tables)
+        if not as_json:
+            print(out)
+
+
+def _print(found: Sequence[LeftRun], settings: list[Row], made: list[Row], numbers: list[Row]) -> None:
     console = Console(highlight=False)
     for run in found:
         if run.settings is None:
             sentence = f"{run.name} has no {SCENARIO_FILE}: its settings are not known"
             console.print(Text(sentence, style="yellow"))
+    for sentence in remarks(found):
+        console.print(Text(sentence, style="yellow"))
     _show(console, found, "setting", settings)
     if not settings:
         console.print("the scenarios are the same")
@@ -57,6 +78,33 @@ def _show(console: Console, found: Sequence[LeftRun], heading: str, rows: Sequen
     for label, values in rows:
         table.add_row(Text(label), *(Text(text_of(label, value)) for value in values))
     console.print(table)
+
+
+def _check_out(out: Path, force: bool) -> None:
+    """Raise ConfigError before the work."""
+    if out.suffix.lower() not in _PLOTTED:
+        raise ConfigError(f"--out {out}: write {' or '.join(_PLOTTED)}")
+    if out.is_dir() or not out.parent.is_dir():
+        raise ConfigError(f"--out {out}: cannot write there, it is a folder or lies in none")
+    if out.exists() and not force:
+        raise ConfigError(f"{out} is there already; --force replaces it")
+
+
+def _plot(out: Path, found: Sequence[LeftRun], tables: Sequence[tuple[str, list[Row]]]) -> None:
+    try:
+        if out.suffix.lower() == ".png":
+            from launch_scripts.report.pictures.comparison import save_comparison
+
+            save_comparison(out, found)
+        else:
+            from launch_scripts.report.page.compare_page import compare_page
+
+            write_file(out, compare_page(found, remarks(found), tables).encode())
+    except OSError as error:
+        raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        names = ", ".join(run.name for run in found)
+        raise StoreError(f"report.json of one of {names} is damaged: {error}") from error
 
 
 def _left(name: str, runs: Path) -> LeftRun:

@@ -69,7 +69,7 @@ def write_new(path: Path, choices: Choices) -> None:
     if not path.absolute().parent.is_dir():
         raise ConfigError(f"{path}: there is no folder {path.parent}; make it first")
     _checked(path, choices)
-    if sys.stdin.isatty() and sys.stderr.isatty():
+    if is_terminal():
         choices = _asked(path, choices)
     text = _text(path, choices)
     try:
@@ -78,6 +78,11 @@ def write_new(path: Path, choices: Choices) -> None:
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
     print(f"{path} is written; `swarm check {path}` looks at it, `swarm up {path}` runs it")
+
+
+def is_terminal() -> bool:
+    """Whether somebody can be asked."""
+    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def _asked(path: Path, choices: Choices, ask: Callable[..., Any] = typer.prompt) -> Choices:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +13,7 @@ import typer
 
 from launch_scripts.command_line import complete, panels
 from launch_scripts.commands.shared_options import AsJson, PresetOption, Tls, spread
+from swarm.places import written
 
 if TYPE_CHECKING:
     from swarm.config.scenario import NetworkConfig
@@ -27,10 +29,43 @@ _STATUS_LISTEN_S = 1.5
 class Where:
     """Router and namespace of the swarm that a command asks."""
 
-    connect: Annotated[str, typer.Option(help="The router's endpoint.", rich_help_panel=panels.NETWORK)] = (
-        "tcp/127.0.0.1:7447"
-    )
-    namespace: Annotated[str, typer.Option(help="Prefix of all keys.", rich_help_panel=panels.NETWORK)] = "swarm"
+    connect: Annotated[
+        str | None,
+        typer.Option(
+            help="The router's endpoint; if not given, that of the newest run here, or tcp/127.0.0.1:7447.",
+            rich_help_panel=panels.NETWORK,
+        ),
+    ] = None
+    namespace: Annotated[
+        str | None,
+        typer.Option(
+            help="Prefix of all keys; if not given, that of the run, or `swarm`.", rich_help_panel=panels.NETWORK
+        ),
+    ] = None
+    run: Annotated[
+        str | None,
+        typer.Option(
+            help="The run to ask, where several run here: its name in --runs, or its folder.",
+            rich_help_panel=panels.NETWORK,
+        ),
+    ] = None
+    runs: Annotated[
+        Path, typer.Option(help="Folder of the runs of this machine.", rich_help_panel=panels.NETWORK)
+    ] = Path("runs")
+
+    @cached_property
+    def _found(self) -> NetworkConfig:
+        from launch_scripts.commands.running.find_swarm import check_alone, find_swarm
+        from swarm.config.scenario import NetworkConfig
+
+        check_alone(self.connect, self.run)
+        if self.connect is not None:
+            return NetworkConfig()
+        found = find_swarm(self.runs, self.run)
+        if found.others:
+            told = ", ".join(found.others[:3])
+            typer.echo(f"asking run {found.run}, the newest; also running: {told} (--run NAME)", err=True)
+        return found.network
 
     def network(self, tls: Tls) -> NetworkConfig:
         import msgspec
@@ -39,12 +74,18 @@ class Where:
         from launch_scripts.process_table import LAUNCHER
         from swarm.config.scenario import Scenario
 
-        chosen = with_network(Scenario(), connect=self.connect, namespace=self.namespace, tls=tls.config())
+        chosen = with_network(
+            msgspec.structs.replace(Scenario(), network=self._found),
+            connect=self.connect,
+            namespace=self.namespace,
+            tls=tls.config(),
+        )
         network = as_process(chosen, LAUNCHER, "0").network
         return msgspec.structs.replace(network, connect_timeout_s=_CONNECT_S)
 
     def __str__(self) -> str:
-        return f"in namespace {self.namespace!r} at {self.connect}"
+        endpoint = self.connect or ", ".join(self._found.connect)
+        return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
 
 
 @app.command(rich_help_panel=_PANEL)
@@ -123,7 +164,6 @@ def _route_on_terrain(
     from launch_scripts.commands.routes.route_files import profile_of, write_route
     from launch_scripts.commands.terrain.route_on_terrain import find_route
     from shared_map.terrain.places import MapFrame
-    from swarm.places import written
 
     found = find_route(terrain, start, end, preset)
     if out is not None:
@@ -149,6 +189,8 @@ def _route_on_terrain(
 @spread
 def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
+
+    Without --connect it asks the newest run of this machine that runs, whatever its ports.
 
     swarm status
 
@@ -181,25 +223,24 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
 
 @app.command(rich_help_panel=_PANEL)
 @spread
-def metrics(
+def top(
     where: Where,
     tls: Tls,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="On loopback; 0 picks one.")] = 9464,
-    dashboard: Annotated[
-        bool, typer.Option("--dashboard", help="Print a dashboard for Grafana, as JSON, and exit.")
+    each: Annotated[bool, typer.Option("--each", help="A line for each process, not only for each role.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Show it once and end.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object a second, or one with --once.")
     ] = False,
 ) -> None:
-    """Serve the figures of a running swarm to Prometheus, until Ctrl-C. It only listens.
+    """Watch a running swarm: processes, vehicles and targets, once a second; `q` or Ctrl-C ends it.
 
-    swarm metrics --port 9464
+    Processes on other machines are shown, too: each tells what it takes up. CPU of 100 % is one core; late/s counts
+    ticks that came late or not at all, of a role the worst.
 
-    swarm metrics --dashboard > swarm.json
+    swarm top --each
 
-    `swarm up --metrics-port 9464` does the same for as long as the run lasts.
+    swarm top --json --once | jq .processes[0]
     """
-    from launch_scripts.commands import metrics as command
+    from launch_scripts.commands.running.top import top as show
 
-    if dashboard:
-        typer.echo(command.dashboard())
-    else:
-        command.serve_metrics(where.network(tls), port)
+    show(where.network(tls), where, each=each, once=once, as_json=as_json)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
 import typer
 
+from launch_scripts.launcher.progress import progress
 from launch_scripts.replay.run import Replayed, keep, other_versions, recordings_of, replay_run
 from launch_scripts.report.results.run_folder import find_run
 from swarm.runtime.recording.replaying import Difference
@@ -22,6 +24,7 @@ def replay_one(
     name: str, runs: Path, process: str | None, until_s: float | None, keep_in: Path | None, as_json: bool
 ) -> bool:
     """Replay a run, and print where outputs differ. True if none does. Raises SwarmError."""
+    logging.getLogger().addHandler(logging.NullHandler())  # what the processes logged is in their own logs
     folder = find_run(name, runs)
     if keep_in is not None:
         for recorded in recordings_of(folder, process):
@@ -35,10 +38,11 @@ def replay_one(
             typer.echo(f"recorded with {package} {then}, replayed with {now}")
         typer.echo(_ROW.format("process", "life", "events", "outputs", "seconds", "result"))
     rows: list[Replayed] = []
-    for row in replay_run(folder, process, until_s):
-        rows.append(row)
-        if not as_json:
-            typer.echo(_line(row))
+    with progress() as tell:
+        for row in replay_run(folder, process, until_s, progress=lambda share: tell("replaying", share)):
+            rows.append(row)
+            if not as_json:
+                typer.echo(_line(row))
     if as_json:
         typer.echo(
             json.dumps({"run": str(folder), "versions": others, "processes": list(map(_told, rows))}, indent=2)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from launch_scripts.report.results.run_folder import find_run
+from swarm.config.explain import choice
 from swarm.errors import ConfigError
 
 
@@ -25,7 +26,7 @@ def export_from(
     for option, given, allowed in (("--what", what, tuple(WHAT)), ("--format", [format], FORMATS)):
         for each in given:
             if each not in allowed:
-                raise ConfigError(f"{option} is {each!r}; expected one of {', '.join(allowed)}")
+                raise ConfigError(f"{option}: found {each!r}{choice(each, tuple(allowed))}")
     folder = find_run(run, runs)
     if gif:
         from launch_scripts.report.pictures.animation import export_gif

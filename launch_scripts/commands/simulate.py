@@ -60,7 +60,7 @@ def simulate_once(
         f"{result.seconds:g} simulated seconds in {result.wall_s:.1f} s: {result.speed:.1f} times real time, "
         f"{result.deliveries:,} deliveries" + ("" if trace is None else f"; event log in {trace}")
     )
-    terminal.say(f"report: {folder / 'report.json'}, picture: {folder / 'report.png'}")
+    terminal.say(f"report: {folder / 'report.html'}, numbers: {folder / 'report.json'}")
     if result.trace_cut is not None:
         raise StoreError(f"the event log {trace} has no end: {result.trace_cut}")
 

@@ -16,6 +16,12 @@ _LINE_EVERY_S = 5.0
 _DRAW_EVERY_S = 0.2
 
 
+def busy_loading(*, as_json: bool, plain: bool) -> contextlib.AbstractContextManager[None]:
+    """Says so while the modules of a launcher are loaded, before there is a run whose terminal could."""
+    console = Console(stderr=as_json, highlight=False)
+    return busy_line(console, console.print, lambda: "loading", changes=console.is_terminal and not plain)
+
+
 @contextlib.contextmanager
 def busy_line(
     console: Console, say: Callable[[str], None], text: Callable[[], str], *, changes: bool

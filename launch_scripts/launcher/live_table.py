@@ -2,38 +2,52 @@
 
 from __future__ import annotations
 
-from rich.console import Group
+from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.state import RunState, TargetLine
 
-SHOWN_TARGETS = 24
 SHOWN_ALARMS = 5
+_FEWEST_TARGETS = 3
 
 
-def live_table(state: RunState, title: str) -> Group:
-    """The table of one instant."""
-    shown = Table(title=title, title_justify="left", expand=False, pad_edge=False)
-    labels, rows = facts.table(state)
-    for n, label in enumerate(labels):
-        shown.add_column(label, justify="right" if n else "left")
-    for line, row in list(zip(state.targets, rows, strict=True))[:SHOWN_TARGETS]:
-        shown.add_row(*row, style=_style(line))
-    if len(rows) > SHOWN_TARGETS:
-        shown.add_row(f"... {len(rows) - SHOWN_TARGETS} more")
-    lines = [Text(line, overflow="ellipsis", no_wrap=True) for line in facts.lines(state)]
+def live_table(state: RunState, title: str, console: Console) -> Group:
+    """The table of one instant, as wide and as high as the console allows: lines that are too long go on in the
+    next, and of many targets the first are shown."""
     crew = Text("")
     for role, (alive, every) in state.crew.items():
         crew.append(f"{role} {alive}/{every}  ", style="green" if alive == every else "bold red")
     for role, alive in state.beside.items():
         crew.append(f"{role} {alive}  ", style="green")
-    alarms = [Text(line, style="red") for line in facts.alarm_lines(state, SHOWN_ALARMS)]
-    return Group(shown, *lines, crew, *alarms)
+    alarms = (Text(line, style="red") for line in facts.alarm_lines(state, SHOWN_ALARMS))
+    return fitted(state, [Text(title, style="bold"), *map(Text, facts.lines(state)), crew, *alarms], console)
 
 
-def plain_line(state: RunState) -> str:
+def fitted(state: RunState, above: list[RenderableType], console: Console) -> Group:
+    """What is to be seen in any case, and below it as many targets as the console has lines for."""
+    options = console.options.update(no_wrap=False, overflow="fold")
+    used = len(console.render_lines(Group(*above), options, pad=False))
+    targets = targets_table(state, max(console.height - used - 3, _FEWEST_TARGETS))
+    return Group(*above, Text(), targets)
+
+
+def targets_table(state: RunState, most: int) -> Table:
+    """A line for each target, `most` at most."""
+    shown = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    labels, rows = facts.table(state)
+    for n, label in enumerate(labels):
+        shown.add_column(label, justify="right" if n else "left")
+    kept = most if len(rows) <= most else most - 1
+    for line, row in list(zip(state.targets, rows, strict=True))[:kept]:
+        shown.add_row(*row, style=_style(line))
+    if len(rows) > kept:
+        shown.add_row(f"... {len(rows) - kept} more")
+    return shown
+
+
+def plain_line(state: RunState, title: str) -> str:
     """The state in one line."""
     told = ", ".join(
         f"{facts.fact(name).label} {facts.fact(name).shown(state)}"
@@ -41,7 +55,7 @@ def plain_line(state: RunState) -> str:
     )
     alarms = "".join(f"; {line}" for line in facts.alarm_lines(state, SHOWN_ALARMS))
     return (
-        f"{state.elapsed_s:5.1f} s  processes {facts.fact('processes_well').shown(state)}, "
+        f"{title}: processes {facts.fact('processes_well').shown(state)}, "
         f"restarts {state.restarts}; vehicles {facts.fact('vehicles_driven').shown(state)}: "
         f"{facts.fact('states').shown(state)}; {told}{alarms}"
     )

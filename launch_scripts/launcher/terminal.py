@@ -55,7 +55,7 @@ class Terminal:
 
     def __init__(self, as_json: bool, plain: bool) -> None:
         make_output_last()
-        self._console = Console(stderr=as_json, highlight=False, soft_wrap=True)
+        self._console = Console(stderr=as_json, highlight=False)
         self._table = self._console.is_terminal and not plain
         self._live: Live | None = None
         self._due_s = 0.0
@@ -68,7 +68,7 @@ class Terminal:
     def print(self, what: Any) -> None:
         """Prints, if that is possible: a full disk ends no run. For a reader who has left see `LastingOutput`."""
         try:
-            self._console.print(what)
+            self._console.print(what, soft_wrap=True)  # whoever copies a line gets it whole
             self._console.file.flush()
         except OSError as error:
             log.warning("cannot write the output: %s", error.strerror or error)
@@ -92,9 +92,9 @@ class Terminal:
     def show(self, title: str, state: RunState) -> None:
         self._due_s = time.monotonic() + (_DRAW_EVERY_S if self._table else _PLAIN_EVERY_S)
         if not self._table:
-            self.say(plain_line(state))
+            self.say(plain_line(state, title))
             return
-        table = live_table(state, title)
+        table = live_table(state, title, self._console)
         with contextlib.suppress(OSError):  # of a terminal that is gone
             if self._live is None:
                 self._live = Live(table, console=self._console, auto_refresh=False, transient=False)

@@ -7,7 +7,6 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,21 +15,21 @@ from launch_scripts.check.settings import check_start
 from launch_scripts.launcher.lives import next_life
 from launch_scripts.launcher.local_swarm import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import log_to
-from launch_scripts.launcher.options import as_process, common_run_id, make_run_dir, new_run_id
+from launch_scripts.launcher.options import as_process, make_run_dir
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.preload import ROLES_AND_KERNELS, ROLES_ONLY
 from launch_scripts.launcher.run_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.stop_signals import StopAsked
 from launch_scripts.launcher.terminal import Terminal
+from launch_scripts.launcher.up_options import UpOptions, run_id_of, table_of
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.launcher.watcher import Watcher, ask_run, check_vacant
 from launch_scripts.launcher.ways_to_look import tunnel, what_is_left
 from launch_scripts.ports import check_ports
-from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec, processes_of
+from launch_scripts.process_table import LAUNCHER, ROLES, ProcessSpec
 from launch_scripts.report.disk_watch import DiskWatch
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.run_folder import begin_run
-from launch_scripts.report.run_state.plan import plan_of_members
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.arrays import Floats
 from shared_map.terrain.terrain import Terrain, load_terrain, load_truth, prepare
@@ -38,15 +37,13 @@ from shared_map.terrain.terrain_report import said_of
 from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
-from swarm.clock import MonotonicClock
-from swarm.config.scenario import Scenario
-from swarm.errors import BusError, ConfigError, StoreError, SwarmError
+from swarm.clock import NS_PER_S, MonotonicClock
+from swarm.errors import BusError, StoreError, SwarmError
 from swarm.order_book import OrderBook
 from swarm.plugins.find import check_plugins
 from swarm.ranks import job_of
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.role import RoleSetup
-from swarm.wire.messages.processes import RunInfo
 
 if TYPE_CHECKING:
     from launch_scripts.metrics.of_launcher import LauncherMetrics
@@ -57,33 +54,6 @@ _TURN_S = 0.05
 _LISTEN_WITHIN_S = 20.0
 _UP_WITHIN_S = 60.0
 _QUIET_NOTES = frozenset({"live_view"})
-
-
-@dataclass(frozen=True, slots=True)
-class UpOptions:
-    """Options of a run.
-
-    joins         there is a router elsewhere: none is started here
-    rank          of planners and the targets process, start only those of this rank; if None all
-    run_id        the run to take part in; if None it is made or found
-    began_s       time.monotonic() at which the command was given
-    table         other processes than the scenario's
-    metrics_port  where figures are served to Prometheus; 0 is any
-    record_inputs  of every process, for `swarm replay`
-    """
-
-    scenario: Scenario
-    runs: Path
-    roles: tuple[str, ...] = ROLES
-    joins: bool = False
-    rank: int | None = None
-    run_id: str | None = None
-    as_json: bool = False
-    plain: bool = False
-    began_s: float = field(default_factory=time.monotonic)
-    table: tuple[ProcessSpec, ...] | None = None
-    record_inputs: bool = False
-    metrics_port: int | None = None
 
 
 class _RefusedError(SwarmError):
@@ -97,43 +67,16 @@ class _RefusedError(SwarmError):
 def run_swarm(options: UpOptions) -> int:
     """Run to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     check_start(options.scenario, joins=options.joins)
-    for spec in _table(options):
+    for spec in table_of(options):
         as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
     if not options.joins:
         check_ports(options.scenario, options.roles)
-    run_id, started_ns = _run_id(options)
+    run_id, started_ns = run_id_of(options)
     run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / "launcher.log")
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
     return _Run(options, run_id, run_dir, started_ns).run()
-
-
-def _table(options: UpOptions) -> list[ProcessSpec]:
-    """The processes to start here. Raises ConfigError if there are none."""
-    table = list(options.table or processes_of(options.scenario, options.roles, options.rank))
-    if not table:
-        of_rank = "" if options.rank is None else f" of rank {options.rank}"
-        raise ConfigError(
-            f"scenario {options.scenario.name} has no {' or '.join(options.roles)}{of_rank}; see standbys"
-        )
-    return table
-
-
-def _run_id(options: UpOptions) -> tuple[str, int | None]:
-    """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario. With
-    the id comes when the run began, if it runs already."""
-    found: list[RunInfo] = []
-    if options.joins:
-        log_to(None)  # it may have to wait, and says so
-        found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
-    whole = set(ROLES[1:]) <= set(options.roles) and options.rank is None
-    run_id = options.run_id
-    if run_id is None and whole:
-        run_id = new_run_id()
-    elif run_id is None:
-        run_id = found[0].run_id if found else common_run_id(options.scenario)
-    return run_id, plan_of_members(info for info in found if info.run_id == run_id).started_ns
 
 
 def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
@@ -157,9 +100,11 @@ class _Run:
         self._terminal = Terminal(options.as_json, options.plain)
         self._stop_asked = StopAsked()
         self._preparing = "preparing the terrain"
-        self._swarm = LocalSwarm(_table(options), self._setup_of, run_dir)
+        self._swarm = LocalSwarm(table_of(options), self._setup_of, run_dir)
         self._disk = DiskWatch(run_dir)
         self._startup_s: float | None = None
+        self._up_at_s: float | None = None
+        """When the swarm was whole, on the run's clock."""
         self._recorder: Recorder | None = None
         self._metrics = self._open_metrics()
         for sentence in begin_run(run_dir, options.scenario, run_id):
@@ -306,6 +251,7 @@ class _Run:
             now_s = time.monotonic()
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
+                self._up_at_s = (watcher.now_ns() - self._started_ns) / NS_PER_S
                 began_s = now_s
                 if watcher.routes_served or not self._all_external:
                     so_far = "all processes are alive and routes are served"
@@ -350,15 +296,22 @@ class _Run:
         for note in watcher.take_notes():
             if note.kind == "live_view":
                 self._terminal.say(f"live view: {note.text}", "bold")
-                self._terminal.say(f"from another computer: {tunnel(note.text)}, then the same address there")
+                self._terminal.say(f"from elsewhere: {tunnel(note.text)}, then the same address")
             elif note.kind not in _QUIET_NOTES:
                 self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if self._terminal.due():
-            summary = watcher.recorder.summary(watcher.now_ns())
-            title = f"{self._scenario.name}, {summary.elapsed_s:.0f} s" + (
-                f", live view {watcher.live_view}" if watcher.live_view else ""
-            )
-            self._terminal.show(title, summary)
+            state = watcher.recorder.summary(watcher.now_ns())
+            self._terminal.show(self._title(watcher, state.elapsed_s), state)
+
+    def _title(self, watcher: Watcher, elapsed_s: float) -> str:
+        """How far the run is, on its own clock, which everybody shows: start-up counts, its time is added."""
+        if self._up_at_s is None:
+            every = len(self._swarm.running)
+            up = every - len(self._missing(watcher))
+            return f"{self._scenario.name}: starting, {up} of {every} processes are up, {elapsed_s:.0f} s"
+        end_s = self._up_at_s + self._scenario.seconds
+        live = f", live view {watcher.live_view}" if watcher.live_view else ""
+        return f"{self._scenario.name}: {elapsed_s:.0f} of {end_s:.0f} s{live}"
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:

@@ -12,11 +12,11 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Note, RunInfo
+from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.vehicles import Followed
-from swarm.wire.topics import FOLLOWED, RUN
+from swarm.wire.topics import FOLLOWED, RUN, STATS
 
-_TAG = "launcher-run"
+_TAG, _GONE_TAG = "launcher-run", "launcher-gone"
 _ASK_TIMEOUT_S = 1.0
 _READ_S = 0.1
 """Longest time for which the launcher reads at once: it has processes to look after."""
@@ -44,6 +44,7 @@ class Watcher:
         # The first tells that routes are served, sooner than any figures do.
         self._bus.subscribe(FOLLOWED, self._inbox.post)
         self._bus.watch_alive(self._inbox.post)
+        self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG)  # of a run that this is a part of
 
     def listen(self, for_s: float) -> None:
         """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
@@ -75,6 +76,8 @@ class Watcher:
                     case PlannerStatus(routes_served=served) if served:
                         self.routes_served = True
                 self.recorder.heard(message, fields, now_ns)
+            case Replied(tag=tag, message=Stats() as stats) if tag == _GONE_TAG:
+                self.recorder.heard(stats, {}, now_ns)
             case Appeared(peer):
                 self.ever_up.add((peer.role, peer.id))
                 self.alive.add((peer.role, peer.id))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn
 
-from launch_scripts.monitor.ground import layers
-from launch_scripts.monitor.ground.layers import Layer
+from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.legend import BACKGROUND, HEIGHT_PX, WIDTH_PX
 from launch_scripts.monitor.ground.map_margin import said_heights
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
@@ -16,21 +17,20 @@ from launch_scripts.monitor.movers.mover_drawing import FOLLOWED_ENTITY, mover_o
 
 
 def make_blueprint(
-    mesh: TerrainMesh, *, vehicles: int = 100, knows_truth: bool = False, follow: str | None = None
+    mesh: TerrainMesh, shown: Sequence[Layer] = (PHOTO,), *, vehicles: int = 100, follow: str | None = None
 ) -> rrb.Blueprint:
     """Layers of the 3D view on the left, each with its legend; figures, plots and the log on the right.
 
     vehicles  how many there are, which decides how much is drawn of each
     follow    vehicle or target that the camera follows
     """
-    shown = [layers.PHOTO, layers.COST, *([layers.KNOWN] if knows_truth else [])]
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Tabs(*(_layer(mesh, layer, vehicles, follow) for layer in shown), active_tab=0),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/summary", name="Now"),
                 _plot("captures_and_marks", "Captures and marks"),
-                _plot("gap", "Gap to optimum of each target, %", legend=False),
+                _plot("gap", "Certified gap of the routes to each target, mean, %", legend=False),
                 rrb.Tabs(
                     _plot("messages", "Messages per second", legend=False),
                     _plot("growth_ms", "Growth of the trees, ms", legend=False),
@@ -65,8 +65,10 @@ def _view_3d(mesh: TerrainMesh, layer: Layer, vehicles: int, follow: str | None)
     middle = (mesh.width_m / 2, -mesh.depth_m / 2, float(mesh.heights_m.mean()))
     far = max(mesh.width_m, mesh.depth_m)
     contents = ["+ /world/**", "- /world/layers/**"]
-    if layer is not layers.PHOTO:
-        contents += [f"- /{layers.PHOTO.entity}/**", f"+ /{layer.entity}/**"]
+    if layer is not PHOTO:
+        contents += [f"- /{PHOTO.entity}/**", f"+ /{layer.entity}/**"]
+    if layer.target is not None:
+        contents += ["- /world/routes/**", f"+ /world/routes/{layer.target}"]
     return rrb.Spatial3DView(
         origin=f"/{FOLLOWED_ENTITY}" if follow else "/world",
         contents=contents,

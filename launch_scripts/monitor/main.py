@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.ground.layers import shown_layers
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.ground.zones import scenario_areas
 from launch_scripts.monitor.service import FRAME_HZ, MonitorService
@@ -28,17 +29,14 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
     mesh = TerrainMesh(load_terrain(setup), config.height_factor)
     terrain = load_terrain(setup)  # mapped anew: of what the mesh has read most is not read again
     knows_truth = setup.scenario.terrain.hidden != HiddenConfig()
+    layers = shown_layers(setup.scenario, knows_truth=knows_truth)
     path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
     inbox = Inbox()
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(open_bus(setup.scenario.network, patient=True))
         recording_id = f"{setup.run_id}.{setup.incarnation:x}"
-        blueprint = make_blueprint(
-            mesh,
-            vehicles=setup.scenario.vehicle_count,
-            knows_truth=knows_truth,
-            follow=setup.scenario.monitor.follow,
-        )
+        scenario = setup.scenario
+        blueprint = make_blueprint(mesh, layers, vehicles=scenario.vehicle_count, follow=scenario.monitor.follow)
         sinks = Sinks(recording_id, path, config, blueprint)
         stack.callback(sinks.close)
         service = MonitorService(
@@ -52,6 +50,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None) -> None:
             recording=None if path is None else RecordingWatch(path, sinks.begin_file),
             truth=load_truth(setup, terrain) if knows_truth else None,
             zones=scenario_areas(setup.scenario, terrain.grid),
+            layers=layers,
         )
         process = Process(service, inbox, MonotonicClock(), FRAME_HZ)
         sinks.tell_page(lambda: page_facts(setup, service, path))

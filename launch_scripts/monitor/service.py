@@ -1,6 +1,7 @@
 """The monitor's shell: draws what it hears of the swarm, frame by frame.
 
-It only listens. It may be late, stalled, killed or absent; no process waits for it.
+It listens, and asks planners for the costs that its layers show. It may be late, stalled, killed or absent; no
+process waits for it.
 """
 
 from __future__ import annotations
@@ -13,35 +14,39 @@ import rerun as rr
 from launch_scripts.monitor.drawing import Drawing
 from launch_scripts.monitor.figures_panel import level_of, summary_markdown
 from launch_scripts.monitor.ground.ground_view import GroundView
+from launch_scripts.monitor.ground.layers import PHOTO, Layer
 from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from launch_scripts.monitor.ground.zones import Area
 from launch_scripts.monitor.movers.movers_view import MoversView
 from launch_scripts.monitor.serving.recording_watch import RecordingWatch
 from launch_scripts.monitor.serving.sinks import Streams
 from launch_scripts.report.recorder import RECORDED, Recorder
-from launch_scripts.report.samples import messages_per_s
 from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.sync import MapSync
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post
+from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.liveness import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.runtime.stats import ENDED, Counters
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.base import Nothing
+from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
-from swarm.wire.topics import BODY, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, Topic
+from swarm.wire.topics import BODY, COST, FLEET, FOLLOWED, MARKS, POSE, SIGHTED, STATS, Topic
 
 log = logging.getLogger(__name__)
 
+_GONE = "gone"
+"""Tag of the question what processes that are gone have counted."""
 FRAME_HZ = 10.0
 """How often the view is drawn."""
 _DRAWN: dict[Topic, float] = {FLEET: 0.5 / FRAME_HZ, POSE: 0.0, FOLLOWED: 0.5, SIGHTED: 0.0, BODY: 0.0}
 """What is drawn as it comes, and how often the newest of each key is taken. Marks come by way of the map's sync."""
 _ENDED_KEPT = 4096
+_ANSWER_S = 5.0
 _ANNOUNCE_NS = NS_PER_S // 2
 _LAST_WORD_NS = NS_PER_S // 2
 """So long after a process went its last figures are waited for, which say whether it was asked to end."""
@@ -55,6 +60,7 @@ class MonitorService:
     recording  watches the file of the recording, if there is one
     truth      the true ground, where this process knows it
     zones      of the scenario
+    layers     tabs of the view; the photo if there are none
     """
 
     def __init__(
@@ -70,6 +76,7 @@ class MonitorService:
         recording: RecordingWatch | None = None,
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
+        layers: Sequence[Layer] = (),
     ) -> None:
         self.recorder = Recorder(setup.scenario, terrain.grid, setup.started_ns)
         self.over = False
@@ -91,7 +98,10 @@ class MonitorService:
         self._drawing = Drawing(rec, self._target_ids)
         self._movers = MoversView(rec, self._mesh, setup.scenario, self.recorder, self.counters, replica.filter)
         legend = self._movers.looks.legend()
-        self._ground = GroundView(rec, self._mesh, terrain, cost_map, replica, truth, zones, legend)
+        shown = layers or [PHOTO]
+        self._ground = GroundView(
+            rec, self._mesh, terrain, cost_map, replica, shown, self._target_ids, truth, zones, legend
+        )
         self._frame = 0
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
@@ -100,6 +110,7 @@ class MonitorService:
         self._ended: set[Peer] = set()
         """Processes which said in their last figures that they end as they were asked to."""
         self._last_sample_s = -1.0
+        self._figures_due_ns = 0
 
     def start(self, now_ns: int) -> None:
         self._started_ns = now_ns
@@ -108,6 +119,8 @@ class MonitorService:
             if topic is not MARKS:
                 self._bus.subscribe(topic, self._post, every_s=every_s)
         self._bus.watch_alive(self._post)
+        self._bus.ask(STATS, Nothing(), self._post, tag=_GONE)
+        self.recorder.alive(self._member.peer, True, now_ns)  # others see it, and nobody is told of itself
         self._sync.start(now_ns)
         self._drawing.set_time(0, 0.0)
         self._begin_drawing()
@@ -118,6 +131,11 @@ class MonitorService:
             return
         if self._member.handle(event) or self._sync.handle(event, now_ns):
             return
+        match event:
+            case Replied(message=Stats() as stats):
+                self.recorder.heard(stats, {}, now_ns)
+            case Replied(message=CostReply() as costs):
+                self._ground.hear_costs(costs, now_ns)
         if not isinstance(event, Heard):
             return
         self.recorder.heard(event.message, event.fields, now_ns)
@@ -142,11 +160,17 @@ class MonitorService:
         self._drawing.set_time(self._frame, self._seconds())
         self._watch_recording(now_ns)
         self._ground.tick(now_ns)
+        if (target := self._ground.samples.next_target(now_ns)) is not None:
+            request = self._ground.samples.request
+            self._bus.ask(COST, request, self._post, tag="cost", timeout_s=_ANSWER_S, target=target)
         self._movers.tick(now_ns)
         self._draw_plots(now_ns)
 
     def stop(self, now_ns: int) -> None:
         self._tell_gone(now_ns)
+        self.recorder.finish(now_ns)
+        self._figures_due_ns = now_ns
+        self._draw_plots(now_ns)  # the last that the recording shows is how the run ended
         self.over = True
         self._member.publish_stats(now_ns)
 
@@ -205,11 +229,12 @@ class MonitorService:
 
     def _draw_plots(self, now_ns: int) -> None:
         samples = self.recorder.samples.newest
-        if not samples or samples[-1].time_s == self._last_sample_s:
+        if samples and samples[-1].time_s != self._last_sample_s:
+            self._last_sample_s = samples[-1].time_s
+            self._drawing.plots(samples[-1], samples[-1].messages_per_s)
+        if now_ns < self._figures_due_ns:  # by our own clock: a swarm that says nothing any more is news, too
             return
-        self._last_sample_s = samples[-1].time_s
-        rates = messages_per_s(samples)
-        self._drawing.plots(samples[-1], rates[-1][1] if rates else None)
+        self._figures_due_ns = now_ns + NS_PER_S
         summary = self.recorder.summary(now_ns)
         self._movers.summarised(summary)
         self._drawing.summary(summary_markdown(self._setup, summary))

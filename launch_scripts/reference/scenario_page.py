@@ -15,8 +15,9 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from launch_scripts.reference.docstrings import meanings, prose
+from launch_scripts.reference.docstrings import prose
 from launch_scripts.reference.wire_page import number
+from swarm.config.describe import bare, hints_of, is_several, meanings, section_in
 from swarm.config.scenario import Scenario
 
 PATH = Path(__file__).parents[2] / "docs" / "reference" / "scenario.md"
@@ -87,13 +88,12 @@ def _sections(root: Section) -> list[tuple[str, Section]]:
     """Every section with the path under which it stands in a file, in the order of the file; each struct once."""
     found: list[tuple[str, Section]] = [("", root)]
     for path, section in found:
-        for key, hint in _hints(section).items():
-            inner = _struct_in(hint)
+        for key, hint in hints_of(section).items():
+            inner = section_in(hint)
             if inner is not None and all(inner is not known for _, known in found):
-                several = typing.get_origin(_bare(hint)) is tuple
                 joined = f"{path.strip('[]')}.{key}" if path else key
-                joined += ".NAME" * (typing.get_origin(_bare(hint)) is dict)
-                found.append((f"[[{joined}]]" if several else f"[{joined}]", inner))
+                joined += ".NAME" * (typing.get_origin(bare(hint)) is dict)
+                found.append((f"[[{joined}]]" if is_several(hint) else f"[{joined}]", inner))
     return found
 
 
@@ -102,25 +102,21 @@ def _section(path: str, section: Section) -> Iterator[str]:
     yield prose(section.__doc__) + "\n"
     yield "| key | meaning | unit | allowed | default |"
     yield "|---|---|---|---|---|"
-    hints, said = _hints(section), _meanings(section)
+    hints, said = hints_of(section), _meanings(section)
     for field in msgspec.structs.fields(section):
-        if path == "" and _struct_in(hints[field.name]) is not None:
+        if path == "" and section_in(hints[field.name]) is not None:
             continue
         cells = (said[field.name], _unit(field.name), _allowed(hints[field.name]), _default(field))
         yield f"| `{field.name}` | " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
     yield ""
 
 
-def _hints(section: Section) -> dict[str, Any]:
-    return typing.get_type_hints(section, include_extras=True)
-
-
 def _meanings(section: Section) -> dict[str, str]:
     """What each field means. A field of the root that is a section of its own is described by that section."""
-    said = meanings(section.__doc__)
+    said = meanings(section)
     missing: list[str] = []
-    for name, hint in _hints(section).items():
-        inner = _struct_in(hint)
+    for name, hint in hints_of(section).items():
+        inner = section_in(hint)
         if name not in said and inner is not None:
             said[name] = prose(inner.__doc__).partition("\n")[0]
         elif name not in said:
@@ -130,30 +126,6 @@ def _meanings(section: Section) -> dict[str, str]:
             f"{section.__module__}.{section.__name__}: no row in the docstring for {', '.join(missing)}"
         )
     return said
-
-
-def _bare(hint: Any) -> Any:
-    """A type without Annotated and None around it."""
-    while True:
-        origin = typing.get_origin(hint)
-        if origin is Annotated:
-            hint = typing.get_args(hint)[0]
-        elif origin in (types.UnionType, typing.Union):
-            kinds = [arg for arg in typing.get_args(hint) if arg is not type(None)]
-            if len(kinds) > 1:
-                return hint
-            hint = kinds[0]
-        else:
-            return hint
-
-
-def _struct_in(hint: Any) -> Section | None:
-    bare = _bare(hint)
-    if typing.get_origin(bare) is tuple:
-        bare = _bare(typing.get_args(bare)[0])
-    elif typing.get_origin(bare) is dict:
-        bare = _bare(typing.get_args(bare)[1])
-    return bare if isinstance(bare, type) and issubclass(bare, msgspec.Struct) else None
 
 
 def _unit(name: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from launch_scripts.replay.rebuild import REPLAYED, Ground, Grounds, rebuilt, setup_of
@@ -87,20 +88,29 @@ def replay_run(
     process: str | None = None,
     until_s: float | None = None,
     ground: Ground | None = None,
-    progress: Callable[[Recorded], Progress] = lambda _: lambda _: None,
+    progress: Callable[[float], None] = lambda share: None,
 ) -> Iterator[Replayed]:
     """Feed the recordings of a run to the services of this build, one after the other. Raises as `recordings_of`.
 
-    ground  of a run whose scenario does not say what it is on
+    ground    of a run whose scenario does not say what it is on
+    progress  takes the share of all bytes that is replayed
     """
     grounds = Grounds(folder, ground)
-    for recorded in recordings_of(folder, process):
+    recordings = recordings_of(folder, process)
+    whole, before = sum(each.bytes for each in recordings), 0
+    for recorded in recordings:
+        share_of = partial(_share, progress, before, whole)
+        before += recorded.bytes
         try:
-            outcome = _replay(folder, recorded, grounds, until_s, progress(recorded))
+            outcome = _replay(folder, recorded, grounds, until_s, share_of)
         except SwarmError as error:
             yield Replayed(recorded=recorded, outcome=None, why=str(error))
         else:
             yield Replayed(recorded=recorded, outcome=outcome)
+
+
+def _share(progress: Callable[[float], None], before: int, whole: int, read: int) -> None:
+    progress((before + read) / whole)
 
 
 def _replay(

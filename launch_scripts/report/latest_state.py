@@ -119,6 +119,16 @@ class Observed(Counts):
         """Whether the process has ever been seen alive."""
         return (role, id) in self._was_up
 
+    def knows(self, role: str, id: str) -> bool:
+        """Whether the process has ever been seen alive, or what it counted is known."""
+        return self.was_up(role, id) or (role, id) in self._newest
+
+    def told_by_planner(self, target: str) -> PlannerStatus | None:
+        """What the planner that leads says; None if there is none, or it is gone and says nothing any more."""
+        ids = [ranked_id(target, rank) for rank in range(HIGHEST_RANK + 1)]
+        gone = any(self.knows("planner", id) for id in ids) and not any(self.is_well("planner", id) for id in ids)
+        return None if gone else self.status.get(target)
+
     def ids_up(self, role: str) -> list[str]:
         """Ids of the processes of a role which are alive."""
         return [id for each, id in self.up() if each == role]

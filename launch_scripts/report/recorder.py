@@ -15,7 +15,7 @@ import numpy as np
 
 from launch_scripts.report.begun_routes import BegunRoutes
 from launch_scripts.report.latest_state import MarkedCells
-from launch_scripts.report.results.certified_gap import gaps_to, of_excess
+from launch_scripts.report.results.certified_gap import of_excess
 from launch_scripts.report.results.results import Driven, results
 from launch_scripts.report.run_state.facts import for_report
 from launch_scripts.report.run_state.model import HEARD, RunModel
@@ -28,7 +28,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
-from swarm.runtime.stats import MESSAGES_PER_S, Histogram
+from swarm.runtime.stats import Histogram
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note
@@ -139,8 +139,7 @@ class Recorder:
             if tracks_due:
                 self._sample_tracks(now_ns, vehicles)
             if sample_due:
-                self._sample_due_ns = now_ns + _SAMPLE_NS
-                self.samples.add(self.sample(now_ns, vehicles))
+                self._add_sample(now_ns)
             if self.ready_ns is None and self.routed and not self.missing():
                 self.ready_ns = now_ns
 
@@ -157,23 +156,30 @@ class Recorder:
         places = [self.observed.place_m(pose) for _, pose in poses]
         self.target_tracks.add(now_ns, pieces, np.array(places, np.float32))
 
-    def sample(self, now_ns: int, vehicles: VehicleColumns) -> Sample:
-        observed = self.observed
-        status = sorted(observed.status.items())
-        return Sample(
-            time_s=self.seconds(now_ns),
-            states=vehicles.count_states(),
-            captures=observed.total("captures"),
-            marks=observed.total("marks"),
-            reroute_requests=observed.total("reroute_requests"),
-            routes_served=observed.total("routes_served"),
-            messages_per_s=observed.now_of(MESSAGES_PER_S),
-            alive=len(observed.up()),
-            gaps={id: gap.mean for id, gap in gaps_to(observed).items() if gap.mean is not None},
-            growth_ms={id: s.growth_ms for id, s in status},
-            gap_excess=buckets_of(observed.histogram("followed_gap_excess").buckets),
-            waiting_s=float(self.driven.waiting_s.sum()),
-            standing_s=float(self.driven.standing_s.sum()),
+    def finish(self, now_ns: int) -> None:
+        """The run is over: its last sample is of its end."""
+        self._touch(now_ns)
+        self._add_sample(now_ns)
+
+    def _add_sample(self, now_ns: int) -> None:
+        self._sample_due_ns = now_ns + _SAMPLE_NS
+        state = self.summary(now_ns)
+        self.samples.add(
+            Sample(
+                time_s=state.elapsed_s,
+                states=tuple(state.states.values()),
+                captures=state.captures,
+                marks=state.marks,
+                reroute_requests=state.reroute_requests,
+                routes_served=state.routes_served,
+                messages_per_s=state.messages_per_s,
+                alive=state.alive,
+                gaps={line.id: line.gap.mean for line in state.targets if line.gap and line.gap.mean is not None},
+                growth_ms={line.id: line.growth_ms for line in state.targets if line.growth_ms is not None},
+                gap_excess=buckets_of(self.observed.histogram("followed_gap_excess").buckets),
+                waiting_s=float(self.driven.waiting_s.sum()),
+                standing_s=float(self.driven.standing_s.sum()),
+            )
         )
 
     def summary(self, now_ns: int) -> RunState:
@@ -191,7 +197,8 @@ class Recorder:
         if seconds is None and self.model.first_ns is not None and self.last_ns is not None:
             seconds = (self.last_ns - self.model.first_ns) / NS_PER_S
         observed, total = self.observed, self.observed.total
-        state = self.summary(self.last_ns or 0)
+        # Later come the words of a run that ends: nobody tracks targets any more, which is no alarm.
+        state = self.summary(self.tracked.moved_ns or self.last_ns or 0)
         rates = [rate for _, rate in messages_per_s(self.samples.all())]
         fields = {
             "scenario": self.scenario.name,

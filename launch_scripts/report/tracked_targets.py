@@ -25,7 +25,8 @@ class TrackedTargets:
     def __init__(self, grid: GridSpec, status: Mapping[str, PlannerStatus]) -> None:
         self._trackings = Trackings(grid)
         self._status = status
-        self._moved_ns = 0
+        self.moved_ns = 0
+        """When a vehicle or a target was last heard of."""
 
     def hear(self, pose: TargetPose, now_ns: int) -> TargetPose | None:
         """Take in a pose; returns it, with its cell, if it counts."""
@@ -34,7 +35,7 @@ class TrackedTargets:
 
     def something_moved(self, now_ns: int) -> None:
         """A vehicle or target was heard of. What comes after the last of them are the words of a run that ends."""
-        self._moved_ns = max(self._moved_ns, now_ns)
+        self.moved_ns = max(self.moved_ns, now_ns)
 
     def lost(self, now_ns: int) -> set[str]:
         """The targets that nobody tracks now; of those without a tracker as their planners tell."""
@@ -53,6 +54,6 @@ class TrackedTargets:
         """How often targets were lost, which still are, and what was odd about poses."""
         return {
             "lost": observed.total("trackers_lost"),
-            "lost_at_end": sorted(self.lost(self._moved_ns)),
+            "lost_at_end": sorted(self.lost(self.moved_ns)),
             **{name: observed.total(name) for name in ODD_POSES},
         }

@@ -158,6 +158,7 @@ class Simulation:
                     node.stop()
                     node.ticking = False
         self.run_until(self.now_s + _STOP_S)
+        self.recorder.finish(self.scheduler.clock.now_ns())
         for node in self.nodes.values():
             node.end_recording()
 

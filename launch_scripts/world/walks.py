@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from shared_map.arrays import CellsOf
 from swarm.config.scenario import CostConfig, TargetConfig
@@ -40,6 +39,9 @@ class TrueTerrain:
     """True pace of every cell, and the steps that are possible."""
 
     def __init__(self, grid: GridSpec, pace_s_per_m: NDArray[np.float32]) -> None:
+        # Imported here: it takes as long as all else that a run's roles share, and one process of them needs it.
+        from scipy.ndimage import label
+
         self.grid = grid
         self.pace_s_per_m = pace_s_per_m.view()
         self.pace_s_per_m.flags.writeable = False  # walks are told it

@@ -9,6 +9,7 @@ import msgspec
 
 from shared_map.keeper.base_map_transfer import BaseMapServer
 from shared_map.keeper.compaction import CompactionPlan, compact
+from shared_map.keeper.last_words import LastWords
 from shared_map.keeper.orders import KeptOrders
 from shared_map.keeper.store import Keeper, KeeperStore
 from shared_map.keeper.zones import free_name, rows_of, zone_sets, zones_of
@@ -17,7 +18,7 @@ from shared_map.replication.replica import MapReplica, PublishSet
 from shared_map.replication.sync import MapSync
 from shared_map.sightings import Sightings
 from shared_map.terrain.terrain import Terrain
-from swarm.bus.bus import Asked, Bus, Event, Heard, Post
+from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.order_book import described
@@ -25,8 +26,9 @@ from swarm.runtime.membership import Member
 from swarm.runtime.role import RoleSetup
 from swarm.wire.messages.marks import MarkSet
 from swarm.wire.messages.orders import Order, ZoneOrder, Zones
+from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.targets import Sighted
-from swarm.wire.topics import SIGHTED, ZONES
+from swarm.wire.topics import SIGHTED, STATS, ZONES
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +60,7 @@ class KeeperService:
         self._base_map = BaseMapServer(terrain, setup.id)
         self._store = store
         self._orders = KeptOrders(setup.id, setup.scenario, terrain, store, bus, post)
+        self._last_words = LastWords()
         self._keeper = Keeper()
         self.replica = MapReplica(terrain.grid)
         self._sync = MapSync(
@@ -96,12 +99,28 @@ class KeeperService:
         self._bus.subscribe(SIGHTED, self._post)
         self._bus.serve(ZONES, self._post, keeper=self._id)
         self._orders.start(now_ns)
+        self._bus.subscribe(STATS, self._post)
+        self._bus.serve(STATS, self._post)
+        self._last_words.alive(self._member.peer, True)
+        for role in ("planner", "targets", "keeper", "monitor"):  # agents are watched for orders
+            self._bus.watch_alive(self._post, role=role)
         log.info("keeper started: %d tiles in store %s", len(self.replica.held.tiles), self._store.path)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if isinstance(event, Heard) and isinstance(event.message, Sighted):
-            self._sightings.hear(event.message, now_ns)
-            return
+        match event:
+            case Heard(message=Sighted() as sighted):
+                self._sightings.hear(sighted, now_ns)
+                return
+            case Heard(message=Stats() as stats):
+                self._last_words.hear(stats)
+                return
+            case Asked(topic=topic) if topic is STATS:
+                for stats in self._last_words.of_the_gone():
+                    event.answer(stats, role=stats.role, id=stats.id)
+                event.end()
+                return
+            case Appeared(peer) | Disappeared(peer):  # others want to know it, too
+                self._last_words.alive(peer, isinstance(event, Appeared))
         if isinstance(event, Asked) and isinstance(event.request, ZoneOrder):
             self._order_zone(event, event.request, now_ns)
             return

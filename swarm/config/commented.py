@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import textwrap
-import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import msgspec
 
-from swarm.config.describe import expected, is_several, meanings, section_in
+from swarm.config.describe import expected, hints_of, is_several, meanings, section_in
 from swarm.config.scenario import Scenario
 from swarm.config.write import toml_key, toml_value
 
@@ -25,8 +24,8 @@ def commented(settings: Mapping[str, Any], head: str) -> str:
     return "\n".join([*lines, *_section(settings, Scenario, ())]) + "\n"
 
 
-def _section(settings: Mapping[str, Any], section: type[Any], path: tuple[str, ...]) -> Iterator[str]:
-    said, hints = meanings(section), typing.get_type_hints(section, include_extras=True)
+def _section(settings: Mapping[str, Any], section: Any, path: tuple[str, ...]) -> Iterator[str]:
+    said, hints = meanings(section), hints_of(section)
     defaults = {field.name: field.default for field in msgspec.structs.fields(section)}
     for key, value in settings.items():
         if section_in(hints[key]) is None:

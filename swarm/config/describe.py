@@ -6,34 +6,40 @@ import inspect
 import re
 import types
 import typing
+from collections.abc import Mapping
+from functools import cache
 from typing import Annotated, Any, Literal
 
 import msgspec
 
-from swarm.config.scenario import Section
-
-_ROW = re.compile(r"(\w+) {2,}(\S.*)")
+_ROW = re.compile(r"(\w+(?:, \w+)*) {2,}(\S.*)")
 _WORDS = {str: "text in quotes", int: "a whole number", float: "a number", bool: "true or false"}
 _UNBOUNDED = 1e12
 """Limits beyond this keep numbers finite; they say nothing to a reader."""
 
 
-def meanings(section: type[Section]) -> dict[str, str]:
+def meanings(section: type[msgspec.Struct]) -> dict[str, str]:
     """Setting -> meaning, in the order of the rows of a section's docstring.
 
-    A row is `key`, two or more spaces and the meaning; lines that begin with spaces continue it.
+    A row is `key` or several, two or more spaces and the meaning; lines that begin with spaces continue it.
     """
     found: dict[str, str] = {}
-    key = ""
+    keys: list[str] = []
     for line in (inspect.getdoc(section) or "").splitlines():
         if row := _ROW.fullmatch(line):
-            key = row[1]
-            found[key] = row[2]
-        elif line.startswith(" ") and key:
-            found[key] += f" {line.strip()}"
+            keys = row[1].split(", ")
+            found |= dict.fromkeys(keys, row[2])
+        elif line.startswith(" ") and keys:
+            found |= {key: f"{found[key]} {line.strip()}" for key in keys}
         else:
-            key = ""
+            keys = []
     return found
+
+
+@cache
+def hints_of(section: Any) -> Mapping[str, Any]:
+    """Setting -> its type, with its bounds."""
+    return typing.get_type_hints(section, include_extras=True)
 
 
 def expected(hint: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from swarm.config.describe import bare, expected, is_section, is_several, section_in
+from swarm.config.describe import bare, expected, hints_of, is_section, is_several, section_in
 from swarm.config.input_files import shown
 
 _LONGEST_LIST = 200
@@ -141,9 +141,7 @@ def _is_near(key: str, allowed: Sequence[str]) -> bool:
 
 def _keys(section: Any) -> list[str]:
     """The keys of a section that hold values."""
-    return [
-        key for key, hint in typing.get_type_hints(section, include_extras=True).items() if not section_in(hint)
-    ]
+    return [key for key, hint in hints_of(section).items() if not section_in(hint)]
 
 
 def _places(root: type) -> Iterator[tuple[str, Any]]:
@@ -151,7 +149,7 @@ def _places(root: type) -> Iterator[tuple[str, Any]]:
     found = [("", root)]
     for path, section in found:
         yield (f"in {path}" if path else "at the top of the file, before the first [section]"), section
-        for key, hint in typing.get_type_hints(section, include_extras=True).items():
+        for key, hint in hints_of(section).items():
             inner = section_in(hint)
             if inner is not None and all(inner is not known for _, known in found):
                 joined = f"{path.strip('[]')}.{key}" if path else key
@@ -205,7 +203,7 @@ def _field_type(section: Any, key: str) -> Any:
     section = bare(section)
     if typing.get_origin(section) is dict:
         return typing.get_args(section)[1]
-    return typing.get_type_hints(section, include_extras=True).get(key) if is_section(section) else None
+    return hints_of(section).get(key) if is_section(section) else None
 
 
 def _item_type(hint: Any) -> Any:

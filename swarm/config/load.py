@@ -128,6 +128,10 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
     if scenario.cost.directional:
         yield from _said(_check_directional, scenario.planner, source)
     yield from _group_faults(scenario, source)
+    shown = scenario.monitor.show_target
+    if shown and shown not in scenario.target_ids:
+        known = choice(shown, scenario.target_ids, " there are ")
+        yield f"{source}: monitor.show_target is {shown!r}, which is no target{known}"
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
             yield from _said(check_endpoint, endpoint, scenario.network.tls is not None, f"{source}: network.{key}")

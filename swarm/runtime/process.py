@@ -111,7 +111,7 @@ class Process:
 
     tick_hz  ticks a second; those that come too late are dropped and counted (`ticks_dropped`). `ticks_late` counts
              these and those that come later than half a period after they were due
-    phase    where in the clock's periods ticks fall, from 0 to 1; if None, the first comes at once
+    phase    where in the clock's periods all ticks but the first fall, from 0 to 1; if None, where that falls
     """
 
     def __init__(
@@ -169,8 +169,7 @@ class Process:
 
     def _loop(self, counters: Counters) -> None:
         due_ns = events_until_ns = self._clock.now_ns()
-        if self._phase_ns is not None:
-            due_ns += (self._phase_ns - due_ns) % self._tick_ns
+        phase_ns = self._phase_ns
         usage = OwnUsage()
         while not self._stopping:
             now_ns = self._clock.now_ns()
@@ -179,6 +178,9 @@ class Process:
                 counters.count("ticks_dropped", missed)
                 counters.count("ticks_late", missed + (late_ns > self._tick_ns // 2))
                 due_ns += (missed + 1) * self._tick_ns
+                if phase_ns is not None:  # the first tick waits for nothing, the next for their phase
+                    due_ns -= (due_ns - phase_ns) % self._tick_ns
+                    phase_ns = None
                 usage.look(counters, now_ns)
                 self._service.tick(now_ns)
                 took_ns = self._clock.now_ns() - now_ns

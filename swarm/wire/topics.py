@@ -271,7 +271,7 @@ ROUTE = Topic(
 )  # fmt: skip
 COST = Topic(
     "cost", "target/{target}/cost", CostReply, "cost-to-go of a batch of cells", "asked",
-    access(serve="planner:target", ask="agent targets rover"),
+    access(serve="planner:target", ask="agent targets monitor rover"),
     request=CostRequest, published=False,
 )  # fmt: skip
 STATUS = Topic(
@@ -307,9 +307,10 @@ OBEYED = Topic(
     request=Obey, published=False, priority=Priority.INTERACTIVE,
 )  # fmt: skip
 STATS = Topic(
-    "stats", "stats/{role}/{id}", Stats, "what a process has counted", "1 Hz",
-    access(put=MEMBERS_OWN, hear="monitor"),
-    priority=Priority.BACKGROUND,
+    "stats", "stats/{role}/{id}", Stats,
+    "what a process has counted; keepers answer with the last words of processes that are gone", "1 Hz",
+    access(put=MEMBERS_OWN, serve="keeper", ask="monitor", hear="monitor keeper"),
+    request=Nothing, priority=Priority.BACKGROUND,
 )  # fmt: skip
 NOTE = Topic(
     "note", "note/{role}/{id}", Note, "something worth telling a person", "as it happens",

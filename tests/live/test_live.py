@@ -89,7 +89,12 @@ def test_a_person_asks_for_a_route_and_for_the_status(live: LiveSwarm, bus: Zeno
     status = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)
     assert len(status["processes"]) == 8
     assert [planner["target"] for planner in status["planners"]] == ["t0", "t1"]
-    assert "planner-t1" in swarm("status", "--connect", live.endpoint).stdout
+    assert "planner-t1" in swarm("status", "--runs", live.runs).stdout, "found by its folder"
+    top = json.loads(swarm("top", "--runs", live.runs, "--json", "--once").stdout)
+    assert top["processes_well"] == [6, 6]
+    loads = {f"{each['role']}-{each['id']}": each for each in top["processes"]}
+    assert len(loads) == 8, "router and monitor tell theirs, too"
+    assert all(each["alive"] and each["cpu_percent"] >= 0 and each["rss_bytes"] > 10e6 for each in loads.values())
 
 
 def test_any_zenoh_session_gets_a_readable_route(live: LiveSwarm, bus: ZenohBus) -> None:

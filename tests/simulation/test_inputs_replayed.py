@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import itertools
 import json
+import time
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -19,13 +22,18 @@ from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.simulate import simulate
 from launch_scripts.simulation.trial import nodes_of
 from launch_scripts.simulation.worlds import SMALL
+from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
+from shared_map.terrain.terrain import build_terrain
 from swarm.errors import ConfigError, StoreError
 from swarm.runtime.recording import records
+from swarm.runtime.recording.outside import Outside
+from swarm.runtime.recording.recording import Recording
 from swarm.runtime.recording.records import (
     CALLS,
     MAGIC,
     Cut,
     HeardOne,
+    JobEnded,
     Output,
     Outputs,
     Read,
@@ -75,6 +83,65 @@ def test_every_process_of_a_run_with_faults_gives_the_same_when_it_is_replayed(
         assert each.outcome is not None
         assert each.outcome.events > 5
         assert each.outcome.outputs > 5
+
+
+def test_what_a_planner_reads_of_clock_kernels_and_shelf_is_an_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = msgspec.structs.replace(
+        SMALL, seed=4, planner=msgspec.structs.replace(SMALL.planner, strategy="multi_resolution")
+    )
+    terrain = build_terrain(scenario)
+    calls = itertools.count()
+    # As a live planner is given them: CPU time, kernels that are compiled by and by, corridors in files.
+    live = {"stopwatch": time.thread_time_ns, "all kernels": lambda: next(calls) > 100}
+    function, outside = Recording.function, Recording.outside
+
+    def functions(self: Recording, name: str, given: object, kind: Any) -> Any:
+        return function(self, name, live[name], kind)
+
+    def shelves(self: Recording, thing: object, what: Outside) -> Any:
+        if what is PREPARED_COSTS:
+            thing = PreparedCosts(tmp_path, terrain, scenario.planner)
+        return outside(self, thing, what)
+
+    monkeypatch.setattr(Recording, "function", functions)
+    monkeypatch.setattr(Recording, "outside", shelves)
+    simulate(scenario, seconds=4, record_to=tmp_path)
+    for process in ("planner-t0", "planner-t1"):
+        (replayed,) = replay_run(tmp_path, process)
+        assert replayed.same, replayed
+    ended = [each for each in records_of(replayed.recorded.path) if isinstance(each, JobEnded)]
+    assert {what for each in ended for what, _ in each.reads} >= {"load", "claim"}
+
+
+def test_an_error_of_a_service_is_its_last_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decide = Agent.decide
+    calls = 0
+
+    def fails(agent: Agent, now_ns: int) -> list[Any]:
+        nonlocal calls
+        calls += 1
+        if calls == 30:
+            raise ZeroDivisionError("a bug")
+        return decide(agent, now_ns)
+
+    one_agent = msgspec.structs.replace(SMALL, vehicles=msgspec.structs.replace(SMALL.vehicles, per_agent=10))
+    with monkeypatch.context() as patched:
+        patched.setattr(Agent, "decide", fails)
+        with pytest.raises(ZeroDivisionError):
+            simulate(one_agent, 4, 9, record_to=tmp_path)
+        calls = 0
+        (replayed,) = replay_run(tmp_path, "agent-a0")
+        assert replayed.same
+        assert replayed.outcome is not None
+        assert replayed.outcome.ended == "ended by an error"
+    (mended,) = replay_run(tmp_path, "agent-a0")
+    assert mended.outcome is not None
+    assert mended.outcome.difference is not None
+    assert mended.outcome.difference.recorded is not None
+    assert mended.outcome.difference.recorded.startswith("raise ")
+    assert mended.outcome.events == replayed.outcome.events - 1
 
 
 def test_recording_a_run_does_not_change_it(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.blueprint import make_blueprint
+from launch_scripts.monitor.ground.layers import shown_layers
 from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.serving.sinks import Sinks
@@ -67,12 +68,13 @@ class Rig(SwarmModel):
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
         self.speaker = self.bus("speaker")
         mesh = TerrainMesh(terrain)
-        self.sinks = Sinks("run.1", path, config, make_blueprint(mesh))
+        layers = shown_layers(scenario, knows_truth=False)
+        self.sinks = Sinks("run.1", path, config, make_blueprint(mesh, layers))
         setup = self.setup("monitor", "0")
         self.service = self.start(
             "monitor",
             lambda bus, post: MonitorService(
-                setup, terrain, bus, post, self.sinks.streams, mesh=mesh, live_url=live_url
+                setup, terrain, bus, post, self.sinks.streams, mesh=mesh, live_url=live_url, layers=layers
             ),
         )
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from launch_scripts.commands.run_frame import frame_of_members
+from launch_scripts.launcher.live_table import targets_table
 from launch_scripts.report.results.certified_gap import gaps_to
 from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.model import HEARD, RunModel
@@ -23,10 +24,10 @@ from swarm.grid import GridSpec
 from swarm.places import extent_of, fields_of, written
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.planning import PlannerStatus
-from swarm.wire.messages.processes import Beat, RunInfo
-from swarm.wire.topics import RUN
+from swarm.wire.messages.processes import Beat, RunInfo, Stats
+from swarm.wire.topics import RUN, STATS
 
-_TAG = "status-run"
+_TAG, _GONE = "status-run", "status-gone"
 _ASK_S = 1.0
 _NO_GRID = GridSpec(1, 1, 1.0)
 _SHOWN_ALARMS = 12
@@ -64,6 +65,12 @@ class StatusWatch:
             bus.subscribe(topic, post, every_s=every_s)
         bus.watch_alive(post)
         bus.ask(RUN, Nothing(), post, tag=_TAG, timeout_s=_ASK_S)
+        self._bus, self._post = bus, post
+        self._ask_gone()
+
+    def _ask_gone(self) -> None:
+        """Ask what processes that are gone have said last."""
+        self._bus.ask(STATS, Nothing(), self._post, tag=_GONE, timeout_s=_ASK_S)
 
     def take(self, event: Event, now_ns: int) -> None:
         """Take in one event."""
@@ -72,8 +79,10 @@ class StatusWatch:
                 self._found.append(info)
             case AskEnded(tag=tag) if tag == _TAG:
                 self.answered = True
-            case Heard() | Appeared() | Disappeared():
+            case Heard() | Appeared() | Disappeared() | Replied(message=Stats()):
                 self._told.append((now_ns, event))
+                if isinstance(event, Disappeared):  # perhaps before it said anything to us
+                    self._ask_gone()
 
     def status(self, now_ns: int) -> Status | None:
         """What was told so far; None if nobody has answered."""
@@ -90,7 +99,7 @@ class StatusWatch:
         leads: dict[tuple[str, str], bool] = {}
         for told_ns, event in self._told:
             match event:
-                case Heard(message=message):
+                case Heard(message=message) | Replied(message=message):
                     if isinstance(message, Beat):
                         leads[message.role, message.id] = message.leads
                     model.heard(message, told_ns)
@@ -108,8 +117,9 @@ def print_status(status: Status, console: Console) -> None:
         console.print("no run yet: only routers answer", highlight=False)
     else:
         time = facts.fact("elapsed_s")
-        head = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells, "
-        console.print(f"{head}{time.label} {time.shown(state)}", highlight=False, soft_wrap=True)
+        head = f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells"
+        console.print(head, highlight=False, soft_wrap=True)
+        console.print(f"{time.label} {time.shown(state)}", highlight=False)
         if frame is not None and frame.grid.crs != "local":
             console.print(f"terrain: {extent_of(frame, 'latlon')}", highlight=False)
         for line in facts.lines(state):
@@ -118,11 +128,8 @@ def print_status(status: Status, console: Console) -> None:
     for line in facts.alarm_lines(state, _SHOWN_ALARMS, over=True):
         console.print(line, style="yellow", highlight=False, soft_wrap=True)
     if state.targets:
-        labels, rows = facts.table(state, whole=True)
-        table = Table(*labels, pad_edge=False)
-        for target, row in zip(state.targets, rows, strict=True):
-            table.add_row(*row, style="yellow" if target.lost or not target.planner_up else None)
-        console.print(table)
+        console.print(targets_table(state, len(state.targets)))
+        console.print(_planning(state))
     for id, planner in sorted(status.model.observed.status.items()):
         cell = _target_cell(planner, frame)
         if frame is not None and cell is not None:
@@ -136,7 +143,7 @@ def print_status(status: Status, console: Console) -> None:
 
 
 def _processes(status: Status) -> Table:
-    crew = Table("process", "up", "messages out", "in", "dropped", pad_edge=False)
+    crew = _table("process", "up", "messages out", "in", "dropped")
     for info in status.members:
         stats = status.model.observed.newest_stats(info.role, info.id)
         counts = {} if stats is None else stats.counts
@@ -145,6 +152,22 @@ def _processes(status: Status) -> Table:
         leading = {True: ", leads", False: ", stands by", None: ""}[status.leads.get((info.role, info.id))]
         crew.add_row(f"{info.role}-{info.id}{leading}", facts.seconds(up_s), *(facts.count(n) for n in told))
     return crew
+
+
+def _planning(state: RunState) -> Table:
+    """What of the targets no other table has: beside the rest it would be wider than a terminal."""
+    columns = [facts.TARGET_FACTS[0], *(column for column in facts.TARGET_FACTS if not column.always)]
+    shown = _table(*(column.label for column in columns))
+    for line in state.targets:
+        shown.add_row(*(column.shown(line) for column in columns), style="yellow" if line.lost else None)
+    return shown
+
+
+def _table(*labels: str) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for n, label in enumerate(labels):
+        table.add_column(label, justify="right" if n else "left")
+    return table
 
 
 def status_fields(status: Status) -> dict[str, Any]:

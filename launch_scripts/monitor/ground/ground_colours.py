@@ -6,6 +6,8 @@ filled, so that the two differ without colour, too.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,10 +25,15 @@ LETHAL_MARK, SLOW_MARK, FAST_MARK = (98, 30, 165), (235, 150, 0), (90, 200, 250)
 LETHAL_PRIOR, HATCH, NO_GO, ROAD = (12, 14, 20), (200, 200, 212), rgb(palette.RED), (232, 222, 196)
 STILL_HIDDEN_LETHAL, STILL_HIDDEN_SLOW = rgb(palette.RED), rgb(palette.ORANGE)
 FOUND, OVERRULED = rgb(palette.SKY), rgb(palette.PINK)
-WINDOW = (255, 200, 60)
+WINDOW, TREE = (255, 200, 60), (255, 255, 255)
+UNREACHED = (70, 60, 66)
 _HATCH_TEXELS = 7
-COST_COLOURS = "cividis"
+_CIVIDIS = "#00224e #1a386f #434e6c #61656f #7d7c78 #9b9476 #bcae6c #dec958 #fee838"
+COST_COLOURS = tuple(_CIVIDIS.split())
 """From dear to cheap."""
+_VIRIDIS = "#fde725 #aadc32 #5cc863 #27ad81 #21908d #2c718e #3b518b #472c7a #440154"
+COST_TO_GO_COLOURS = tuple(_VIRIDIS.split())
+"""From the target outwards."""
 _COST_STEPS = 256
 
 
@@ -52,7 +59,7 @@ class GroundColours:
         ends = np.percentile(drivable, (1, 99)) if len(drivable) else (0.1, 1.0)
         self.quickest_s_per_m = float(ends[0])
         self.slowest_s_per_m = max(float(ends[1]), 1.25 * self.quickest_s_per_m)
-        self._cost_colours = colours_of(COST_COLOURS, _COST_STEPS)
+        self._cost_colours = between(COST_COLOURS, _COST_STEPS)
 
     def close(self, cells: NDArray[np.int64]) -> None:
         """Says which cells zones close."""
@@ -113,10 +120,17 @@ class GroundColours:
             image[seen] = _mixed(image[seen], colour, 0.85)
         return image
 
-    def shaded(self, colours: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bytes:
-        """Colours on the relief of these texels."""
-        shade = 0.5 + 0.5 * self._shade[rows[:, None], cols[None, :]]
+    def lethal_at(self, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bools:
+        """Whether the map says that these rows and columns of cells are lethal: bool (rows, cols)."""
+        lethal: Bools = np.isinf(self._now[rows[:, None], cols])
+        return lethal
+
+    def on_relief(self, colours: Floats, rows: NDArray[np.intp], cols: NDArray[np.intp]) -> Bytes:
+        """Colours of these rows and columns of cells, float32 (rows, cols, 3), lit; lethal ground is dark."""
+        side = self._mesh.texel
+        shade = 0.5 + 0.5 * self._shade[rows[:, None] // side, cols // side]
         lit: Bytes = np.clip(colours * shade, 0, 255).astype(np.uint8)
+        lit[self.lethal_at(rows, cols)] = LETHAL_PRIOR
         return lit
 
     def _hatch(self, image: Bytes, window: Window) -> None:
@@ -130,7 +144,7 @@ class GroundColours:
         stripe = (rows + cols) % _HATCH_TEXELS < 2
         closed = closed & ~no_go
         image[closed] = _mixed(image[closed], LETHAL_PRIOR, 0.45)
-        image[closed & stripe] = _mixed(image[closed & stripe], HATCH, 0.3)
+        image[closed & stripe] = _mixed(image[closed & stripe], HATCH, 0.45)
         stripe = (rows - cols) % _HATCH_TEXELS < 3
         image[no_go] = _mixed(image[no_go], NO_GO, 0.25)
         image[no_go & stripe] = _mixed(image[no_go & stripe], NO_GO, 0.75)
@@ -143,12 +157,13 @@ class GroundColours:
         )
 
 
-def colours_of(colour_map: str, steps: int) -> Floats:
-    """Colours of a colour map of matplotlib, float32 (steps, 3), 0 to 255."""
-    from matplotlib import colormaps
-
-    colours: Floats = (255 * colormaps[colour_map](np.linspace(0, 1, steps))[:, :3]).astype(np.float32)
-    return colours
+def between(colours: Sequence[str], steps: int) -> Floats:
+    """So many colours evenly between those named, float32 (steps, 3), 0 to 255."""
+    named = np.array([rgb(colour) for colour in colours], np.float32)
+    at = np.linspace(0, len(named) - 1, steps)
+    channels = [np.interp(at, np.arange(len(named)), named[:, n]) for n in range(3)]
+    mixed: Floats = np.stack(channels, axis=1).astype(np.float32)
+    return mixed
 
 
 def _cells(window: Window) -> tuple[slice, slice]:

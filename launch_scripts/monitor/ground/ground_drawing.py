@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from launch_scripts.monitor.ground.ground_colours import WINDOW
+from launch_scripts.monitor.ground.ground_colours import TREE, WINDOW
 from launch_scripts.monitor.ground.legend import ZONE_COLOURS
 from launch_scripts.monitor.ground.map_margin import map_margin
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
@@ -20,6 +20,7 @@ _NAMES_SHOWN = 40
 _LINE, _THIN = -1.3, -0.8
 """Radii in points of the viewer's window, the same at every zoom: rerun takes negative radii so."""
 _NO_BALL = -0.1
+_WHOLE_SIDE = 112
 PHOTO = "world/ground"
 
 
@@ -29,10 +30,13 @@ class GroundDrawing:
     def __init__(self, rec: rr.RecordingStream | Streams, mesh: TerrainMesh) -> None:
         self._rec, self._mesh = rec, mesh
 
-    def begin(self, layers: Sequence[str], legends: Mapping[str, bytes], zones: Sequence[Area]) -> None:
+    def begin(
+        self, layers: Sequence[str], wholes: Sequence[str], legends: Mapping[str, bytes], zones: Sequence[Area]
+    ) -> None:
         """Logs what never changes.
 
         layers  entities that have the terrain's tiles, coarser than the photo
+        wholes  entities that have the terrain in one piece
         """
         self._rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for tile in self._mesh.mesh_tiles():
@@ -41,9 +45,10 @@ class GroundDrawing:
             for tile in self._mesh.mesh_tiles(coarser=2):
                 for layer in layers:
                     self._tile(layer, tile)
+        for layer in wholes:
+            self._tile(layer, self._mesh.whole(_WHOLE_SIDE))
         for layer, picture in legends.items():
-            image = rr.EncodedImage(contents=picture, media_type="image/png")
-            self._rec.log(f"legend/{layer}", image, static=True)
+            self.legend(layer, picture)
         style = rr.LineStrips3D.from_fields(colors=[WINDOW], radii=[_LINE])
         self._rec.log("world/windows", style, static=True)
         margin = map_margin(self._mesh)
@@ -68,6 +73,14 @@ class GroundDrawing:
                 ),
             ),
         )
+
+    def legend(self, layer: str, picture: bytes) -> None:
+        image = rr.EncodedImage(contents=picture, media_type="image/png")
+        self._rec.log(f"legend/{layer}", image, static=True)
+
+    def tree(self, layer: str, lines: Floats, radii: Floats) -> None:
+        """Logs lines as thick as what leads along them."""
+        self._rec.log(f"{layer}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
 
     def windows(self, outlines: Floats, targets: Sequence[str]) -> None:
         """Logs the outline of each target's window, with its name in the south."""

@@ -7,9 +7,20 @@ from dataclasses import dataclass
 
 import rerun as rr
 
-from launch_scripts.monitor.ground import layers
+from launch_scripts.monitor.ground.cost_to_go import CostSamples
 from launch_scripts.monitor.ground.ground_colours import GroundColours
-from launch_scripts.monitor.ground.ground_drawing import PHOTO, GroundDrawing
+from launch_scripts.monitor.ground.ground_drawing import GroundDrawing
+from launch_scripts.monitor.ground.layers import (
+    COST,
+    KNOWN,
+    NEAREST,
+    PHOTO,
+    Layer,
+    legends,
+    nearest_legend,
+    to_target_legend,
+)
+from launch_scripts.monitor.ground.target_layers import TargetPictures
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.monitor.ground.windows import window_outlines
 from launch_scripts.monitor.ground.zones import Area, closed_cells, ordered_areas
@@ -20,11 +31,12 @@ from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain
 from swarm.clock import NS_PER_S
 from swarm.grid import Window
-from swarm.wire.messages.planning import PlannerStatus
+from swarm.wire.messages.planning import CostReply, PlannerStatus
 
 _WINDOWS_NS = NS_PER_S
 _REFRESH_NS = NS_PER_S
 _ZONES_AGAIN_NS = 10 * NS_PER_S
+_NEAREST_NS = 8 * NS_PER_S
 
 
 @dataclass(eq=False)
@@ -32,12 +44,12 @@ class _Tiles:
     """A layer of tiles: which are out of date. Marks come many times a second to the same tiles, and each of their
     pictures is drawn once for all.
 
-    entity     under which its tiles are logged
+    layer      whose tiles these are
     every_ns   how often tiles that are out of date are drawn
     at_once    how many at most
     """
 
-    entity: str
+    layer: Layer
     picture: Callable[[Window], Bytes]
     every_ns: int
     at_once: int
@@ -50,9 +62,11 @@ class _Tiles:
 class GroundView:
     """Draws terrain, layers, zones and windows on a recording stream.
 
-    truth  the true ground, where this process knows it
-    zones  those of the scenario
-    movers  what the legends say of all that moves
+    truth    the true ground, where this process knows it
+    zones    those of the scenario
+    layers   tabs of the view
+    targets  in order of their colours
+    movers   what the legends say of all that moves
     """
 
     def __init__(
@@ -62,6 +76,8 @@ class GroundView:
         terrain: Terrain,
         cost_map: CostMap,
         replica: MapReplica,
+        layers: Sequence[Layer],
+        targets: Sequence[str],
         truth: Floats | None = None,
         zones: Sequence[Area] = (),
         movers: Sequence[Look] = (),
@@ -72,12 +88,17 @@ class GroundView:
         self._drawing = GroundDrawing(rec, mesh)
         self._colours = colours = GroundColours(mesh, terrain, cost_map.ground_s_per_m, truth)
         self._colours.close(closed_cells(self._zones))
-        self._layers = [
+        self._shown, self._target_ids = list(layers), list(targets)
+        tiled = (
             _Tiles(PHOTO, colours.photo_of, NS_PER_S, 80),
-            _Tiles(layers.COST.entity, colours.cost_of, 3 * NS_PER_S, 40),
-        ]
-        if truth is not None:
-            self._layers.append(_Tiles(layers.KNOWN.entity, colours.known_of, 3 * NS_PER_S, 40))
+            _Tiles(COST, colours.cost_of, 3 * NS_PER_S, 40),
+            _Tiles(KNOWN, colours.known_of, 3 * NS_PER_S, 40),
+        )
+        self._layers = [each for each in tiled if each.layer in layers]
+        self._targets = [layer for layer in layers if layer.target is not None]
+        self.samples = CostSamples(terrain.grid, next((layer.target for layer in self._targets), None))
+        self._pictures = TargetPictures(mesh, colours, self.samples)
+        self._nearest_due_ns = 0
         self._ordered: list[Area] = []
         self._zones_version, self._zones_due_ns = 0, 0
         self._windows: dict[str, tuple[int, ...]] = {}
@@ -87,18 +108,34 @@ class GroundView:
 
     def begin(self) -> None:
         """Draws all of it."""
-        entities = [each.entity for each in self._layers]
-        self._drawing.begin(entities[1:], layers.legends(self._colours, entities, self._movers), self._zones)
+        tiled = [each.layer.entity for each in self._layers if each.layer is not PHOTO]
+        wholes = [layer.entity for layer in self._shown if layer not in (each.layer for each in self._layers)]
+        self._drawing.begin(tiled, wholes, legends(self._colours, self._shown, self._movers), self._zones)
+        if NEAREST in self._shown:
+            self._drawing.legend(NEAREST.name, nearest_legend(self._target_ids, self._movers))
+        self._pictures.full_s = 0.0  # so that the next answer draws a legend
         self._drawing.ordered(self._ordered)
         for layer in self._layers:
             layer.stale = dict.fromkeys(range(self._mesh.tiles))
             self._draw_tiles(layer, self._mesh.tiles)
 
     def hear_status(self, status: PlannerStatus) -> None:
+        self.samples.hear_target(status.target)
         window = tuple(status.window)
         if self._windows.get(status.target) != window:
             self._windows[status.target] = window
             self._windows_new = True
+
+    def hear_costs(self, reply: CostReply, now_ns: int) -> None:
+        """Draws what a planner answered."""
+        if not self.samples.hear(reply):
+            return
+        for layer in self._targets:
+            if layer.target == reply.target and reply.target in self.samples.costs_s:
+                self._draw_to_target(layer, reply.target)
+        if NEAREST in self._shown and now_ns >= self._nearest_due_ns and self.samples.costs_s:
+            self._nearest_due_ns = now_ns + _NEAREST_NS
+            self._drawing.texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
 
     def tick(self, now_ns: int) -> None:
         """Draws what has changed, now and then."""
@@ -128,7 +165,15 @@ class GroundView:
     def _draw_tiles(self, layer: _Tiles, most: int) -> None:
         for tile in list(layer.stale)[:most]:
             del layer.stale[tile]
-            self._drawing.texture(layer.entity, tile, layer.picture(self._mesh.tile_window(tile)))
+            self._drawing.texture(layer.layer.entity, tile, layer.picture(self._mesh.tile_window(tile)))
+
+    def _draw_to_target(self, layer: Layer, target: str) -> None:
+        before_s = self._pictures.full_s
+        self._drawing.texture(layer.entity, 0, self._pictures.to_target(target))
+        tree = self._pictures.tree(target)
+        self._drawing.tree(layer.entity, tree.lines, tree.radii)
+        if self._pictures.full_s != before_s:
+            self._drawing.legend(layer.name, to_target_legend(target, self._pictures.full_s, self._movers))
 
     def _draw_ordered(self, now_ns: int) -> None:
         """Draws operators' zones when they change, and now and then for viewers that join late."""

@@ -2,37 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from launch_scripts.monitor.ground.ground_colours import COST_COLOURS, GroundColours
+from launch_scripts.monitor.ground.cost_to_go import unit_of
+from launch_scripts.monitor.ground.ground_colours import COST_COLOURS, COST_TO_GO_COLOURS, GroundColours
 from launch_scripts.monitor.ground.ground_drawing import PHOTO as PHOTO_ENTITY
 from launch_scripts.monitor.ground.legend import (
     CLOSED,
     FOUND,
     KNOWN_OR_NOT,
     LETHAL_COST,
+    TO_TARGET,
     WINDOW,
     Scale,
     legend_picture,
 )
-from launch_scripts.monitor.movers.looks import Look
+from launch_scripts.monitor.movers.looks import HUES, Look
+from swarm.config.scenario import Scenario
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """name: of its legend, title: of its tab, entity: whose tiles are its ground."""
+    """A tab of the view.
+
+    name    of its legend
+    entity  which has the ground of this layer
+    target  whose routes alone it shows; None for all
+    """
 
     name: str
     title: str
     entity: str
+    target: str | None = None
 
 
 PHOTO = Layer("photo", "Photo", PHOTO_ENTITY)
 COST = Layer("cost", "Cost", "world/layers/cost")
 KNOWN = Layer("known", "Known and true", "world/layers/known")
+NEAREST = Layer("nearest", "Nearest target", "world/layers/nearest")
 _ENTRIES = {
     PHOTO: (*CLOSED, *FOUND),
     COST: (*CLOSED, LETHAL_COST),
@@ -40,8 +50,22 @@ _ENTRIES = {
 }
 
 
-def legends(colours: GroundColours, entities: Collection[str], movers: Sequence[Look] = ()) -> dict[str, bytes]:
-    """Name -> PNG, of the layers with these entities.
+def shown_layers(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
+    """The layers of a run, in order of their tabs."""
+    targets = scenario.target_ids
+    shown = [PHOTO, COST]
+    if knows_truth:
+        shown.append(KNOWN)
+    if targets:
+        target = scenario.monitor.show_target or targets[0]
+        shown.append(Layer("to_target", f"To {target}", "world/layers/to_target", target))
+    if len(targets) > 1:
+        shown.append(NEAREST)
+    return shown
+
+
+def legends(colours: GroundColours, shown: Sequence[Layer], movers: Sequence[Look] = ()) -> dict[str, bytes]:
+    """Name -> PNG, of those layers whose legend stays as it is.
 
     movers  what it says of all that moves
     """
@@ -49,8 +73,21 @@ def legends(colours: GroundColours, entities: Collection[str], movers: Sequence[
     return {
         layer.name: legend_picture((*entries, WINDOW, *movers), scales.get(layer.name))
         for layer, entries in _ENTRIES.items()
-        if layer.entity in entities
+        if layer in shown
     }
+
+
+def to_target_legend(target: str, full_s: float, movers: Sequence[Look] = ()) -> bytes:
+    """PNG of the legend of a cost-to-go, of which so much is at the end of the scale."""
+    unit, unit_s = unit_of(full_s)
+    texts = tuple(f"{full_s * n / 5 / unit_s:.3g}" for n in range(6))
+    return legend_picture((*TO_TARGET, WINDOW, *movers), Scale(COST_TO_GO_COLOURS, f"{unit} to {target}", texts))
+
+
+def nearest_legend(targets: Sequence[str], movers: Sequence[Look] = ()) -> bytes:
+    """PNG of the legend of territories: of as many targets as there are colours."""
+    named = [Look("fill", hue, f"nearest: {target}") for target, hue in zip(targets, HUES, strict=False)]
+    return legend_picture((*named, WINDOW, *movers))
 
 
 def _cost_scale(colours: GroundColours) -> Scale:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 import io
 from dataclasses import dataclass
-from typing import Any
+from typing import assert_never
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from launch_scripts.monitor.ground import ground_colours as colours
 from launch_scripts.monitor.movers.looks import Colour, Look
@@ -15,16 +16,19 @@ from launch_scripts.report.pictures import palette
 
 BACKGROUND = (17, 22, 28)
 WIDTH_PX, HEIGHT_PX = 1840, 156
-_DPI = 200
-_TEXT = "#dfe3e8"
-_ROWS = 5
+_TEXT = (223, 227, 232)
+_ROWS, _ROW_PX, _TOP_PX = 5, 29, 20
+_SIZE_PX, _SWATCH_PX, _GAP_PX = 21, (40, 18), 30
+_LEFT_PX, _SCALE_PX = 14, 420
+_FINE = 4
+"""Shapes are drawn so many times as large, and then made smaller, so that their edges are smooth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """A bar with the colours of a colour map of matplotlib, and texts evenly along it."""
+    """A bar of colours, evenly between those named, and texts evenly along it."""
 
-    colour_map: str
+    colours: tuple[str, ...]
     title: str
     texts: tuple[str, ...]
 
@@ -45,6 +49,11 @@ FOUND = (
     Look("fill", colours.SLOW_MARK, "found slow"),
     Look("fill", colours.FAST_MARK, "found quick"),
 )
+TO_TARGET = (
+    Look("line", colours.TREE, "where the cost falls most"),
+    Look("fill", colours.UNREACHED, "no way from here"),
+    Look("fill", colours.LETHAL_PRIOR, "lethal"),
+)
 LETHAL_COST = Look("fill", colours.LETHAL_PRIOR, "found lethal")
 KNOWN_OR_NOT = (
     Look("fill", colours.FOUND, "hidden, and found"),
@@ -57,80 +66,63 @@ KNOWN_OR_NOT = (
 @functools.lru_cache(maxsize=16)
 def legend_picture(entries: tuple[Look, ...], scale: Scale | None = None) -> bytes:
     """A PNG of `WIDTH_PX` x `HEIGHT_PX`."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH_PX / _DPI, HEIGHT_PX / _DPI), dpi=_DPI, facecolor=_shares(BACKGROUND))
-    left = 0.006
+    image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), BACKGROUND)
+    draw = ImageDraw.Draw(image)
+    font = ImageFont.load_default(_SIZE_PX)
+    left = float(_LEFT_PX)
     if scale is not None:
-        _draw_scale(figure, scale)
-        left = 0.255
-    figure.legend(
-        handles=[_handle(entry) for entry in entries], loc="center left", bbox_to_anchor=(left, 0.5),
-        ncol=-(-len(entries) // _ROWS), frameon=False, labelcolor=_TEXT, fontsize=8, handlelength=1.9,
-        handleheight=0.9, columnspacing=1.6, borderaxespad=0, borderpad=0, handletextpad=0.6, labelspacing=0.35,
-    )  # fmt: skip
+        _draw_scale(image, draw, scale)
+        left += _SCALE_PX + 2 * _GAP_PX
+    for first in range(0, len(entries), _ROWS):
+        column = entries[first : first + _ROWS]
+        for row, entry in enumerate(column):
+            middle = _TOP_PX + row * _ROW_PX
+            image.paste(_swatch(entry), (round(left), middle - _SWATCH_PX[1] // 2))
+            draw.text((left + _SWATCH_PX[0] + 12, middle), entry.meaning, _TEXT, font, anchor="lm")
+        left += _SWATCH_PX[0] + 12 + max(font.getlength(entry.meaning) for entry in column) + _GAP_PX
     file = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(file)  # type: ignore[no-untyped-call]
+    image.save(file, "PNG")
     return file.getvalue()
 
 
-def _handle(entry: Look) -> Any:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    colour, text = _shares(entry.colour), entry.meaning
-    match entry.shape:
+def _swatch(look: Look) -> Image.Image:
+    width, height = (_FINE * side for side in _SWATCH_PX)
+    image = Image.new("RGB", (width, height), BACKGROUND)
+    draw = ImageDraw.Draw(image)
+    middle, radius, colour, thick = width // 2, height // 2, look.colour, 2 * _FINE
+    square = (middle - radius, 0, middle + radius - 1, height - 1)
+    match look.shape:
         case "fill":
-            return Patch(facecolor=colour, edgecolor=_TEXT, linewidth=0.3, label=text)
+            draw.rectangle((0, 0, width - 1, height - 1), colour, _TEXT, _FINE // 2)
         case "hatch":
-            return Patch(facecolor=(0.1, 0.11, 0.13), edgecolor=colour, hatch="/////", linewidth=0.6, label=text)
+            for start in range(-height, width, height // 2):
+                draw.line((start, height, start + height, 0), colour, thick)
+            draw.rectangle((0, 0, width - 1, height - 1), None, colour, _FINE)
         case "line":
-            return Line2D([], [], color=colour, linewidth=1.8, label=text)
-        case shape:
-            marker, edge = _marker(shape)
-            return Line2D([], [], color="none", marker=marker, markersize=9 if shape == "pin" else 6.5, label=text,
-                          markerfacecolor="none" if edge else colour, markeredgecolor=colour if edge else _TEXT,
-                          markeredgewidth=1.2 if edge else 0.3)  # fmt: skip
-
-
-def _marker(shape: str) -> tuple[Any, bool]:
-    """A marker of matplotlib, and whether it is hollow."""
-    from matplotlib.path import Path
-    from matplotlib.transforms import Affine2D
-
-    match shape:
-        case "pin":
-            pole = Path([(-0.1, 0.2), (0.1, 0.2), (0.1, -1), (-0.1, -1), (-0.1, 0.2)])
-            return Path.make_compound_path(Path.circle((0, 0.5), 0.5), pole), False
-        case "box":
-            return "s", True
+            draw.line((0, radius, width, radius), colour, 2 * thick)
+        case "ball":
+            draw.ellipse(square, colour)
         case "ring":
-            return "o", True
+            draw.ellipse(square, None, colour, thick)
+        case "box":
+            draw.rectangle(square, None, colour, thick)
         case "disc":
-            return Path.unit_circle().transformed(Affine2D().scale(1.1, 0.5)), False
-    return "o", False
+            draw.ellipse((middle - 3 * radius // 2, radius // 2, middle + 3 * radius // 2, 3 * radius // 2), colour)
+        case "pin":
+            draw.line((middle, radius // 2, middle, height), colour, thick)
+            draw.ellipse((middle - radius // 2, 0, middle + radius // 2, radius), colour)
+        case _:
+            assert_never(look.shape)
+    return image.resize(_SWATCH_PX, Image.Resampling.LANCZOS)
 
 
-def _draw_scale(figure: Any, scale: Scale) -> None:
-    axes = figure.add_axes((0.012, 0.42, 0.22, 0.2))
-    axes.imshow(
-        np.linspace(0, 1, 256)[None],
-        cmap=scale.colour_map,
-        aspect="auto",
-        extent=(0, 1, 0, 1),
-        interpolation="nearest",
-    )
-    axes.set_yticks([])
-    axes.set_xticks(np.linspace(0, 1, len(scale.texts)), scale.texts, color=_TEXT, fontsize=7.5)
-    axes.tick_params(length=2, pad=2, color=_TEXT)
-    for label, side in zip((axes.get_xticklabels()[0], axes.get_xticklabels()[-1]), ("left", "right"), strict=True):
-        label.set_horizontalalignment(side)
-    axes.set_title(scale.title, color=_TEXT, fontsize=8, loc="left", pad=3)
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def _shares(colour: Colour) -> tuple[float, float, float]:
-    red, green, blue = (value / 255 for value in colour)
-    return red, green, blue
+def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, scale: Scale) -> None:
+    small, font = ImageFont.load_default(_SIZE_PX - 2), ImageFont.load_default(_SIZE_PX)
+    top = HEIGHT_PX // 2 - 42
+    draw.text((_LEFT_PX, top), scale.title, _TEXT, font, anchor="lm")
+    bar = colours.between(scale.colours, _SCALE_PX).astype(np.uint8)
+    image.paste(Image.fromarray(np.repeat(bar[None], 28, axis=0)), (_LEFT_PX, top + 20))
+    for n, text in enumerate(scale.texts):
+        share = n / (len(scale.texts) - 1)
+        anchor = "lm" if n == 0 else "rm" if share == 1 else "mm"
+        draw.text((_LEFT_PX + share * _SCALE_PX, top + 66), text, _TEXT, small, anchor=anchor)

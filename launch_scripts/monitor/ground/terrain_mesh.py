@@ -109,6 +109,14 @@ class TerrainMesh:
         """All tiles of the terrain's mesh, with vertices so many times as far apart."""
         return [self._mesh_tile(index, coarser * self.step) for index in range(self.tiles)]
 
+    def whole(self, side: int) -> MeshTile:
+        """The terrain in one piece, with at most so many vertices along a side."""
+        rows, cols = (
+            np.unique(np.linspace(0, count - 1, min(side, count)).astype(np.int64))
+            for count in (self.grid.rows, self.grid.cols)
+        )
+        return self._piece(0, Window(0, 0, self.grid.rows, self.grid.cols), rows, cols)
+
     def tile_window(self, index: int) -> Window:
         tile_row, tile_col = divmod(index, self.tile_cols)
         row0, col0 = tile_row * self.tile_cells, tile_col * self.tile_cells
@@ -130,6 +138,9 @@ class TerrainMesh:
         window = self.tile_window(index)
         rows = _stepped(window.row0, window.row1, step, self.tile_cells)
         cols = _stepped(window.col0, window.col1, step, self.tile_cells)
+        return self._piece(index, window, rows, cols)
+
+    def _piece(self, index: int, window: Window, rows: NDArray[np.int64], cols: NDArray[np.int64]) -> MeshTile:
         grid_rows, grid_cols = np.meshgrid(rows, cols, indexing="ij")
         vertices = self.place_cells((grid_rows * self.grid.cols + grid_cols).reshape(-1))
         height, width = (

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 
 from launch_scripts.monitor.movers.routes import RouteNow
 from launch_scripts.report.results.certified_gap import percent
+from launch_scripts.report.run_state.facts import TARGET_FACTS
 from launch_scripts.report.run_state.state import TargetLine
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from swarm.clock import NS_PER_S
@@ -52,14 +53,9 @@ def body_details(body: Body) -> str:
 
 
 def target_details(line: TargetLine) -> str:
-    """As `t3: 16 chase it, nearest at 0.4 km, captured 2 times, certified gap 1.05%`."""
-    parts = [f"{line.following} chase it"]
-    if line.nearest_m is not None:
-        parts.append(f"nearest at {line.nearest_m / 1000:.1f} km")
-    parts.append(f"captured {line.captures} times")
-    if line.gap is not None:
-        parts.append(f"certified gap {percent(line.gap.mean)}")
-    return f"{line.title}: {', '.join(parts)}"
+    """What the table says of it, as `t3: following 16, nearest 412 m, re-plans 30, certified gap 1.05%`."""
+    title, *others = (fact for fact in TARGET_FACTS if fact.always)
+    return f"{title.shown(line)}: {', '.join(f'{fact.label} {fact.shown(line)}' for fact in others)}"
 
 
 def target_labels(

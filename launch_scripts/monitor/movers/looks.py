@@ -21,14 +21,9 @@ Colour = tuple[int, int, int]
 Shape = Literal["ball", "box", "pin", "ring", "disc", "line", "fill", "hatch"]
 
 
-def _rgb(colour: str) -> Colour:
-    red, green, blue = (int(colour[n : n + 2], 16) for n in (1, 3, 5))
-    return red, green, blue
-
-
 HUES: tuple[Colour, ...] = tuple(
     map(
-        _rgb,
+        palette.rgb,
         (palette.SKY, palette.ORANGE, "#F0E442", palette.PINK, palette.GREEN, "#E8601C", "#0F6FC6"),
     )
 )

@@ -111,7 +111,9 @@ class MoversView:
             self._draw_followed(vehicles)
         self._sightings.expire(now_ns)
         lost = self._recorder.tracked.lost(now_ns)
-        self._targets.draw(observed.targets(), lost, self._sightings.best(now_ns), self._details, now_ns)
+        # A target that an operator removed is in no table either.
+        places_m = {id: place_m for id, place_m in observed.targets().items() if id in self._details}
+        self._targets.draw(places_m, lost, self._sightings.best(now_ns), self._details, now_ns)
         self._bodies.tick(now_ns)
         self._bodies.take_changed()
         self._bodies.complaints.clear()

@@ -45,6 +45,30 @@ def settings_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
     ]
 
 
+def remarks(runs: Sequence[LeftRun]) -> list[str]:
+    """What to know before figures are compared, in sentences."""
+    terrains = [_table(run.report.get("terrain")).get("digest") for run in runs]
+    seeds, seconds = [run.report.get("seed") for run in runs], [run.report.get("seconds") for run in runs]
+    scales = [run.report.get("time_scale") for run in runs]
+    simulated = [bool(run.report.get("simulated")) for run in runs]
+    lengths = [value for value in seconds if isinstance(value, int | float)]
+    said = (
+        (_differ(terrains), "The terrains differ: costs, distances and gaps are of other ground."),
+        (_differ(seeds), f"The seeds differ ({_each(seeds)}): part of each difference is chance."),
+        (
+            bool(lengths) and max(lengths) > 1.05 * min(lengths),
+            f"The runs lasted {_each(f'{value:.0f}' for value in lengths)} s: counts grow with time.",
+        ),
+        (_differ(scales), f"Motion was {_each(scales)} times real motion: the same seconds are not the same way."),
+        (_differ(simulated), "Some ran live and some in a simulation: their response times are not comparable."),
+    )
+    return [sentence for differs, sentence in said if differs]
+
+
+def _each(values: Iterable[Any]) -> str:
+    return ", ".join(str(value) for value in values)
+
+
 def circumstances_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
     """Versions and machines that are not the same."""
     made = [run.report.get("made") for run in runs]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
+from swarm.ranks import job_of
 from swarm.runtime.stats import Histogram, merged
 from swarm.wire.messages.processes import Stats
 
@@ -54,6 +55,18 @@ class Counts:
     def total(self, name: str) -> int | None:
         """A count, summed over processes and incarnations; None if no process has published it."""
         told = [stats.counts[name] for stats in self._summed() if name in stats.counts]
+        return sum(told) if told else None
+
+    def of_job(self, role: str, job: str, *names: str) -> int | None:
+        """Counts of the processes with one job, such as a target's planner and its standbys, summed; None if none
+        of them has published any."""
+        told = [
+            stats.counts[name]
+            for stats in self._summed()
+            if stats.role == role and job_of(stats.id) == job
+            for name in names
+            if name in stats.counts
+        ]
         return sum(told) if told else None
 
     def gauge(self, name: str) -> float | None:

@@ -90,13 +90,13 @@ def _by_target(observed: Observed, scenario: Scenario) -> dict[str, Any]:
     vehicles = observed.vehicles()
     rows: dict[str, Any] = {}
     for id in _all(scenario.target_ids, captures, gaps, observed.status):
-        gap, status = gaps.get(id), observed.status.get(id)
+        gap = gaps.get(id)
         rows[id] = {
             "captures": captures.get(id, 0),
             "routes": 0 if gap is None else gap.routes,
             "certified_gap": None if gap is None else gap.fields(),
-            "growths": None if status is None else status.growths,
-            "window_growths": None if status is None else status.window_growths,
+            "growths": observed.of_job("planner", id, "growths"),
+            "window_growths": observed.of_job("planner", id, "window_growths"),
             "chased_by_at_end": len(vehicles.chasing(id)),
         }
     return rows

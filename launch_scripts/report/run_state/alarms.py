@@ -169,7 +169,7 @@ def _told(observed: Observed) -> Iterator[Found]:
 def _missing(observed: Observed, plan: RunPlan, targets: list[str], now_ns: int) -> Iterator[Found]:
     starting = plan.started_ns is not None and now_ns - plan.started_ns < STARTING_S * NS_PER_S
     for role, id in plan.crew_now(targets):
-        if observed.fills(role, id) or (starting and not observed.was_up(role, id)):
+        if observed.fills(role, id) or (starting and not observed.knows(role, id)):
             continue
         stats = observed.newest_stats(role, id)
         leads = next((ranked for ranked in observed.ids_up(role) if job_of(ranked) == job_of(id)), None)
@@ -194,7 +194,7 @@ def _silent(observed: Observed, now_ns: int) -> Iterator[Found]:
 
 def _lost(observed: Observed, tracked: TrackedTargets, targets: list[str], now_ns: int) -> Iterator[Found]:
     for id in sorted(tracked.lost(now_ns).intersection(targets)):
-        status, pose = observed.status.get(id), observed.poses.get(id)
+        status, pose = observed.told_by_planner(id), observed.poses.get(id)
         since_ns, cell = None, None if pose is None else pose.cell
         if status is not None and status.pose_age_s is not None:
             # When the planner heard the last pose: the same whenever it is asked.

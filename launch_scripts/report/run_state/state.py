@@ -175,7 +175,7 @@ def _lines(
     captures, gaps = observed.counts_by(CAPTURES_OF), gaps_to(observed)
     lines = []
     for id in targets:
-        pose, status = observed.poses.get(id), observed.status.get(id)
+        pose, status = observed.poses.get(id), observed.told_by_planner(id)
         nearest_m = None
         if pose is not None and len(vehicles):
             east_m, south_m = observed.place_m(pose)
@@ -187,13 +187,13 @@ def _lines(
                 rank=observed.rank("planner", id),
                 following=len(vehicles.chasing(id)),
                 nearest_m=nearest_m,
-                growths=None if status is None else status.growths + status.window_growths,
+                growths=observed.of_job("planner", id, "growths", "window_growths"),
                 growth_ms=None if status is None else status.growth_ms,
                 captures=captures.get(id, 0),
                 gap=gaps.get(id),
                 pose_age_s=tracked.age_s(id, now_ns),
                 lost=id in lost,
-                routes_served=None if status is None else status.routes_served,
+                routes_served=observed.of_job("planner", id, "routes_served"),
                 strategy=None if status is None else status.strategy,
                 tracker=None if status is None else status.tracker,
                 full_growth_age_s=None if status is None else status.tree_age_ms / 1e3,

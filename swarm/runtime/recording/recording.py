@@ -41,13 +41,21 @@ from swarm.runtime.stats import Counters
 T = TypeVar("T")
 FAILED = "!"
 """Before the sentence of a StoreError, in the name of what was read."""
+RAISED = "raise "
+"""Before an error by which a service ended, as its last output."""
 _FLUSH_NS = NS_PER_S
+_LONGEST_ERROR = 500
 _PACKAGES = ("terrain-swarm", "numba", "numpy", "msgspec")
 
 
 def there_is(name: str) -> str:
     """The name of the reading which says whether a function or an object is there."""
     return f"there is {name}"
+
+
+def raised_as(error: BaseException) -> str:
+    """An error as an output."""
+    return f"{RAISED}{type(error).__name__}: {error}"[:_LONGEST_ERROR]
 
 
 def digest_of(content: bytes) -> bytes:
@@ -179,7 +187,7 @@ class Recording(Boundary):
         try:
             yield
         except BaseException as error:
-            self.let_out("raise", f"{type(error).__name__}: {error}".encode(), error)
+            self.let_out(raised_as(error), b"")
             self._let_go()
             self._writer.flush()
             raise

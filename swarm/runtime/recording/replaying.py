@@ -16,7 +16,7 @@ from swarm.runtime.recording.boundary import Boundary, BoundaryAnswerer, Boundar
 from swarm.runtime.recording.events import event_of
 from swarm.runtime.recording.loop_figures import set_figures
 from swarm.runtime.recording.outside import Outside, unpack
-from swarm.runtime.recording.recording import FAILED, digest_of, there_is
+from swarm.runtime.recording.recording import FAILED, RAISED, digest_of, raised_as, there_is
 from swarm.runtime.recording.records import (
     CALLS,
     Call,
@@ -146,6 +146,9 @@ class Replaying(Boundary):
         if not self._in_job:
             self.outputs.append(_LetOut(Output(to, len(content), digest_of(content)), what))
 
+    def raised(self, error: BaseException) -> None:
+        self.let_out(raised_as(error), b"")
+
     def submit(self, worker: Worker, tag: str, job: Callable[[], object], post: Post, model_ns: int) -> None:
         self._jobs[self._submitted] = job
         self._submitted += 1
@@ -230,7 +233,7 @@ class _Replay:
 
     def _steps(self) -> Iterator[_Step]:
         """The calls in the recording that are whole: the last one of a process that was killed may not be."""
-        step = _Step(None)
+        step, at = _Step(None), 0
         until_ns = None if self._until_s is None else self._reader.head.started_ns + int(self._until_s * NS_PER_S)
         for record in self._reader:
             if isinstance(record, Read):
@@ -239,7 +242,9 @@ class _Replay:
                 step.outputs += record.outputs
             elif isinstance(record, CALLS):
                 yield step
-                self._progress(self._reader.at)
+                if self._reader.at != at:  # a block further
+                    at = self._reader.at
+                    self._progress(at)
                 if until_ns is not None and record.now_ns > until_ns:
                     self._ended = f"replayed until {self._until_s:g} s"
                     return
@@ -255,29 +260,32 @@ class _Replay:
                 return
             else:
                 raise StoreError(f"{self._reader.path} is damaged: a second head")
-        if any(output.to == "raise" for output in step.outputs):
+        if _was_raised(step):
             yield step
             self._ended = "ended by an error"
 
     def _feed(self, step: _Step) -> Difference | None:
         boundary, call = self._boundary, step.call
         boundary.reads, boundary.outputs = step.reads, []
+        stray: str | None = None
         if call is not None:
             self._seconds = (call.now_ns - self._reader.head.started_ns) / NS_PER_S
         try:
             self._call(call)
         except _NotRecorded as missing:
-            return self._difference(step, None, f"reads {missing}, which is not in the recording there")
+            stray = f"reads {missing}, which is not in the recording there"
         except StoreError as error:
             if not _was_raised(step):
                 raise StoreError(f"event {self._events + 1} of {self._reader.path}: {error}") from error
-            self._raised(error)
+            boundary.raised(error)
         except Exception as error:
-            self._raised(error)
+            boundary.raised(error)
         for recorded, replayed in zip(step.outputs, boundary.outputs, strict=False):
             if recorded != replayed.output:
                 return self._difference(step, recorded, _said(replayed))
         done = min(len(step.outputs), len(boundary.outputs))
+        if stray is not None:
+            return self._difference(step, step.outputs[done] if done < len(step.outputs) else None, stray)
         if len(step.outputs) > done:
             return self._difference(step, step.outputs[done], None)
         if len(boundary.outputs) > done:
@@ -303,15 +311,12 @@ class _Replay:
             case _:
                 service.handle(self._boundary.event_of(call, self._reader.head.started_ns), call.now_ns)
 
-    def _raised(self, error: Exception) -> None:
-        self._boundary.let_out("raise", f"{type(error).__name__}: {error}".encode(), error)
-
     def _difference(self, step: _Step, recorded: Output | None, replayed: str | None) -> Difference:
         return Difference(
             event=self._events + (step.call is not None),
             what=MAKING if step.call is None else described(step.call),
             seconds=self._seconds,
-            recorded=None if recorded is None else f"{recorded.to} ({_size(recorded)})",
+            recorded=None if recorded is None else _named(recorded),
             replayed=replayed,
         )
 
@@ -337,16 +342,18 @@ def described(call: Call) -> str:
 
 
 def _was_raised(step: _Step) -> bool:
-    return any(output.to == "raise" for output in step.outputs)
+    return any(output.to.startswith(RAISED) for output in step.outputs)
 
 
-def _size(output: Output) -> str:
-    return f"{output.length} bytes, digest {output.digest.hex()}"
+def _named(output: Output) -> str:
+    if not output.length:
+        return output.to
+    return f"{output.to} ({output.length} bytes, digest {output.digest.hex()})"
 
 
 def _said(let_out: _LetOut) -> str:
     text = "" if let_out.what is None else f": {let_out.what}"
-    return f"{let_out.output.to} ({_size(let_out.output)}){text}"
+    return f"{_named(let_out.output)}{text}"
 
 
 class _NoBus:

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -99,7 +100,7 @@ def test_values_are_completed_with_what_is_there(newest_run: Path) -> None:
     assert offered("up", "jacksboro", "--only", "p") == ["planner"]
     assert offered("compare", "2026") == ["20260102-000000-bbbb", "20260101-000000-aaaa"]
     assert "LAST" in offered("compare", "")
-    assert offered("report", "export", "L") == ["LAST"]
+    assert offered("export", "L") == ["LAST"]
     assert offered("new", "x.toml", "--walk", "w") == ["waypoints"]
     assert offered("new", "x.toml", "--terrain", "s") == ["synthetic"]
     assert offered("new", "x.toml", "--preset", "h") == ["hiker"]
@@ -107,6 +108,8 @@ def test_values_are_completed_with_what_is_there(newest_run: Path) -> None:
     assert offered("set", "pl") == ["planner.cpu_budget", "planner.push_s"]
     assert offered("plugins", "check", "se") == ["sensor"]
     assert offered("chaos", "--blow", "k") == ["kill"]
+    assert offered("export", "LAST", "--what", "ma") == ["marks"]
+    assert offered("export", "LAST", "--format", "g") == ["geojson", "gpkg"]
     assert offered("terrain", "info", "x.tif", "--elevation-encoding", "terra") == ["terrain-rgb", "terrarium"]
 
 
@@ -178,7 +181,7 @@ def test_doctor_looks_at_everything_and_says_how_it_is(
         ("shared memory", "os.access", lambda path, mode: False, "warning", "mount a tmpfs"),
         ("clock", "_clock_state", lambda: 5, "warning", "not synchronised"),
         ("clock", "_clock_state", lambda: 0, "ok", "synchronised"),
-        ("disk", "shutil.disk_usage", lambda path: (1, 1, 1 << 20), "warning", "are free in"),
+        ("disk", "shutil.disk_usage", lambda path: SimpleNamespace(free=1 << 20), "warning", "are free in"),
     ],
 )
 def test_what_doctor_finds_says_what_to_do(
@@ -191,10 +194,6 @@ def test_what_doctor_finds_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     owner, _, name = replaced.rpartition(".")
-    if name == "disk_usage":
-        import collections
-
-        value = lambda path: collections.namedtuple("Usage", "free")(1 << 20)  # noqa: E731
     monkeypatch.setattr(getattr(machine, owner) if owner else machine, name, value)
     found = machine.CHECKS[about](about, tmp_path)
     assert (found.level, found.about) == (level, about)

@@ -24,7 +24,7 @@ from launch_scripts.monitor.ground.ground_colours import (
     STILL_HIDDEN_SLOW,
     GroundColours,
 )
-from launch_scripts.monitor.ground.layers import COST, KNOWN, PHOTO, legends
+from launch_scripts.monitor.ground.layers import COST, KNOWN, PHOTO, legends, nearest_legend, to_target_legend
 from launch_scripts.monitor.ground.legend import HEIGHT_PX, WIDTH_PX
 from launch_scripts.monitor.ground.map_margin import map_margin, said_heights
 from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, TerrainMesh
@@ -202,9 +202,11 @@ def test_how_high_heights_are_drawn_is_said_and_can_be_set() -> None:
     "groups", [["all"], ["reconnaissance", "haulage-trucks", "fire-fighters", "police-cars", "e"]]
 )
 def test_every_layer_has_a_legend(groups: list[str]) -> None:
-    layers = [PHOTO.entity, COST.entity, KNOWN.entity]
-    pictures = legends(colours_of(flat()), layers, Looks(groups, ["t0"]).legend())
-    assert set(pictures) == {"photo", "cost", "known"}
+    movers = Looks(groups, ["t0"]).legend()
+    pictures = legends(colours_of(flat()), [PHOTO, COST, KNOWN], movers)
+    pictures["to"] = to_target_legend("t0", 5400, movers)
+    pictures["nearest"] = nearest_legend(["t0", "t1"] * 9, movers)
+    assert set(pictures) == {"photo", "cost", "known", "to", "nearest"}
     for picture in pictures.values():
         image = Image.open(io.BytesIO(picture)).convert("RGB")
         assert image.size == (WIDTH_PX, HEIGHT_PX)

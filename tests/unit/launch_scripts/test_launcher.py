@@ -16,7 +16,8 @@ from support.processes import eventually, session_of
 
 from launch_scripts.launcher.child import ExitReason
 from launch_scripts.launcher.local_swarm import Backoff, Ending, LocalSwarm
-from launch_scripts.launcher.up import UpOptions, run_swarm
+from launch_scripts.launcher.up import run_swarm
+from launch_scripts.launcher.up_options import UpOptions
 from launch_scripts.launcher.warm_up import WarmUp
 from launch_scripts.process_table import NICENESS, ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.scenario import GroupConfig, Scenario, StandbyConfig, TargetConfig
@@ -209,6 +210,16 @@ def test_an_error_of_the_users_comes_up_as_its_sentence_and_code(swarms: list[Lo
     assert "Traceback" not in log
 
 
+def test_what_all_roles_wait_for_loads_nothing_slow() -> None:
+    slow = ("numba", "rasterio", "rerun", "scipy", "skimage", "sklearn", "matplotlib")
+    code = (
+        "import sys; from launch_scripts.launcher.warm_roles import MODULES;"
+        "missing = [m for m in MODULES if m not in sys.modules]; assert not missing, missing;"
+        f"found = [m for m in {slow!r} if m in sys.modules]; assert not found, found"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[3], timeout=60)
+
+
 def test_who_does_not_end_when_asked_is_killed_and_named(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,7 +228,7 @@ def test_who_does_not_end_when_asked_is_killed_and_named(
     swarm.start()
     wait_for_line(tmp_path / "order.txt", "+router-0")
     time.sleep(0.3)
-    assert swarm.stop(lambda: time.sleep(0.02)) == ["agent-a0 did not end within 0.5 s and was killed"]
+    assert "agent-a0 did not end within 0.5 s and was killed" in swarm.stop(lambda: time.sleep(0.02))
 
 
 def test_when_the_end_is_asked_for_twice_all_end_at_once_and_only_who_was_killed_is_named(

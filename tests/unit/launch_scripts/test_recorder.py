@@ -352,10 +352,11 @@ def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_i
     assert (first.title, first.lost, first.pose_age_s) == ("t0 (lost 9 s)", True, 9.0)
     assert (second.title, second.lost, second.pose_age_s) == ("t1", False, 1.0)
     lost = "target lost: nobody knows where t0 is; routes lead to where it was, row 0, col 0, since 0 s"
-    assert lost in plain_line(recorder.summary(10 * NS_PER_S))
+    assert lost in plain_line(recorder.summary(10 * NS_PER_S), "small")
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
     hear(recorder, status("t0", 1.0), at_s=60.0)  # the last words of a run that takes long to end
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0"]
+    assert [alarm["about"] for alarm in recorder.report()["alarms"] if alarm["kind"] == "target-lost"] == ["t0"]
     hear(recorder, fleet("a0.1", {"a0-00": (1.0, 1.0)}), at_s=60.0)
     assert recorder.report()["tracking"]["lost_at_end"] == ["t0", "t1"]
     hear(recorder, pose("t0", 100.0, 100.0, 2), pose("t1", 100.0, 100.0, 2), at_s=61.0)

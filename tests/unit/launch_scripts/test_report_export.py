@@ -258,8 +258,8 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(
     (tmp_path / "empty").mkdir()
     for words, complaint in (
         (("nowhere",), "there is no run 'nowhere'"),
-        ((run, "--format", "doc"), "--format is 'doc'; expected one of geojson, gpkg, csv"),
-        ((run, "--what", "mark"), "--what is 'mark'; expected one of tracks, targets, captures, routes, marks"),
+        ((run, "--format", "doc"), "--format: found 'doc'; allowed: 'geojson'"),
+        ((run, "--what", "mark"), "--what: found 'mark'; did you mean 'marks'?"),
         ((run, "--out", run / TRACKS_FILE), "is a file; expected a folder"),
         ((tmp_path / "empty",), "has no tracks.npz: the run has not ended yet"),
         ((run, "--gif"), "has no report.json"),

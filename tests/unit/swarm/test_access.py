@@ -46,6 +46,7 @@ def test_what_only_one_process_knows_only_that_process_says() -> None:
         ("marks", "put", "keeper"),  # what authors that are gone have left
         ("marks", "put", "planner"),
         ("marks", "serve", "keeper"),
+        ("stats", "serve", "keeper"),  # what processes that are gone have counted
         ("pushed-route", "put", "planner"),
         ("pose", "put", "targets"),  # it moves all simulated targets
         ("true-pose", "put", "targets"),

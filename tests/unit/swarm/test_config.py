@@ -56,6 +56,7 @@ def refusal(text: str) -> str:
         ("[[cost.zones]]\nkind = 'road'", ["cost.zones[0]", "missing required field `polygon`"]),
         ("[[groups]]\nvehicles = 0", ["groups[0].vehicles", "found 0", "1 to 100000"]),
         ("[[groups]]\nvehicles = 2.5", ["groups[0].vehicles", "found 2.5, expected a whole number"]),
+        ("[monitor]\nshow_target = 'u'", ["monitor.show_target is 'u', which is no target"]),
         ("[[groups]]\ntargets = ['u']\n[[targets]]\nname = 't'", ["groups: all chases 'u', which is no target"]),
         ("[[groups]]\ntargets = ['t']\n[[targets]]\ncount = 2", ["all chases 't'", "did you mean 't"]),
         ("[[groups]]\n[[groups]]", ["two groups are called 'all'"]),

@@ -1,0 +1,188 @@
+"""`swarm top`: a table of a running swarm which is drawn anew each second."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from launch_scripts.commands.running.observer import RunObserver
+from launch_scripts.launcher.lasting_output import make_output_last
+from launch_scripts.launcher.live_table import fitted
+from launch_scripts.launcher.watcher import ask_run
+from launch_scripts.process_table import ROLES
+from launch_scripts.report.run_state import facts
+from launch_scripts.report.run_state.process_load import ProcessLoad, RoleLoad, by_role
+from launch_scripts.report.run_state.state import RunState
+from swarm.bus.zenoh_bus import open_bus
+from swarm.clock import MonotonicClock
+from swarm.errors import BusError
+from swarm.wire.messages.processes import RunInfo
+
+if TYPE_CHECKING:
+    from swarm.bus.bus import Bus
+    from swarm.config.scenario import NetworkConfig
+
+EVERY_S = 1.0
+_FIRST_S = 2.2
+"""Until the first table: each process tells its figures once a second, and rates need two of them."""
+_ANSWER_WITHIN_S = 10.0
+_SHOWN_ALARMS = 3
+
+
+def top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_json: bool) -> None:
+    """Shows the swarm until Ctrl-C, `q`, or its end. Raises BusError if nobody answers at the beginning."""
+    make_output_last()
+    console = Console(highlight=False)
+    moving = console.is_terminal and not as_json and not once
+    with open_bus(network) as bus, _quietly(), _keys() if moving else contextlib.nullcontext():
+        observer = RunObserver(bus, MonotonicClock(), _members(bus, where))
+        due_s = time.monotonic() + _FIRST_S
+        with Live(console=console, auto_refresh=False) if moving else contextlib.nullcontext() as live:
+            while True:
+                observer.listen(due_s)
+                due_s = max(due_s + EVERY_S, time.monotonic())
+                state, processes = observer.state(), observer.processes()
+                if as_json:
+                    print(json.dumps(fields_of(observer.run, state, processes)), flush=True)
+                else:
+                    shown = table_of(observer.run, state, processes, console, each=each)
+                    if live is None:
+                        console.print(shown)
+                    else:
+                        live.update(shown, refresh=True)
+                if once:
+                    return
+                if observer.over or not observer.answers:
+                    break
+                if moving and _asked_to_end():
+                    return
+    Console(stderr=as_json, highlight=False).print(f"run {observer.run.run_id} is over, or cannot be reached")
+
+
+def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
+    """The run at an instant, at most 80 columns wide."""
+    load = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    load.add_column("process" if each else "role")
+    for label in ("up", "CPU %", "memory", "late/s", "messages/s", "restarts"):
+        load.add_column(label, justify="right")
+    if not each:
+        load.add_column("busiest", no_wrap=True, overflow="ellipsis")
+    lines: Sequence[ProcessLoad | RoleLoad] = processes if each else by_role(processes, ROLES)
+    for line in lines:
+        load.add_row(*_row(line), style=_style(line))
+    title = Text(f"run {run.run_id}, scenario {run.scenario}, {facts.fact('elapsed_s').shown(state)}", style="bold")
+    alarms = (Text(line, style="red") for line in facts.alarm_lines(state, _SHOWN_ALARMS))
+    return fitted(state, [title, *map(Text, facts.lines(state)), *alarms, Text(), load], console)
+
+
+def fields_of(run: RunInfo, state: RunState, processes: list[ProcessLoad]) -> dict[str, Any]:
+    """The same for programs."""
+    return {
+        "run_id": run.run_id,
+        "scenario": run.scenario,
+        **facts.for_report(state),
+        "processes": [
+            {
+                "role": line.role,
+                "id": line.id,
+                "alive": line.alive,
+                "up_s": round(line.up_s, 1),
+                "cpu_percent": _rounded(line.cpu_percent),
+                "rss_bytes": None if line.rss_bytes is None else round(line.rss_bytes),
+                "late_per_s": _rounded(line.late_per_s),
+                "messages_per_s": _rounded(line.messages_per_s),
+                "restarts": line.restarts,
+            }
+            for line in processes
+        ],
+    }
+
+
+def _row(line: ProcessLoad | RoleLoad) -> tuple[str, ...]:
+    told = (
+        _number(line.cpu_percent),
+        "-" if line.rss_bytes is None else f"{line.rss_bytes / (1 << 20):,.0f} MB",
+        _number(line.late_per_s),
+        facts.count(line.messages_per_s),
+        str(line.restarts),
+    )
+    if isinstance(line, ProcessLoad):
+        return line.name, facts.seconds(line.up_s) if line.alive else "gone", *told
+    busiest = f"{line.busiest.name} {line.busiest.cpu_percent:.0f} %" if line.busiest and line.known > 1 else ""
+    return line.role, f"{line.alive} of {line.known}", *told, busiest
+
+
+def _style(line: ProcessLoad | RoleLoad) -> str | None:
+    whole = line.alive if isinstance(line, ProcessLoad) else line.alive == line.known
+    return "yellow" if line.restarts and whole else None if whole else "red"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}" if value >= 10 else f"{value:.1f}"
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 2)
+
+
+def _members(bus: Bus, where: object) -> list[RunInfo]:
+    """The members of the run that most answers belong to. Waits for one that is just starting."""
+    until_s = time.monotonic() + _ANSWER_WITHIN_S
+    while True:
+        found = ask_run(bus, routers=True)
+        told = [info.run_id for info in found if info.run_id]
+        if told:
+            run_id = max(dict.fromkeys(told), key=told.count)
+            return [info for info in found if info.run_id == run_id]
+        if not found or time.monotonic() > until_s:
+            who = "nobody answers" if not found else "only routers answer"
+            raise BusError(f"{who} {where}: is the swarm running?")
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Ctrl-C and SIGTERM end it without a word."""
+
+    def leave(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, leave)
+    with contextlib.suppress(KeyboardInterrupt):
+        yield
+
+
+@contextlib.contextmanager
+def _keys() -> Iterator[None]:
+    """Lets single keys be read, where there is a keyboard."""
+    if not sys.stdin.isatty():
+        yield
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(sys.stdin)
+    try:
+        tty.setcbreak(sys.stdin)
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+
+
+def _asked_to_end() -> bool:
+    """Whether `q` was pressed."""
+    if not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    keys = os.read(sys.stdin.fileno(), 64)
+    return not keys or b"q" in keys.lower()

@@ -1,0 +1,132 @@
+"""What the processes of a run take up and how well they keep time, from what each says of itself. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+from swarm.clock import NS_PER_S
+from swarm.runtime.own_usage import CPU_S, RSS_BYTES
+from swarm.runtime.stats import MESSAGES_PER_S, RESTARTS
+from swarm.wire.messages.processes import Stats
+
+_LEAST_NS = NS_PER_S // 2
+"""Over a shorter time no rate is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessLoad:
+    """One process, over its last second or so; None where it does not say.
+
+    cpu_percent  100 is one core
+    late_per_s   ticks that came later than half a period, or not at all
+    """
+
+    role: str
+    id: str
+    alive: bool
+    up_s: float
+    cpu_percent: float | None
+    rss_bytes: float | None
+    late_per_s: float | None
+    messages_per_s: float | None
+    restarts: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.role}-{self.id}"
+
+
+@dataclass(frozen=True, slots=True)
+class RoleLoad:
+    """All processes of a role: sums, and the worst of lateness.
+
+    busiest  the one that takes most CPU; None if none says
+    """
+
+    role: str
+    alive: int
+    known: int
+    cpu_percent: float | None
+    rss_bytes: float | None
+    late_per_s: float | None
+    messages_per_s: float | None
+    restarts: int
+    busiest: ProcessLoad | None
+
+
+class ProcessLoads:
+    """The last two that every process told of itself."""
+
+    def __init__(self) -> None:
+        self._told: dict[tuple[str, str], tuple[Stats | None, Stats]] = {}
+
+    def hear(self, stats: Stats) -> None:
+        """Take in what a process says; of an earlier life, or older, nothing."""
+        key = (stats.role, stats.id)
+        _, last = self._told.get(key, (None, None))
+        if last is None or stats.incarnation > last.incarnation:
+            self._told[key] = (None, stats)
+        elif stats.incarnation == last.incarnation and stats.stamp_ns - last.stamp_ns >= _LEAST_NS:
+            self._told[key] = (last, stats)
+
+    def lines(self, up: Collection[tuple[str, str]]) -> list[ProcessLoad]:
+        """Every process that has told anything, in order.
+
+        up  (role, id) of those that are alive
+        """
+        return [
+            ProcessLoad(
+                role=role,
+                id=id,
+                alive=(role, id) in up,
+                up_s=max(now.stamp_ns - now.incarnation, 0) / NS_PER_S,
+                cpu_percent=_rate(before, now, "gauges", CPU_S, 100.0),
+                rss_bytes=now.gauges.get(RSS_BYTES),
+                late_per_s=_rate(before, now, "counts", "ticks_late"),
+                messages_per_s=now.gauges.get(MESSAGES_PER_S),
+                restarts=round(now.gauges.get(RESTARTS, 0.0)),
+            )
+            for (role, id), (before, now) in sorted(self._told.items())
+        ]
+
+
+def _rate(before: Stats | None, now: Stats, where: str, name: str, times: float = 1.0) -> float | None:
+    """By how much it grew a second."""
+    earlier = None if before is None else getattr(before, where).get(name)
+    later = getattr(now, where).get(name)
+    if before is None or earlier is None or later is None:
+        return None
+    return float(max(later - earlier, 0) * times * NS_PER_S / (now.stamp_ns - before.stamp_ns))
+
+
+def by_role(lines: Iterable[ProcessLoad], roles: Iterable[str]) -> list[RoleLoad]:
+    """The sums of each role, in the order of `roles`; others after them."""
+    all_lines = list(lines)
+    known = list(dict.fromkeys([*roles, *(line.role for line in all_lines)]))
+    found = []
+    for role in known:
+        mine = [line for line in all_lines if line.role == role]
+        if not mine:
+            continue
+        late = [line.late_per_s for line in mine if line.late_per_s is not None]
+        told = [line for line in mine if line.cpu_percent is not None and line.alive]
+        found.append(
+            RoleLoad(
+                role=role,
+                alive=sum(line.alive for line in mine),
+                known=len(mine),
+                cpu_percent=_sum(line.cpu_percent for line in mine if line.alive),
+                rss_bytes=_sum(line.rss_bytes for line in mine if line.alive),
+                late_per_s=max(late, default=None),
+                messages_per_s=_sum(line.messages_per_s for line in mine if line.alive),
+                restarts=sum(line.restarts for line in mine),
+                busiest=max(told, key=lambda line: line.cpu_percent or 0.0, default=None),
+            )
+        )
+    return found
+
+
+def _sum(values: Iterable[float | None]) -> float | None:
+    told = [value for value in values if value is not None]
+    return sum(told) if told else None

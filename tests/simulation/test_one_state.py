@@ -1,0 +1,313 @@
+"""No fact that is shown in two places differs: table, view, `swarm status` and report, over ten different runs."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from rich.console import Console
+
+from launch_scripts.commands.running.status import StatusWatch, print_status, status_fields
+from launch_scripts.launcher.live_table import live_table
+from launch_scripts.monitor.ground.terrain_mesh import TerrainMesh
+from launch_scripts.monitor.movers.details import _DOES
+from launch_scripts.monitor.service import MonitorService
+from launch_scripts.report.run_state import facts
+from launch_scripts.report.run_state.state import RunState
+from launch_scripts.simulation.node import EPOCH_NS
+from launch_scripts.simulation.simulate import Simulation
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import Event
+from swarm.clock import NS_PER_S
+from swarm.config.agents import added_agent
+from swarm.config.load import parse_scenario
+from swarm.config.scenario import RoverConfig, Scenario, StandbyConfig
+from swarm.runtime.role import RoleSetup
+from swarm.wire.messages.orders import GiveOrder, ZoneOrder
+
+_SIDE = 24
+_BASE = """
+name = "little"
+time_scale = 10
+[terrain]
+source = "synthetic"
+rows = 24
+cols = 24
+resolution_m = 10
+[[targets]]
+name = "t"
+count = 2
+speed_m_per_s = 1
+[[groups]]
+vehicles = 4
+[vehicles]
+per_agent = 2
+sense_range_m = 40
+capture_range_m = 20
+"""
+_HIDDEN = _BASE.replace("speed_m_per_s = 1\n", 'speed_m_per_s = 1\ntracker = "sighted"\n')
+_SHOWN_S = 4.5
+"""When the running swarm is looked at."""
+
+Run = tuple[str, Scenario, Callable[[Simulation], None]]
+
+
+def _scenario(text: str = _BASE, **changes: Any) -> Scenario:
+    return msgspec.structs.replace(parse_scenario(text), **changes)
+
+
+def _crashes(*when: tuple[float, str, bool]) -> Callable[[Simulation], None]:
+    def plan(simulation: Simulation) -> None:
+        for at_s, name, for_good in when:
+            simulation.scheduler.at(
+                EPOCH_NS + int(at_s * NS_PER_S),
+                lambda name=name, for_good=for_good: simulation.crash(name, for_good=for_good),  # type: ignore[misc]
+            )
+
+    return plan
+
+
+def _guest(simulation: Simulation) -> None:
+    guest = added_agent(simulation.scenario, "g", simulation.scenario.groups[0].name, 1, "cell:12,12")
+    simulation.scheduler.at(EPOCH_NS + NS_PER_S, lambda: simulation.add(guest) and None)
+    _crashes((3.5, "agent-g", True))(simulation)
+
+
+def _orders(simulation: Simulation) -> None:
+    simulation.order(0.8, GiveOrder(subject="target", name="x", new=True, cell=12 * _SIDE + 12))
+    simulation.order(2.0, GiveOrder(subject="target", name="t1", off=True))
+    simulation.order(1.5, GiveOrder(subject="vehicle", name="a0-00"))
+
+
+def _zone(simulation: Simulation) -> None:
+    simulation.order(1.0, ZoneOrder(action="add", name="mine", polygon=[(4, 4), (4, 9), (9, 9), (9, 4)]))
+    _crashes((3.0, "agent-a1", True))(simulation)
+
+
+RUNS: list[Run] = [
+    ("plain", _scenario(seed=1), _crashes()),
+    ("hidden targets", _scenario(_HIDDEN, seed=2), _crashes()),
+    ("an agent killed twice", _scenario(seed=3), _crashes((1.5, "agent-a0", False), (3.0, "agent-a0", False))),
+    ("targets process killed", _scenario(seed=4), _crashes((2.5, "targets-0", False))),
+    ("a planner gone for good", _scenario(seed=5), _crashes((2.0, "planner-t1", True))),
+    (
+        "standbys, and a leader gone",
+        _scenario(seed=6, standbys=StandbyConfig(planner=1, targets=1)),
+        _crashes((2.0, "planner-t0", True), (2.2, "targets-0", False)),
+    ),
+    ("a guest that goes", _scenario(seed=7), _guest),
+    ("orders", _scenario(seed=8), _orders),
+    ("a zone, an agent gone for good", _scenario(seed=9), _zone),
+    (
+        "bodies, keeper killed",
+        _scenario(seed=10, rovers=(RoverConfig(name="r", count=2, speed_m_per_s=1.0, radius_m=4.0),)),
+        _crashes((2.0, "keeper-0", False)),
+    ),
+]  # fmt: skip
+
+
+class Logged:
+    """Stands where a recording stream would: keeps the newest of each entity."""
+
+    def __init__(self) -> None:
+        self.newest: dict[str, Any] = {}
+
+    def log(self, path: str, *parts: Any, static: bool = False) -> None:
+        self.newest[path] = parts[0]
+        for part in parts[1:]:
+            for batch in part.as_component_batches():
+                self.newest[f"{path}:details"] = _words(batch)
+
+    def set_time(self, *args: object, **kwargs: object) -> None:
+        pass
+
+    def details(self, *paths: str) -> list[str]:
+        """What people read who point at things of these entities."""
+        return [text for path in paths for text in self.newest.get(f"{path}:details", ())]
+
+    @property
+    def summary(self) -> str:
+        return _words(self.newest["summary"].text)[0]
+
+    def last(self, chart: str) -> list[float]:
+        scalars = self.newest[f"plots/{chart}"].scalars
+        return [float(value) for value in scalars.as_arrow_array().to_pylist()]
+
+
+def _words(batch: Any) -> list[str]:
+    return [str(word) for word in batch.as_arrow_array().to_pylist()]
+
+
+class Watched:
+    """A simulated run with a monitor that watches it from its beginning."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        terrain = terrain_of_pace(np.full((_SIDE, _SIDE), 0.3, np.float32), 10.0)
+        self.simulation = simulation = Simulation(scenario, terrain=terrain)
+        self.logged = Logged()
+        setup = RoleSetup(scenario, simulation.run_id, "monitor", "0", EPOCH_NS + 1, EPOCH_NS)
+        bus = simulation.network.bus("monitor-0", scenario.network.namespace, simulation.authenticator)
+        clock = simulation.scheduler.clock
+
+        def post(event: Event) -> None:
+            self.monitor.handle(event, clock.now_ns())
+
+        self.monitor = MonitorService(
+            setup,
+            terrain,
+            bus,
+            post,
+            self.logged,
+            mesh=TerrainMesh(terrain),  # type: ignore[arg-type]
+        )
+        self.watching = True
+        simulation.scheduler.after(1, self._start)
+
+    def _start(self) -> None:
+        self.monitor.start(self.now_ns)
+        self._tick()
+
+    def _tick(self) -> None:
+        if self.watching:
+            self.monitor.tick(self.now_ns)
+            self.simulation.scheduler.after(NS_PER_S // 4, self._tick)
+
+    @property
+    def now_ns(self) -> int:
+        return self.simulation.scheduler.clock.now_ns()
+
+    def status(self) -> StatusWatch:
+        """Somebody who comes now and asks."""
+        simulation = self.simulation
+        bus = simulation.network.bus("status", simulation.scenario.network.namespace, simulation.authenticator)
+        watch: StatusWatch
+
+        def post(event: Event) -> None:
+            watch.take(event, self.now_ns)
+
+        watch = StatusWatch(bus, post)
+        return watch
+
+    def draw_all(self, now_ns: int) -> None:
+        """One frame in which nothing waits for the next, the figures first."""
+        self.monitor._figures_due_ns = 0
+        self.monitor.tick(now_ns)
+        movers = self.monitor._movers
+        for due in (movers._vehicles._due, movers._targets._due):
+            due._next_ns = dict.fromkeys(due._next_ns, 0)
+        movers._fleets_new = True
+        self.monitor.tick(now_ns)
+
+    def hush(self) -> None:
+        """Nobody says anything any more, and what was said arrives."""
+        for node in self.simulation.nodes.values():
+            node.ticking = False
+        self.simulation.run_until(self.simulation.now_s + 0.6)
+
+
+def shown_in(text: str) -> dict[str, str]:
+    """Label -> what is shown of it, from the lines of any of the four."""
+    labels = sorted((fact.label for fact in facts.FACTS), key=len, reverse=True)
+    found: dict[str, str] = {}
+    for part in re.split(r" {2,}|\n|\*\*, ", text):
+        label = next((label for label in labels if part.startswith(f"{label} ")), None)
+        if label is not None:
+            text = part.removeprefix(f"{label} ").strip()
+            assert found.setdefault(label, text) == text, f"{label} is shown twice in one place and differs"
+    return found
+
+
+def rows_in(text: str) -> list[list[str]]:
+    """The rows of the table of targets."""
+    rows = [[cell.strip() for cell in re.split("[|│┃]", line.strip("|│┃ \n"))] for line in text.splitlines()]
+    labels = [column.label for column in facts.TARGET_FACTS if column.always]
+    heads = [n for n, row in enumerate(rows) if row[: len(labels)] == labels]
+    (head,) = heads
+    body = [row[: len(labels)] for row in rows[head + 1 :] if len(row) >= len(labels)]
+    return [row for row in body if not set(row[0]) <= set("-─")]
+
+
+def alarms_in(text: str, state: RunState) -> set[str]:
+    """Which of the alarms that last are shown."""
+    return {line for line in (alarm.line(state.grid) for alarm in state.standing_alarms) if line in text}
+
+
+def printed(what: Any) -> str:
+    console = Console(file=io.StringIO(), width=250)
+    console.print(what)
+    return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
+@pytest.mark.parametrize(("scenario", "plan"), [run[1:] for run in RUNS], ids=[run[0] for run in RUNS])
+def test_no_fact_that_is_shown_in_two_places_differs(
+    scenario: Scenario, plan: Callable[[Simulation], None]
+) -> None:
+    watched = Watched(scenario)
+    simulation = watched.simulation
+    plan(simulation)
+    simulation.run_until(_SHOWN_S - 1.6)
+    watch = watched.status()
+    simulation.run_until(_SHOWN_S)
+    watched.hush()
+
+    now_ns = watched.now_ns
+    watched.watching = False
+    watched.draw_all(now_ns)
+    state = simulation.recorder.summary(now_ns)
+    status = watch.status(now_ns)
+    assert status is not None
+    console = Console(file=io.StringIO(), width=250)
+    print_status(status, console)
+    texts = {
+        "table": printed(live_table(state, f"time {facts.fact('elapsed_s').shown(state)}")),
+        "view": watched.logged.summary,
+        "status": console.file.getvalue(),  # type: ignore[attr-defined]
+    }
+    values = {"status as JSON": status_fields(status), "report": simulation.recorder.report()}
+
+    shown = {place: shown_in(text) for place, text in texts.items()}
+    labels = {fact.label for name in (("elapsed_s",), *facts.LINES) for fact in map(facts.fact, name)}
+    for place, found in shown.items():
+        assert labels <= found.keys(), place
+    assert shown["view"] == shown["table"]
+    assert shown["status"] == shown["table"]
+    for place, report in values.items():
+        for fact in facts.FACTS:
+            if fact.name == "elapsed_s" and place == "report":  # which ends with the last message
+                continue
+            assert fact.text(report[fact.name]) == shown["table"].get(fact.label, fact.shown(state)), (place, fact)
+    assert rows_in(texts["view"]) == rows_in(texts["table"]) == rows_in(texts["status"])
+    alarms = {place: alarms_in(text, state) for place, text in texts.items()}
+    assert (
+        alarms["view"]
+        == alarms["table"]
+        == alarms["status"]
+        == {alarm.line(state.grid) for alarm in state.standing_alarms}
+    )
+    told = [(each["kind"], each["about"], each["over_s"]) for each in values["report"]["alarms"]]
+    assert told == [(each["kind"], each["about"], each["over_s"]) for each in values["status as JSON"]["alarms"]]
+
+    vehicles = watched.logged.details("world/vehicles", "world/guests")
+    does = {each.name.lower(): sum(f": {words}" in text for text in vehicles) for each, words in _DOES.items()}
+    assert len(vehicles) == state.vehicles
+    assert does == state.states
+    always = [column for column in facts.TARGET_FACTS if column.always]
+    for text in watched.logged.details("world/targets/balls"):
+        title, _, rest = text.partition(": ")
+        line = next(line for line in state.targets if line.title == title)
+        assert rest == ", ".join(f"{column.label} {column.shown(line)}" for column in always[1:])
+
+    # The end: what the recording shows last is what the report says.
+    simulation.finish()
+    watched.monitor.stop(watched.now_ns)
+    report, end = simulation.report(_SHOWN_S), simulation.recorder.summary(watched.now_ns)
+    assert shown_in(watched.logged.summary) == shown_in(printed(live_table(end, f"time {end.elapsed_s:.0f} s")))
+    assert watched.logged.last("states") == [float(number) for number in report["states"].values()]
+    captures, marks = watched.logged.last("captures_and_marks")
+    assert (captures, round(marks * 100)) == (report["captures"], report["marks"])
+    assert sum(row["captures"] for row in report["by_target"].values()) == report["captures"]

@@ -1,0 +1,199 @@
+"""Layers of cost-to-go: whom the monitor asks, and what its pictures show of the answers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from skimage.graph import MCP_Geometric
+from support.monitor_rig import Rig, little_scenario, little_terrain
+
+from launch_scripts.monitor.ground.cost_to_go import (
+    CostSamples,
+    coarse_tree,
+    full_scale_s,
+    nearest_target,
+    spread,
+    unit_of,
+)
+from launch_scripts.monitor.ground.ground_colours import UNREACHED, GroundColours
+from launch_scripts.monitor.ground.target_layers import TargetPictures
+from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
+from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.bus.bus import Asked, Event
+from swarm.clock import NS_PER_S
+from swarm.grid import GridSpec
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.planning import CostReply, PlannerStatus
+from swarm.wire.topics import COST, STATUS
+
+
+def answer(samples: CostSamples, target: str, costs: list[float]) -> CostReply:
+    return CostReply(
+        target=target, incarnation=1, target_cell=0, map_version=0, tree_age_ms=0.0,
+        cost_to_go_s=pack_column(costs, "<f4"),
+    )  # fmt: skip
+
+
+def costs_to(pace: Floats, row: int, col: int) -> Floats:
+    costs: Floats = MCP_Geometric(np.where(np.isfinite(pace), pace, -1)).find_costs([(row, col)])[0]
+    return costs.astype(np.float32)
+
+
+@given(st.integers(1, 3000), st.integers(1, 3000), st.lists(st.sampled_from(["t0", "t1", "t2", "t3"]), max_size=20))
+def test_few_cells_are_asked_about_the_shown_target_most_and_all_others_in_turn(
+    rows: int, cols: int, heard: list[str]
+) -> None:
+    samples = CostSamples(GridSpec(rows, cols, 10.0), "t1")
+    cells = np.array(samples.request.cells)
+    assert 0 < len(cells) <= 64 * 64
+    assert cells.min() >= 0
+    assert cells.max() < rows * cols
+    for target in heard:
+        samples.hear_target(target)
+    asked = [samples.next_target(n * 2 * NS_PER_S) for n in range(1, 17)]
+    assert all(samples.next_target(32 * NS_PER_S + wait) is None for wait in (0, NS_PER_S))
+    if not heard:
+        assert asked == [None] * 16
+        return
+    counts = {target: asked.count(target) for target in set(heard)}
+    assert sum(counts.values()) == 16
+    others = [count for target, count in counts.items() if target != "t1"]
+    if "t1" in counts and others:
+        assert counts["t1"] == 8
+    assert max(others, default=0) - min(others, default=0) <= 1
+
+
+def test_an_answer_that_fits_no_question_is_left_out() -> None:
+    samples = CostSamples(GridSpec(40, 50, 10.0), "t0")
+    right = len(samples.request.cells)
+    assert not samples.hear(answer(samples, "t0", [1.0] * right)), "nobody said that there is such a target"
+    samples.hear_target("t0")
+    assert not samples.hear(answer(samples, "t0", [1.0] * (right - 1)))
+    assert samples.hear(answer(samples, "t0", [1.0] * right))
+    assert samples.hear(answer(samples, "t0", [math.inf] * right)), "a target that nobody reaches any more"
+    assert samples.costs_s == {}
+
+
+@given(st.integers(1, 60), st.integers(1, 60), st.floats(-3, 3), st.floats(-3, 3))
+def test_between_samples_costs_are_linear_where_all_are_known(
+    rows: int, cols: int, down: float, right: float
+) -> None:
+    samples = CostSamples(GridSpec(rows, cols, 10.0), None)
+    plane = (10 + down * samples.rows[:, None] + right * samples.cols).astype(np.float32)
+    at_rows = np.linspace(samples.rows[0], samples.rows[-1], 7, dtype=np.float32)
+    at_cols = np.linspace(samples.cols[0], samples.cols[-1], 5, dtype=np.float32)
+    found = spread(plane, (samples.rows, samples.cols), at_rows, at_cols)
+    np.testing.assert_allclose(found, 10 + down * at_rows[:, None] + right * at_cols, atol=1e-3)
+
+
+def test_beside_ground_without_a_way_costs_are_those_of_the_samples_that_have_one() -> None:
+    costs = np.array([[1, np.inf, np.inf, np.inf]], np.float32)
+    found = spread(costs, (np.array([0]), np.array([0, 4, 8, 12])), np.zeros(1, np.float32), np.arange(13.0))
+    assert found[0, :4].tolist() == [1.0] * 4
+    assert np.isinf(found[0, 4:]).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_coarse_tree_leads_downhill_and_never_through_a_wall(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pace = rng.uniform(0.1, 1, (40, 50)).astype(np.float32)
+    gap, wall = int(rng.integers(0, 40)), int(rng.integers(5, 45))
+    pace[:, wall - 1 : wall + 1] = np.inf
+    pace[gap, wall - 1 : wall + 1] = 0.1
+    rows, cols = np.arange(1, 40, 4), np.arange(1, 50, 4)
+    pace[5, 5] = 0.1
+    costs = costs_to(pace, 5, 5)
+    lethal = np.isinf(pace)
+
+    def lethal_at(at_rows: NDArray[np.intp], at_cols: NDArray[np.intp]) -> NDArray[np.bool_]:
+        found: NDArray[np.bool_] = lethal[at_rows[:, None], at_cols]
+        return found
+
+    ends, through = coarse_tree(costs[rows[:, None], cols], rows, cols, lethal_at)
+    assert len(ends)
+    assert through.max() <= len(rows) * len(cols)
+    for (from_row, from_col), (to_row, to_col) in ends.tolist():
+        assert costs[to_row, to_col] < costs[from_row, from_col]
+        crosses = (from_col < wall) != (to_col < wall)
+        if crosses and from_row == to_row:
+            assert from_row == gap
+
+
+def test_territories_go_by_cost_and_not_by_distance() -> None:
+    pace = np.full((40, 50), 0.1, np.float32)
+    pace[:, 20:22] = np.inf
+    pace[39, 20:22] = 0.1
+    costs = {"a": costs_to(pace, 0, 19), "b": costs_to(pace, 20, 45)}
+    nearest = nearest_target(costs, ["a", "b", "c"])
+    assert nearest[0, 22] == 1, "next to `a`, behind a wall"
+    assert nearest[39, 0] == 0
+    assert nearest[0, 20] == -1
+
+
+@pytest.mark.parametrize(
+    ("seconds", "full", "unit"), [(50, 50, "seconds"), (170, 180, "minutes"), (9000, 9000, "hours")]
+)
+def test_the_scale_ends_at_a_number_of_few_digits(seconds: float, full: float, unit: str) -> None:
+    assert full_scale_s(seconds) == pytest.approx(full)
+    assert unit_of(full)[0] == unit
+
+
+@given(st.floats(0.01, 1e7))
+def test_the_scale_holds_what_it_is_for_and_not_much_more(seconds: float) -> None:
+    assert seconds * 0.999 <= full_scale_s(seconds) <= 1.7 * seconds
+
+
+def pictures(terrain: Terrain) -> tuple[TargetPictures, CostSamples]:
+    mesh = TerrainMesh(terrain)
+    samples = CostSamples(terrain.grid, "t0")
+    samples.hear_target("t0")
+    return TargetPictures(mesh, GroundColours(mesh, terrain, terrain.ground_s_per_m, None), samples), samples
+
+
+def test_the_heat_map_is_bright_at_the_target_and_dark_afar_and_says_where_there_is_no_way() -> None:
+    pace = np.full((60, 80), 0.1, np.float32)
+    pace[:, 70:72] = np.inf
+    drawn, samples = pictures(terrain_of_pace(pace, 10.0))
+    costs = costs_to(pace, 30, 5) * 10
+    samples.hear(answer(samples, "t0", costs.reshape(-1)[samples.request.cells].tolist()))
+    image = drawn.to_target("t0").astype(int)
+    height, width, _ = image.shape
+    near, far, cut_off = (image[height // 2, round(share * width)] for share in (0.06, 0.8, 0.97))
+    assert near.sum() > 1.3 * far.sum()
+    assert np.abs(cut_off / cut_off.sum() - np.array(UNREACHED) / sum(UNREACHED)).max() < 0.03
+    tree = drawn.tree("t0")
+    assert len(tree.lines) == len(tree.radii) > 50
+    assert tree.lines[..., 0].max() < 710, "behind the wall no line begins"
+
+
+def test_the_monitor_asks_the_planner_and_draws_its_answer() -> None:
+    rig = Rig(little_scenario(), little_terrain(), None)
+    asked: list[int] = []
+    planner = rig.bus("planner-t0")
+
+    def post(event: Event) -> None:
+        if isinstance(event, Asked):
+            asked.append(len(event.request.cells))  # type: ignore[attr-defined]
+            costs = [float(cell % 100) for cell in event.request.cells]  # type: ignore[attr-defined]
+            event.answer(answer(rig.service._ground.samples, "t0", costs), target="t0")
+            event.end()
+
+    planner.serve(COST, post, target="t0")
+    rig.run(1)
+    assert asked == [], "before a planner has told its state there is nobody to ask"
+    status = PlannerStatus(
+        target="t0", incarnation=1, stamp_ns=0, strategy="auto", target_cell=0, map_version=0, tree_age_ms=0.0,
+        window=[0, 0, 9, 9], growths=0, window_growths=0, growth_ms=1.0, routes_served=0, following=0,
+        gap_mean=None, gap_p95=None, gap_max=None,
+    )  # fmt: skip
+    planner.publish(STATUS, status, target="t0")
+    rig.run(7)
+    assert len(asked) in (3, 4), "every two seconds"
+    assert set(asked) == {len(rig.service._ground.samples.request.cells)}
+    assert set(rig.service._ground.samples.costs_s) == {"t0"}
+    rig.close()

@@ -1,0 +1,318 @@
+"""`swarm new` and `swarm check`: what the one writes, the other accepts; what the other says, is so."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+import typing
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import typer
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from launch_scripts import ports
+from launch_scripts.check import needs
+from launch_scripts.check.ground import places
+from launch_scripts.cli import main
+from launch_scripts.commands.new import Choices, _asked
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.commented import commented
+from swarm.config.describe import expected, meanings
+from swarm.config.load import load_scenario, parse_scenario, read_scenario
+from swarm.config.scenario import GroupConfig, Preset, Scenario, TargetConfig, Walk
+from swarm.errors import ConfigError
+from vehicle_agent.placement import spawn_cells
+
+ROOMY = needs.Machine(64, None, None)
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(ports, "_taken", lambda host, port: False)
+
+
+def swarm(line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["swarm", *line.split()])
+    code = main()
+    return code, *capsys.readouterr()
+
+
+# --- swarm new --------------------------------------------------------------------------------------------
+
+
+def test_what_new_writes_is_what_was_chosen_and_check_accepts_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(needs, "this_machine", lambda runs: ROOMY)
+    line = "new my.toml --terrain synthetic --vehicles 7 --targets 2 --walk evade --preset hiker --seconds 12"
+    code, out, err = swarm(line, monkeypatch, capsys)
+    assert (code, err) == (0, "")
+    assert "swarm check my.toml" in out
+    scenario = load_scenario(tmp_path / "my.toml")
+    assert (scenario.name, scenario.vehicle_count, scenario.seconds) == ("my", 7, 12.0)
+    assert (scenario.target_ids, scenario.targets[0].walk) == (["t0", "t1"], "evade")
+    assert (scenario.cost.preset, scenario.cost.slope_rule) == ("hiker", "tobler")
+    code, out, err = swarm("check my.toml", monkeypatch, capsys)
+    assert (code, err) == (0, "")
+    assert out.startswith("my.toml can run, no warnings: vehicles 7, targets 2, processes 7")
+
+
+def test_every_key_that_new_writes_stands_below_its_meaning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The meanings are those of which the reference is made."""
+    assert swarm("new my.toml --terrain jacksboro", monkeypatch, capsys)[0] == 0
+    lines = (tmp_path / "my.toml").read_text().splitlines()
+    assert max(map(len, lines)) <= 110
+    comment: list[str] = []
+    keys = 0
+    every = {
+        (key, meaning)
+        for section in (Scenario, *(kind for kind in _sections()))
+        for key, meaning in meanings(section).items()
+    }
+    for line in lines:
+        if line.startswith("#"):
+            comment.append(line[2:])
+            continue
+        if line and not line.startswith("["):
+            keys += 1
+            said = " ".join(comment)
+            key = line.partition(" = ")[0]
+            assert any(said.startswith(f"{meaning}; ") for name, meaning in every if name == key), line
+        comment = []
+    assert keys > 15
+
+
+def _sections() -> list[type[typing.Any]]:
+    return [each for each in vars(sys.modules[Scenario.__module__]).values() if isinstance(each, type(Scenario))]
+
+
+def test_files_are_named_from_where_the_scenario_lies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(needs, "this_machine", lambda runs: ROOMY)
+    (tmp_path / "mine").mkdir()
+    np.savez(tmp_path / "hill.npz", elevation=np.ones((24, 24), np.float32), resolution_m=10.0)
+    assert swarm("new mine/a.toml --terrain hill.npz --vehicles 3", monkeypatch, capsys)[0] == 0
+    assert tomllib.loads((tmp_path / "mine/a.toml").read_text())["terrain"]["source"] == "../hill.npz"
+    code, out, _ = swarm("check mine/a.toml --json", monkeypatch, capsys)
+    assert code == 0
+    assert (json.loads(out)["rows"], json.loads(out)["resolution_m"]) == (24, 10.0)
+
+
+def test_nothing_is_written_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "my.toml").write_text("seed = 5\n")
+    assert swarm("new my.toml", monkeypatch, capsys)[0] == 2
+    assert (tmp_path / "my.toml").read_text() == "seed = 5\n"
+    assert swarm("new other.toml --walk fly", monkeypatch, capsys)[0] == 2
+    assert not (tmp_path / "other.toml").exists()
+
+
+def test_new_asks_for_what_is_not_given_and_again_for_what_cannot_be(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = iter(["jaksboro", "jacksboro", "car", "wheeled", 0, 9, "evade", -1.0, 30.0])
+    asked: list[str] = []
+
+    def ask(question: str, **options: object) -> object:
+        asked.append(question.partition(":")[0].partition(",")[0])
+        return next(answers)
+
+    found = _asked(tmp_path / "my.toml", Choices(targets=4), ask)
+    assert found == Choices("jacksboro", None, "wheeled", 9, 4, "evade", 30.0)
+    assert asked == [
+        *("Terrain", "Terrain", "Class of vehicles", "Class of vehicles", "How many vehicles", "How many vehicles"),
+        *("How targets move", "How many seconds the run lasts", "How many seconds the run lasts"),
+    ]
+    said = capsys.readouterr().err
+    assert "--terrain: no such file" in said
+    assert "did you mean 'jacksboro'?" in said
+    assert "--preset: found 'car'" in said
+    assert "--vehicles: found 0, expected a whole number, 1 to 100000" in said
+    assert "--seconds: found -1.0" in said
+
+
+def test_who_breaks_off_gets_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def leave(*question: object, **options: object) -> object:
+        raise typer.Abort
+
+    monkeypatch.setattr("launch_scripts.commands.new._asked", leave)
+    monkeypatch.setattr("launch_scripts.commands.new.is_terminal", lambda: True)
+    code, _, err = swarm("new my.toml", monkeypatch, capsys)
+    assert (code, err) == (1, "swarm: stopped; nothing is written\n")
+    assert not (tmp_path / "my.toml").exists()
+
+
+FEW = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+@FEW
+@given(
+    st.text("abcXYZ09_.-", min_size=1, max_size=30).filter(lambda name: name[0] not in ".-"),
+    st.sampled_from(typing.get_args(Walk)),
+    st.sampled_from([*typing.get_args(Preset), None]),
+    st.integers(1, 999),
+    st.floats(0.5, 1e6),
+)
+def test_a_commented_scenario_is_read_as_what_was_written(
+    name: str, walk: str, preset: str | None, count: int, seconds: float
+) -> None:
+    chosen: dict[str, typing.Any] = {
+        "name": name,
+        "seconds": seconds,
+        "cost": {} if preset is None else {"preset": preset},
+        "targets": [{"count": count, "walk": walk}, {"name": "other"}],
+        "groups": [{"vehicles": count}],
+    }
+    read = parse_scenario(commented(chosen, f"Made for {name}\nby hand"))
+    assert (read.name, read.seconds, read.cost.preset) == (name, seconds, preset)
+    assert (read.targets[0].count, read.targets[0].walk, read.targets[1].name) == (count, walk, "other")
+    assert read.vehicle_count == count
+
+
+# --- swarm check ------------------------------------------------------------------------------------------
+
+
+def test_check_says_all_at_once_in_the_order_of_weight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(needs, "this_machine", lambda runs: needs.Machine(1, 1 << 20, 1 << 10))
+    (tmp_path / "s.toml").write_text(
+        '[terrain]\nsource = "synthetic"\nrows = 24\ncols = 24\nrelief_m = 1\n'
+        "[[targets]]\nname = 'a'\nstart = [99, 1]\n[[targets]]\nname = 'b'\nstart = [1, 99]\n"
+        "[[groups]]\nvehicles = 20\n[monitor]\ngrpc_port = 7000\nweb_port = 7000\n"
+    )
+    code, out, _ = swarm("check s.toml", monkeypatch, capsys)
+    assert code == 1
+    lines = out.splitlines()
+    begins = [line.partition(" is ")[0].partition(": found")[0] for line in lines]
+    assert begins[0] == "failure: s.toml: monitor.web_port"
+    assert lines[1].startswith("failure: s.toml: targets[0].start is [99, 1], outside the terrain")
+    assert lines[2].startswith("failure: s.toml: targets[1].start is [1, 99], outside the terrain")
+    assert "about" in lines[3]
+    assert "disk" in lines[3]
+    assert lines[4].startswith("warning: s.toml: memory: about ")
+    assert lines[5:] == ["4 failures, 1 warning"]
+    code, out, _ = swarm("check s.toml --json", monkeypatch, capsys)
+    told = json.loads(out)
+    assert (code, told["ok"], len(told["findings"])) == (1, False, len(lines) - 1)
+    assert told["findings"][0]["level"] == "failure"
+
+
+def test_all_keys_that_are_wrong_are_named_each_once() -> None:
+    text = """
+seed = -1
+secnds = 3
+[terrain]
+rodes = 4
+[[cost.zones]]
+kind = "forbiden"
+polygon_m = [[1, 1], [2, 2], [3, 3]]
+[[cost.zones]]
+polygon_m = [[1, 1], [2, 2], [3, 3]]
+[[groups]]
+vehicles = 0
+[[groups]]
+vehicles = 1.5
+start = "heap"
+"""
+    scenario, faults = read_scenario(text, "s.toml")
+    assert scenario is None
+    keys = ["seed", "secnds", "terrain.rodes", "cost.zones[0].kind", "groups[0].vehicles", "groups[1].vehicles"]
+    assert len(faults) == 7
+    for key, fault in zip([*keys, "groups[1].start"], faults, strict=True):
+        assert key in fault, (key, fault)
+
+
+CELLS = st.tuples(st.integers(-1, 6), st.integers(-1, 6))
+
+
+@FEW
+@given(
+    st.lists(st.lists(st.booleans(), min_size=6, max_size=6), min_size=6, max_size=6).filter(
+        lambda rows: any(map(any, rows))
+    ),
+    st.lists(CELLS, max_size=4),
+    st.integers(1, 40),
+)
+def test_check_refuses_a_placement_exactly_if_the_agents_would(
+    open_cells: list[list[bool]], cells: list[tuple[int, int]], vehicles: int
+) -> None:
+    """The law of `swarm check`: an agent's own refusal comes when all processes are up."""
+    vehicles = max(vehicles, len(cells))
+    pace = np.where(np.array(open_cells), np.float32(0.1), np.float32(np.inf)).astype(np.float32)
+    terrain = terrain_of_pace(pace)
+    group = GroupConfig(vehicles=vehicles, cells=tuple(cells))
+    scenario = Scenario(groups=(group,), vehicles=msgspec.structs.replace(Scenario().vehicles, per_agent=100))
+    found = [each for each in places(scenario, terrain, terrain.ground_s_per_m) if each.level == "failure"]
+    try:
+        spawn_cells(scenario, terrain.grid, terrain.pace_s_per_m, terrain.ground_s_per_m)
+        refused = False
+    except ConfigError:
+        refused = True
+    assert bool(found) == refused, found
+
+
+@FEW
+@given(CELLS, st.integers(0, 35))
+def test_a_target_may_start_where_vehicles_can_come_to_it(start: tuple[int, int], wall: int) -> None:
+    pace = np.full((6, 6), 0.1, np.float32)
+    pace[:, 4] = np.inf  # the last column is cut off, and one more wall cuts off no cell of the others
+    pace.reshape(-1)[wall] = np.inf
+    terrain = terrain_of_pace(pace)
+    scenario = Scenario(targets=(TargetConfig(start=start),), groups=(GroupConfig(vehicles=1),))
+    found = [each.sentence for each in places(scenario, terrain, terrain.ground_s_per_m)]
+    row, col = start
+    fine = 0 <= row < 6 and 0 <= col < 4 and np.isfinite(pace[row, col])
+    assert bool(found) == (not fine), found
+
+
+def test_the_rule_of_thumb_is_near_what_was_measured() -> None:
+    """docs/scale-figures.md: CPU and memory of all processes, live, at 5 Hz with ten targets."""
+    for vehicles, cells_a_side, cores, megabytes in ((300, 280, 0.847, 589), (1000, 512, 1.403, 721)):
+        scenario = parse_scenario(
+            f"[[targets]]\ncount = 10\n[[groups]]\nvehicles = {vehicles}\n"
+            f"[vehicles]\ntick_hz = 5\nper_agent = {max(vehicles // 4, 200)}\n"
+        )
+        found = needs.needs_of(scenario, cells_a_side**2)
+        assert found.cores == pytest.approx(cores, rel=0.15)
+        assert found.memory_bytes / 1e6 == pytest.approx(megabytes, rel=0.35)
+
+
+def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:
+    scenario = parse_scenario("[[groups]]\nvehicles = 1000\n[[targets]]\ncount = 10\n[vehicles]\ntick_hz = 5")
+    wanted = needs.needs_of(scenario, 512**2)
+    (found,) = needs.against(scenario, wanted, needs.Machine(2, None, None), Path())
+    assert found.level == "warning"
+    assert "1,000 vehicles and 10 targets at 5 Hz keep about 1.4 cores busy, and there are 2" in found.text
+    assert "ticks will be late" in found.text
+    assert list(needs.against(scenario, wanted, needs.Machine(4, None, None), Path())) == []
+
+
+@pytest.mark.parametrize(
+    ("hint", "words"),
+    [
+        (int, "a whole number"),
+        (float | None, "a number"),
+        (typing.Annotated[float, msgspec.Meta(gt=0, le=1e12)], "a number, more than 0"),
+        (typing.Annotated[int, msgspec.Meta(ge=0, le=9)], "a whole number, 0 to 9"),
+        (typing.Literal["a", "b"], "one of 'a', 'b'"),
+        (tuple[int, int] | str | None, "[a whole number, a whole number] or text in quotes"),
+        (tuple[str, ...], "a list"),
+        (Scenario, "a table"),
+    ],
+)
+def test_a_type_says_what_it_allows(hint: object, words: str) -> None:
+    assert expected(hint) == words

@@ -1,0 +1,120 @@
+"""What processes take up, from what each says of itself, and the table that shows it."""
+
+from __future__ import annotations
+
+import io
+
+from rich.console import Console
+
+from launch_scripts.commands.running.top import fields_of, table_of
+from launch_scripts.launcher.live_table import live_table
+from launch_scripts.process_table import ROLES
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.run_state.process_load import ProcessLoads, by_role
+from launch_scripts.report.run_state.state import RunState
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
+from swarm.grid import GridSpec
+from swarm.liveness import Peer
+from swarm.wire.messages.processes import RunInfo, Stats
+
+
+def told(id: str, at_s: float, cpu_s: float, late: int, life: int = 1, role: str = "agent") -> Stats:
+    gauges = {"cpu_s": cpu_s, "rss_bytes": 90e6, "messages_per_s": 1234.0, "restarts": float(life - 1)}
+    return Stats(
+        role=role, id=id, incarnation=life, stamp_ns=int(at_s * NS_PER_S), counts={"ticks_late": late},
+        gauges=gauges, histograms={},
+    )  # fmt: skip
+
+
+def test_rates_are_of_the_last_two_words_of_one_life() -> None:
+    loads = ProcessLoads()
+    loads.hear(told("a0", 1.0, 5.0, 10))
+    (line,) = loads.lines({("agent", "a0")})
+    assert (line.cpu_percent, line.late_per_s, line.rss_bytes) == (None, None, 90e6)
+    loads.hear(told("a0", 3.0, 6.0, 14))
+    (line,) = loads.lines({("agent", "a0")})
+    assert (line.cpu_percent, line.late_per_s, line.messages_per_s, line.alive) == (50.0, 2.0, 1234.0, True)
+    loads.hear(told("a0", 3.1, 9.0, 99))  # too soon for a rate
+    loads.hear(told("a0", 2.0, 0.0, 0))  # late
+    assert loads.lines({("agent", "a0")}) == [line]
+    loads.hear(told("a0", 9.0, 0.1, 0, life=2))
+    loads.hear(told("a0", 10.0, 7.0, 20))  # the last word of the life before
+    (line,) = loads.lines(())
+    assert (line.cpu_percent, line.restarts, line.alive) == (None, 1, False)
+
+
+def test_a_role_is_the_sum_of_its_living_processes_and_the_worst_of_their_lateness() -> None:
+    loads = ProcessLoads()
+    for id, cpu_s, late in (("a0", 0.5, 3), ("a1", 0.25, 8), ("a2", 1.0, 0)):
+        loads.hear(told(id, 1.0, 0.0, 0))
+        loads.hear(told(id, 2.0, cpu_s, late))
+    loads.hear(told("0", 1.0, 0.0, 0, role="router"))
+    up = {("agent", "a0"), ("agent", "a1"), ("router", "0")}
+    router, agents = by_role(loads.lines(up), ROLES)
+    assert (router.role, router.alive, router.known) == ("router", 1, 1)
+    assert (agents.alive, agents.known, agents.cpu_percent, agents.late_per_s) == (2, 3, 75.0, 8.0)
+    assert agents.busiest is not None
+    assert agents.busiest.name == "agent-a0", "a2 is gone"
+
+
+def large_run() -> tuple[RunState, ProcessLoads, set[tuple[str, str]]]:
+    """Many targets, long words, big numbers, an alarm."""
+    scenario = Scenario(targets=(TargetConfig(name="convoy-", count=20),), groups=(GroupConfig(vehicles=900),))
+    recorder = Recorder(scenario, GridSpec(4000, 4000, 30.0), 0)
+    loads = ProcessLoads()
+    now_ns = 4000 * NS_PER_S
+    up = set()
+    for role, id in [*recorder.model.plan.crew, ("monitor", "0"), ("router", "0")][1:]:
+        recorder.alive(Peer(role, id, 1), True, now_ns)
+        up.add((role, id))
+        for at_s in (1.0, 2.0):
+            loads.hear(told(id, at_s, at_s * 0.9, 3, role=role))
+    return recorder.summary(now_ns), loads, up
+
+
+def drawn(what: object, columns: int, lines: int) -> list[str]:
+    console = Console(file=io.StringIO(), width=columns, height=lines, force_terminal=False)
+    console.print(what)
+    return console.file.getvalue().rstrip("\n").split("\n")  # type: ignore[attr-defined,no-any-return]
+
+
+def test_the_live_table_cuts_nothing_off_at_80_columns_and_24_lines() -> None:
+    state, _, _ = large_run()
+    title = "a long name: 12 of 60 s, live view http://127.0.0.1:39177/"
+    told = (
+        "agent 36/36",
+        "keeper 0/1",
+        "restarts 0",
+        "re-plans",
+        "certified gap",
+        "captures",
+        "processes 57 of 58",
+    )
+    for columns, lines, last in ((80, 24, "more"), (160, 50, "convoy-19")):
+        console = Console(file=io.StringIO(), width=columns, height=lines)
+        shown = drawn(live_table(state, title, console), columns, lines)
+        text = " ".join(" ".join(shown).split())
+        assert len(shown) <= lines, "what is below would scroll away"
+        assert max(map(len, shown)) <= columns
+        assert "…" not in text
+        for words in (*told, title, last):
+            assert words in text, words
+
+
+def test_top_fits_80_columns_too_and_says_the_same_to_programs() -> None:
+    state, loads, up = large_run()
+    run = RunInfo(
+        run_id="20261122-181823-db5a", role="agent", id="a0", incarnation=1, scenario="a-long-name", terrain="t",
+        rows=4000, cols=4000, resolution_m=30.0, started_ns=0,
+    )  # fmt: skip
+    console = Console(file=io.StringIO(), width=80, height=24)
+    lines = loads.lines(up)
+    for each in (False, True):
+        shown = drawn(table_of(run, state, lines, console, each=each), 80, 24)
+        assert max(map(len, shown)) <= 80
+        assert all(label in "\n".join(shown) for label in ("CPU %", "memory", "late/s", "messages/s", "restarts"))
+        assert each or len(shown) <= 24
+    fields = fields_of(run, state, lines)
+    assert len(fields["processes"]) == len(lines)
+    assert {line["cpu_percent"] for line in fields["processes"]} == {90.0}

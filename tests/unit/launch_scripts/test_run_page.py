@@ -1,0 +1,188 @@
+"""`report.html`: the page that a run leaves; and the comparison of runs."""
+
+from __future__ import annotations
+
+import html.parser
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.fake_run import fake_run
+
+from launch_scripts.cli import main
+from launch_scripts.report.recorder import Recorder
+from launch_scripts.report.results.certified_gap import percent
+from launch_scripts.report.write_report import make_report, write_report
+from shared_map.terrain.terrain import terrain_of_pace
+from swarm.config.load import parse_scenario
+from swarm.config.write import scenario_text
+from swarm.liveness import Peer
+from swarm.wire.messages.processes import Note
+
+HOSTILE = "<script>alert(1)</script>\"'><img src=http://example.org/x onerror=alert(2)>"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run's folder with a name in its notes, and in its scenario, that would rather be a script."""
+    folder = tmp_path_factory.mktemp("runs") / "r1"
+    folder.mkdir()
+    scenario = parse_scenario(
+        'name = "little"\nseed = 3\nseconds = 6.0\n[[targets]]\nname = "t"\ncount = 2\n[[groups]]\nvehicles = 4\n'
+        "[[cost.zones]]\nkind = 'forbidden'\npolygon_m = [[100, 100], [400, 100], [400, 300], [100, 300]]\n"
+    )
+    pace = np.full((24, 32), 0.1, np.float32)
+    pace[4:12, 4:16] = np.inf
+    terrain = terrain_of_pace(pace, 25.0)
+    truth = np.array(pace)
+    truth[14:20, 4:30] = np.inf
+    recorder = Recorder(scenario, terrain.grid)
+    for now_ns, told in fake_run(terrain, truth, scenario):
+        if isinstance(told, Peer):
+            recorder.alive(told, True, now_ns)
+        else:
+            recorder.heard(told, {}, now_ns)
+    note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
+    recorder.heard(note, {}, recorder.last_ns or 0)
+    (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
+    write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
+    return folder
+
+
+class Reader(html.parser.HTMLParser):
+    """What a browser would make of a page: its elements, what they would load, its text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.loaded: list[str] = []
+        self.handlers: list[str] = []
+        self.words: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name in ("src", "href", "xlink:href", "data", "action"):
+                self.loaded.append(value or "")
+            if name.startswith("on"):
+                self.handlers.append(name)
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def test_the_page_needs_no_network_and_runs_nothing_that_a_file_or_a_message_said(run: Path) -> None:
+    text = (run / "report.html").read_text()
+    page = Reader(text)
+    assert page.tags.count("script") == 1
+    assert page.handlers == []
+    assert [place for place in page.loaded if not place.startswith(("data:image/", "#"))] == []
+    assert re.findall(r"url\((?!#)[^)]*\)|@import", text) == []
+    assert "default-src 'none'" in text
+    assert "".join(page.words).count(HOSTILE) == 2  # the note and the scenario, as text
+
+
+def test_figures_on_the_page_are_those_of_the_report(run: Path) -> None:
+    report = json.loads((run / "report.json").read_text())
+    words = " ".join(Reader((run / "report.html").read_text()).words)
+    shown = re.sub(r"\s+", " ", words)
+    gap = report["certified_gap"]
+    assert report["captures"] > 0
+    for text in (
+        f"{report['captures']} captures",
+        f"{percent(gap['mean'])} certified gap, mean",
+        f"{percent(gap['p95'])} certified gap, p95",
+        f"{report['marks']} marks",
+    ):
+        assert text in shown, text
+    for section in ("by_target", "by_vehicle"):
+        for id, row in report[section].items():
+            assert re.search(rf"{id} {row['captures']} ", shown), id
+    assert report["ground_shows"] == ["forbidden", "hidden"]
+    assert "forbidden zone" in shown
+
+
+def test_certified_gaps_over_time_are_of_the_routes_begun_in_between(run: Path) -> None:
+    series = json.loads((run / "report.json").read_text())["series"]
+    begun = np.array(series["routes_begun"])
+    told = np.array([np.nan if gap is None else gap for gap in series["certified_gap_mean"]])
+    assert (np.isnan(told) == (begun == 0)).all()
+    whole = json.loads((run / "report.json").read_text())["certified_gap"]
+    assert np.nansum((told - 1) * begun) / begun.sum() == pytest.approx(whole["mean"] - 1, rel=1e-3)
+
+
+def swarm(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    monkeypatch.setattr("sys.argv", ["swarm", *map(str, words)])
+    try:
+        return main()
+    except SystemExit as end:
+        return int(str(end.code or 0))
+
+
+def test_the_page_is_written_again_from_the_folder_alone(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "r1"
+    shutil.copytree(run, copy)
+    before = (copy / "report.html").read_text()
+    (copy / "report.html").unlink()
+    assert swarm(monkeypatch, "report", "r1", "--runs", tmp_path) == 0
+    assert (copy / "report.html").read_text() == before.replace(f"up {run.parent.name}/", f"up {tmp_path.name}/")
+    for content, sentence in ((b"{}", "is damaged"), (b'{"series": 3, "by_vehicle": 7}', "is damaged")):
+        (copy / "report.json").write_bytes(content)
+        assert swarm(monkeypatch, "report", "r1", "--runs", tmp_path) != 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert sentence in line
+
+
+def test_a_moving_picture_has_all_of_the_run_and_few_bytes(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert swarm(monkeypatch, "export", run, "--gif", "--out", tmp_path) == 0
+    (path,) = tmp_path.iterdir()
+    assert path.stat().st_size < 2_000_000
+    with Image.open(path) as gif:
+        frames = [np.asarray(frame) for frame in _frames(gif)]
+    assert 10 < len(frames) <= 90
+    assert max(frames[0].shape) <= 680
+    assert (frames[0] != frames[-1]).any(axis=-1).mean() < 0.5  # the ground stays
+    assert (frames[0] != frames[-1]).any()
+
+
+def _frames(gif: Any) -> Iterator[Any]:
+    for n in range(gif.n_frames):
+        gif.seek(n)
+        yield gif.convert("RGB")
+
+
+def test_a_comparison_says_first_what_makes_runs_unlike_and_draws_each(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, changes in (("r1", {}), ("r2", {"seed": 9}), ("r3", {"terrain": {"digest": "0" * 16}})):
+        shutil.copytree(run, tmp_path / name)
+        report = json.loads((run / "report.json").read_text()) | changes
+        (tmp_path / name / "report.json").write_text(json.dumps(report))
+    words = ("compare", "r1", "r2", "r3", "--runs", tmp_path)
+    for out in ("c.html", "c.png"):
+        assert swarm(monkeypatch, *words, "--out", tmp_path / out) == 0
+        told = capsys.readouterr().out
+        assert "The terrains differ" in told
+        assert "The seeds differ (3, 9, 3)" in told
+    page = Reader((tmp_path / "c.html").read_text())
+    assert page.tags.count("script") == 0
+    assert [place for place in page.loaded if not place.startswith("#")] == []
+    assert "The terrains differ" in "".join(page.words)
+    with Image.open(tmp_path / "c.png") as picture:
+        assert min(picture.size) > 1000
+    assert swarm(monkeypatch, *words, "--out", tmp_path / "c.png") == 2
+    assert "is there already; --force replaces it" in capsys.readouterr().err
+    assert swarm(monkeypatch, "compare", "r1", "r1", "--runs", tmp_path, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["remarks"] == []
