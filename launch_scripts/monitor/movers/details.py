@@ -24,28 +24,22 @@ _DOES = {
     VehicleState.LOST: "goes on without its planner",
     VehicleState.OUTDATED: "goes by an old pose",
 }
-_TO = {
-    state: " to" if state in (VehicleState.WAITING, VehicleState.FOLLOWING) else "; chases"
-    for state in VehicleState
-}
-_TO[VehicleState.ARRIVED] = " at"
 
 
 def vehicle_details(
     vehicles: VehicleColumns, groups: Mapping[str, str], routes: Mapping[str, RouteNow], now_ns: int
 ) -> list[str]:
-    """As `a0-04 of scouts: on its way to t3; route 2 s old, certified gap 1.20%`."""
+    """As `a0-04 to t3: on its way, route 2 s old, certified gap 1.20%; scouts`. What matters comes first: a viewer
+    may cut off the end."""
     target_ids = vehicles.target_ids
     lines = []
     for id, state, target in zip(vehicles.ids, vehicles.states.tolist(), vehicles.targets.tolist(), strict=True):
         chased = target_ids[target] if target >= 0 else None
-        line = f"{id} of {groups.get(id, '?')}: {_DOES[state]}"
-        if chased is not None:
-            line += f"{_TO[state]} {chased}"
-            route = routes.get(id)
-            if route is not None and route.target == chased and state != VehicleState.ARRIVED:
-                line += f"; route {(now_ns - route.begun_ns) / NS_PER_S:.0f} s old, {_proven(route.gap)}"
-        lines.append(line)
+        line = f"{id}: {_DOES[state]}" if chased is None else f"{id} to {chased}: {_DOES[state]}"
+        route = routes.get(id)
+        if route is not None and route.target == chased and state != VehicleState.ARRIVED:
+            line += f", route {(now_ns - route.begun_ns) / NS_PER_S:.0f} s old, {_proven(route.gap)}"
+        lines.append(f"{line}; {groups.get(id, '?')}")
     return lines
 
 

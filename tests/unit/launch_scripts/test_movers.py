@@ -121,17 +121,17 @@ def test_who_points_at_a_vehicle_reads_who_it_is_and_what_it_does() -> None:
     route = RouteNow("t0", np.array([1, 2]), 1.0125, 3 * NS_PER_S)
     groups = dict.fromkeys(vehicles.ids[:3], "all")
     assert vehicle_details(vehicles, groups, {"a0-00": route, "a0-03": route}, 5 * NS_PER_S) == [
-        "a0-00 of all: on its way to t0; route 2 s old, certified gap 1.25%",
-        "a0-01 of all: arrived at t1",
-        "a0-02 of all: stranded",
-        "a0-03 of ?: waits for a route to t1",
+        "a0-00 to t0: on its way, route 2 s old, certified gap 1.25%; all",
+        "a0-01 to t1: arrived; all",
+        "a0-02: stranded; all",
+        "a0-03 to t1: waits for a route; ?",
     ]
 
 
 def test_a_route_without_a_bound_claims_no_gap() -> None:
     vehicles = columns([VehicleState.FOLLOWING], [0], ["t0"])
     (line,) = vehicle_details(vehicles, {}, {"a0-00": RouteNow("t0", np.array([1, 2]))}, NS_PER_S)
-    assert line.endswith("route 1 s old, gap not proven")
+    assert "route 1 s old, gap not proven" in line
 
 
 def test_who_points_at_a_target_reads_how_its_chase_goes() -> None:
