@@ -71,13 +71,16 @@ def places_counted(scenario: Scenario) -> Iterator[Finding]:
             yield failure(f"groups[{n}].cells", f"{many}; name fewer, or raise groups[{n}].vehicles")
 
 
-def network(scenario: Scenario) -> Iterator[Finding]:
-    """Endpoints that cannot meet, and certificates that are missing or are not of one authority."""
+def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
+    """Endpoints that cannot meet, and certificates that are missing or are not of one authority.
+
+    whole  whether all processes are to run here; else those of others need no certificate here
+    """
     net, view = scenario.network, scenario.monitor
     if view.live and view.grpc_port == view.web_port != 0:
         yield failure("monitor.web_port", f"found {view.web_port}, which is monitor.grpc_port too; choose another")
     if net.tls is not None:
-        yield from _certificates(scenario, net.tls)
+        yield from _certificates(scenario, net.tls, whole)
 
 
 def meets(scenario: Scenario) -> Iterator[Finding]:
@@ -93,7 +96,7 @@ def meets(scenario: Scenario) -> Iterator[Finding]:
             )
 
 
-def _certificates(scenario: Scenario, tls: TlsConfig) -> Iterator[Finding]:
+def _certificates(scenario: Scenario, tls: TlsConfig, whole: bool) -> Iterator[Finding]:
     from launch_scripts.deploy.certificates import check_signed
 
     make = "`swarm deploy certs FOLDER --scenario FILE` makes what is missing"
@@ -117,7 +120,7 @@ def _certificates(scenario: Scenario, tls: TlsConfig) -> Iterator[Finding]:
         except SwarmError as error:
             yield failure("network.tls", str(error))
             return
-    if lacking:
+    if lacking and whole:
         several = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
         yield failure("network.tls", f"{tls.certificate} has no certificate of {lacking[0]}{several}; {make}")
 
@@ -135,7 +138,7 @@ def check_start(scenario: Scenario, *, joins: bool) -> None:
     joins  the router is elsewhere, and a keeper hands out what is not here
     """
     # Plug-ins, certificates of single processes and ports are looked at by whoever knows which roles start here.
-    found = [*places_counted(scenario), *network(scenario)]
+    found = [*places_counted(scenario), *network(scenario, whole=False)]
     if not joins:
         found += [*files_named(scenario), *meets(scenario)]
     for finding in found:

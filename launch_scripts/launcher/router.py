@@ -34,12 +34,21 @@ class RouterService:
     """Belongs to no run, so it may be stopped, started again and replaced while runs go on around it.
 
     reopened  asked at each tick: the bus in place of the one before, which is closed; None: it stays
+    restarts  how often its launcher started it again
     """
 
-    def __init__(self, peer: Peer, bus: Bus, post: Post, reopened: Callable[[], Bus | None] = lambda: None) -> None:
+    def __init__(
+        self,
+        peer: Peer,
+        bus: Bus,
+        post: Post,
+        reopened: Callable[[], Bus | None] = lambda: None,
+        *,
+        restarts: int = 0,
+    ) -> None:
         info = RunInfo(
             run_id=NO_RUN, role=peer.role, id=peer.id, incarnation=peer.incarnation, scenario="", terrain="",
-            rows=0, cols=0, resolution_m=0.0, started_ns=peer.incarnation,
+            rows=0, cols=0, resolution_m=0.0, started_ns=peer.incarnation, restarts=restarts,
         )  # fmt: skip
         self._member = Member(info, bus, post)
         self._reopened = reopened
@@ -107,7 +116,7 @@ def run(setup: RoleSetup, stop_when: Callable[[], None] | None = None) -> None:
     admission = Admission(admitting_all(setup.scenario).network)
     try:
         peer = Peer(setup.role, setup.id, setup.incarnation)
-        service = RouterService(peer, admission.bus, inbox.post, admission.reopened)
+        service = RouterService(peer, admission.bus, inbox.post, admission.reopened, restarts=setup.restarts)
         process = Process(service, inbox, clock, tick_hz=2.0)
         process.stop_on_signals()
         if stop_when is not None:

@@ -80,7 +80,10 @@ def read_scenario(
 def _place(reason: str) -> tuple[tuple[str | int, ...], bool]:
     """The key that msgspec complains of, from the root on, and whether it is missing."""
     what, path = located(reason)
-    if named := re.fullmatch(r"Object (contains unknown|missing required) field `(.*)`", what, re.DOTALL):
+    named = re.fullmatch(r"Object (contains unknown|missing required) field `(.*)`", what, re.DOTALL)
+    if -1 in path:  # somewhere in a table whose key is not told: all of that table
+        path = path[: path.index(-1)]
+    elif named:
         return (*path, named[2]), named[1] == "missing required"
     while path and not isinstance(path[-1], str):
         path = path[:-1]

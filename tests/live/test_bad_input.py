@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 @pytest.mark.parametrize(
     ("old", "new", "code", "sentence"),
     [
-        ('source = "synthetic"', 'source = "nowhere.tif"', 3, "nowhere.tif does not exist"),
+        ('source = "synthetic"', 'source = "nowhere.tif"', 3, "terrain.source: no such file"),
         (
             "roads = 4",
             "roads = 0\n[cost]\nmax_slope_deg = 0.0001",
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
             "every cell of the terrain is lethal",
         ),
         ('walk = "waypoints"', "start = [500, 3]", 2, "start is [500, 3], outside the terrain: 96 x 128 cells"),
-        ("vehicles = 12", "vehicles = 12\ncells = [[3, 500]]", 2, "cell is [3, 500], outside the terrain"),
+        ("vehicles = 12", "vehicles = 12\ncells = [[3, 500]]", 2, "cells is [3, 500], outside the terrain"),
     ],
 )
 def test_what_cannot_be_run_is_refused_in_one_sentence(

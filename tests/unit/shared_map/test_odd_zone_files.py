@@ -64,7 +64,8 @@ def test_a_file_that_cannot_be_read_is_refused_in_one_sentence(tmp_path: Path, n
             factor = 2.0 if kind == "factor" else None
             with pytest.raises(TerrainError) as told:
                 painted([ZoneConfig(kind=kind, name="quarry", file=str(path), factor=factor, width_m=3.0)])
-            assert str(told.value).startswith(f"zone 'quarry' {path}") or "cannot read zone" in str(told.value)
+            names = str(told.value).startswith(f"cost.zones[0]: zone 'quarry' {path}")
+            assert names or "cannot read zone" in str(told.value)
             assert "\n" not in str(told.value)
             assert len(str(told.value)) < 500
     zone = ZoneConfig(kind="factor", file=str(tmp_path / "a.geojson"), factor=2.0)
