@@ -96,13 +96,9 @@ def test_top_tells_what_every_process_takes_up(live: LiveSwarm) -> None:
     def told_of_all() -> bool:
         """False while a process has not spoken twice, as on a machine that is busy."""
         top = json.loads(swarm("top", "--runs", live.runs, "--json", "--once").stdout)
-        assert top["processes_well"] == [6, 6]
-        assert len(top["processes"]) == 8, "router and monitor tell theirs, too"
-        rates = [each["cpu_percent"] for each in top["processes"]]
-        return None not in rates and all(
-            each["alive"] and each["rss_bytes"] > 10e6 and rate >= 0
-            for each, rate in zip(top["processes"], rates, strict=True)
-        )
+        each = top["processes"]  # router and monitor tell theirs, too
+        told = len(each) == 8 and None not in [one["cpu_percent"] for one in each]
+        return told and top["processes_well"] == [6, 6] and all(one["rss_bytes"] > 10e6 for one in each)
 
     eventually(told_of_all, 30, "figures of all processes")
 
