@@ -254,6 +254,31 @@ def test_a_damaged_recording_is_said_in_a_sentence(run: Path, data: st.DataObjec
     assert whole == records_of(source)[1 : len(whole) + 1]
 
 
+def test_a_file_that_is_no_recording_is_said_and_the_others_are_replayed(run: Path, tmp_path: Path) -> None:
+    source = next(each.path for each in recordings_of(run, "keeper-0"))
+    (tmp_path / "inputs").mkdir()
+    (tmp_path / "inputs" / source.name).write_bytes(MAGIC + packed(*records_of(source)[:60]))
+    (tmp_path / "inputs" / "agent-a7.5.inputs").touch()  # the disk was full when it began
+    told = CliRunner().invoke(app, ["replay", str(tmp_path)])
+    assert told.exit_code == 1
+    assert "1 of 1 recordings give the same" in told.stdout
+    assert "agent-a7.5.inputs is no recording" in told.stdout.replace("\n", "")
+    assert CliRunner().invoke(app, ["replay", str(tmp_path), "--process", "keeper-0"]).exit_code == 0
+
+
+@pytest.mark.parametrize("field", ["role", "id", "versions"])
+def test_a_recording_names_no_file_elsewhere_and_nothing_that_a_terminal_obeys(
+    field: str, run: Path, tmp_path: Path
+) -> None:
+    head, *whole = records_of(next(each.path for each in recordings_of(run, "keeper-0")))
+    for wrong in ("x/../../y", "\x1b[31m", "a\n", ""):
+        value = {wrong: "\x1b"} if field == "versions" else wrong
+        changed = msgspec.structs.replace(head, **{field: value})
+        (tmp_path / "x.inputs").write_bytes(MAGIC + packed(changed, *whole[:2]))
+        with pytest.raises(StoreError, match="is damaged"):
+            RecordReader(tmp_path / "x.inputs")
+
+
 def test_bytes_that_match_their_checksum_and_are_no_records_are_said_too(run: Path, tmp_path: Path) -> None:
     whole = records_of(next(each.path for each in recordings_of(run, "planner-t0")))
     at = next(n for n, each in enumerate(whole) if isinstance(each, HeardOne))
@@ -304,6 +329,12 @@ def test_what_is_kept_of_a_recording_is_replayed_by_itself(run: Path, tmp_path: 
     assert 2.5 < kept.outcome.seconds <= 3.0
     with pytest.raises(StoreError, match="is there already"):
         keep(recorded, tmp_path, 3.0)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "scenario.toml").write_text("name = 'mine'\n")
+    with pytest.raises(StoreError, match=r"scenario\.toml is there already"):
+        keep(recorded, other, 3.0)
+    assert [each.name for each in other.iterdir()] == ["scenario.toml"]
 
 
 def test_the_command_says_what_is_the_same_and_exits_with_1_where_something_differs(
