@@ -102,7 +102,7 @@ def _plot(out: Path, found: Sequence[LeftRun], tables: Sequence[tuple[str, list[
             write_file(out, compare_page(found, remarks(found), tables).encode())
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, IndexError, ArithmeticError) as error:
         names = ", ".join(run.name for run in found)
         raise StoreError(f"report.json of one of {names} is damaged: {error}") from error
 
