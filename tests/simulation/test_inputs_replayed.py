@@ -44,7 +44,7 @@ from swarm.runtime.recording.records import (
 from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent
 
-SECONDS = 8
+SECONDS = 6
 
 
 def record(folder: Path, seed: int, seconds: float = SECONDS) -> Path:
@@ -75,7 +75,7 @@ def rewritten(run: Path, folder: Path, process: str, changed: list[Record]) -> P
 def test_every_process_of_a_run_with_faults_gives_the_same_when_it_is_replayed(
     seed: int, run: Path, tmp_path: Path
 ) -> None:
-    replayed = list(replay_run(run if seed == 4 else record(tmp_path, seed, 5)))
+    replayed = list(replay_run(run if seed == 4 else record(tmp_path, seed, 3)))
     assert {each.recorded.head.role for each in replayed} == {"keeper", "planner", "targets", "agent"}
     assert seed != 4 or max(each.recorded.life for each in replayed) > 1  # crashes
     for each in replayed:
@@ -107,7 +107,7 @@ def test_what_a_planner_reads_of_clock_kernels_and_shelf_is_an_input(
 
     monkeypatch.setattr(Recording, "function", functions)
     monkeypatch.setattr(Recording, "outside", shelves)
-    simulate(scenario, seconds=4, record_to=tmp_path)
+    simulate(scenario, seconds=3, record_to=tmp_path)
     for process in ("planner-t0", "planner-t1"):
         (replayed,) = replay_run(tmp_path, process)
         assert replayed.same, replayed
@@ -153,7 +153,7 @@ def test_recording_a_run_does_not_change_it(tmp_path: Path) -> None:
     assert logs[0] == logs[1]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.data())
 def test_an_output_that_was_another_is_found_at_its_event(run: Path, data: st.DataObject) -> None:
     process = data.draw(st.sampled_from(["keeper-0", "planner-t0"]))
@@ -302,7 +302,7 @@ def test_a_recording_that_is_full_says_so_and_is_the_same_until_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(records.RecordWriter.__init__, "__defaults__", (5_000,))
-    record(tmp_path, 4, 3)
+    record(tmp_path, 4, 2)
     found = list(replay_run(tmp_path))
     assert any("at most" in each.outcome.ended for each in found if each.outcome is not None)
     assert all(each.same for each in found)
