@@ -37,8 +37,8 @@ _DAMAGES = (
 """What NumPy and zipfile raise on bytes that are no archive of arrays."""
 _MOST_BYTES = 1 << 30
 """Of all arrays, unpacked."""
-_FARTHEST_M = 1e12
-"""No message places anything so far away."""
+_LEAST_M, _FARTHEST_M = 1e-4, 1e12
+"""Cells of no terrain are so small, and no message places anything so far away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +165,13 @@ def _grid(fields: dict[str, Any]) -> GridSpec:
     lengths = (grid.resolution_m, grid.west_m, grid.north_m)
     if not (isinstance(grid.rows, int) and isinstance(grid.cols, int) and isinstance(grid.crs, str)):
         raise ValueError("its grid has no number of cells or no coordinate system")
-    if not all(isinstance(each, int | float) and abs(each) <= _FARTHEST_M for each in lengths):
-        raise ValueError(f"its grid lies farther than {_FARTHEST_M:g} m away, or nowhere")
+    if (
+        not all(isinstance(each, int | float) and abs(each) <= _FARTHEST_M for each in lengths)
+        or lengths[0] < _LEAST_M
+    ):
+        raise ValueError(
+            f"its grid lies farther than {_FARTHEST_M:g} m away, or nowhere, or has cells without a side"
+        )
     return grid
 
 

@@ -287,6 +287,7 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(
         {"routes_steps": np.array([-1])},
         {"grid": np.array('{"rows": 2.5, "cols": 2, "resolution_m": 1.0}')},
         {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": Infinity}')},
+        {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": 1e-300}')},
         {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": 1.0, "crs": 5}')},
     ],
 )
