@@ -11,6 +11,7 @@ from typing import Any
 import typer
 
 from launch_scripts.launcher.progress import progress
+from launch_scripts.launcher.terminal import plain
 from launch_scripts.replay.run import Replayed, keep, other_versions, recordings_of, replay_run, unreadable
 from launch_scripts.report.results.run_folder import find_run
 from swarm.runtime.recording.replaying import Difference
@@ -59,13 +60,8 @@ def replay_one(
     else:
         _explain(rows)
         for sentence in refused:
-            typer.echo(_shown(sentence))
+            typer.echo(plain(sentence))
     return not refused and all(row.same for row in rows)
-
-
-def _shown(text: str) -> str:
-    """A text of a recording, which may be anybody's, without what a terminal would obey."""
-    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
 
 
 def _line(row: Replayed) -> str:
@@ -79,18 +75,18 @@ def _line(row: Replayed) -> str:
     else:
         result = "same" if outcome.ended == "ended as asked" else f"same ({outcome.ended})"
     figures = (f"{outcome.events:,}", f"{outcome.outputs:,}", f"{outcome.seconds:.2f}")
-    return _ROW.format(recorded.process, recorded.life, *figures, _shown(result))
+    return _ROW.format(recorded.process, recorded.life, *figures, plain(result))
 
 
 def _explain(rows: list[Replayed]) -> None:
     for row in rows:
         who = f"{row.recorded.process}, life {row.recorded.life}"
         if row.outcome is None:
-            typer.echo(_shown(f"{who}: {row.why}"))
+            typer.echo(plain(f"{who}: {row.why}"))
         elif row.outcome.difference is not None:
             _show(who, row.outcome.difference)
         elif row.outcome.damaged is not None:
-            typer.echo(_shown(f"{who}: {row.recorded.path} is {row.outcome.damaged}"))
+            typer.echo(plain(f"{who}: {row.recorded.path} is {row.outcome.damaged}"))
     outcomes = [row.outcome for row in rows if row.outcome is not None]
     same = sum(row.same for row in rows)
     typer.echo(
@@ -100,7 +96,7 @@ def _explain(rows: list[Replayed]) -> None:
 
 
 def _show(who: str, difference: Difference) -> None:
-    typer.echo(_shown(f"{who}: event {difference.event:,}, {difference.what}, at {difference.seconds:.2f} s"))
+    typer.echo(plain(f"{who}: event {difference.event:,}, {difference.what}, at {difference.seconds:.2f} s"))
     typer.echo(f"    recorded: {_short(difference.recorded)}")
     typer.echo(f"    replayed: {_short(difference.replayed)}")
 
@@ -108,7 +104,7 @@ def _show(who: str, difference: Difference) -> None:
 def _short(output: str | None) -> str:
     if output is None:
         return "nothing more"
-    return _shown(output) if len(output) <= _SHOWN else f"{_shown(output[:_SHOWN])} ..."
+    return plain(output) if len(output) <= _SHOWN else f"{plain(output[:_SHOWN])} ..."
 
 
 def _told(row: Replayed) -> dict[str, Any]:

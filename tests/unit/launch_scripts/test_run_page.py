@@ -189,6 +189,9 @@ def test_a_comparison_says_first_what_makes_runs_unlike_and_draws_each(
     assert "The terrains differ" in "".join(page.words)
     assert swarm(monkeypatch, *unlike, "--out", tmp_path / "c.html") == 2
     assert "is there already; --force replaces it" in capsys.readouterr().err
+    (tmp_path / "r2" / "report.json").write_text('{"seed": "\\u001b[31m"}')
+    assert swarm(monkeypatch, "compare", "r1", "r2", "--runs", tmp_path) == 0
+    assert "\x1b" not in capsys.readouterr().out
     assert swarm(monkeypatch, "compare", "r1", "r1", "--runs", tmp_path, "--json") == 0
     assert json.loads(capsys.readouterr().out)["remarks"] == []
 
