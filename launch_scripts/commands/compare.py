@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.launcher.terminal import REPORTED
+from launch_scripts.launcher.terminal import REPORTED, plain
 from launch_scripts.report.files import write_file
 from launch_scripts.report.results.compare import (
     LeftRun,
@@ -59,9 +59,9 @@ def _print(found: Sequence[LeftRun], settings: list[Row], made: list[Row], numbe
     for run in found:
         if run.settings is None:
             sentence = f"{run.name} has no {SCENARIO_FILE}: its settings are not known"
-            console.print(Text(sentence, style="yellow"))
+            console.print(Text(plain(sentence), style="yellow"))
     for sentence in remarks(found):
-        console.print(Text(sentence, style="yellow"))
+        console.print(Text(plain(sentence), style="yellow"))
     _show(console, found, "setting", settings)
     if not settings:
         console.print("the scenarios are the same")
@@ -74,9 +74,9 @@ def _show(console: Console, found: Sequence[LeftRun], heading: str, rows: Sequen
         return
     table = Table(heading, pad_edge=False)
     for run in found:
-        table.add_column(Text(run.name), justify="right", overflow="fold")
+        table.add_column(Text(plain(run.name)), justify="right", overflow="fold")
     for label, values in rows:
-        table.add_row(Text(label), *(Text(text_of(label, value)) for value in values))
+        table.add_row(Text(plain(label)), *(Text(plain(text_of(label, value))) for value in values))
     console.print(table)
 
 
@@ -102,7 +102,7 @@ def _plot(out: Path, found: Sequence[LeftRun], tables: Sequence[tuple[str, list[
             write_file(out, compare_page(found, remarks(found), tables).encode())
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
+    except (TypeError, ValueError, KeyError, AttributeError, IndexError, ArithmeticError) as error:
         names = ", ".join(run.name for run in found)
         raise StoreError(f"report.json of one of {names} is damaged: {error}") from error
 

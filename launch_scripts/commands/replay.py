@@ -11,7 +11,8 @@ from typing import Any
 import typer
 
 from launch_scripts.launcher.progress import progress
-from launch_scripts.replay.run import Replayed, keep, other_versions, recordings_of, replay_run
+from launch_scripts.launcher.terminal import plain
+from launch_scripts.replay.run import Replayed, keep, other_versions, recordings_of, replay_run, unreadable
 from launch_scripts.report.results.run_folder import find_run
 from swarm.runtime.recording.replaying import Difference
 
@@ -30,6 +31,7 @@ def replay_one(
         for recorded in recordings_of(folder, process):
             typer.echo(f"kept {keep(recorded, keep_in, until_s)}", err=as_json)
         folder = keep_in
+    refused = unreadable(folder, process)
     others: dict[str, tuple[str, str]] = {}
     for recorded in recordings_of(folder, process):
         others |= other_versions(recorded)
@@ -45,11 +47,21 @@ def replay_one(
                 typer.echo(_line(row))
     if as_json:
         typer.echo(
-            json.dumps({"run": str(folder), "versions": others, "processes": list(map(_told, rows))}, indent=2)
+            json.dumps(
+                {
+                    "run": str(folder),
+                    "versions": others,
+                    "processes": list(map(_told, rows)),
+                    "unreadable": refused,
+                },
+                indent=2,
+            )
         )
     else:
         _explain(rows)
-    return all(row.same for row in rows)
+        for sentence in refused:
+            typer.echo(plain(sentence))
+    return not refused and all(row.same for row in rows)
 
 
 def _line(row: Replayed) -> str:
@@ -63,18 +75,18 @@ def _line(row: Replayed) -> str:
     else:
         result = "same" if outcome.ended == "ended as asked" else f"same ({outcome.ended})"
     figures = (f"{outcome.events:,}", f"{outcome.outputs:,}", f"{outcome.seconds:.2f}")
-    return _ROW.format(recorded.process, recorded.life, *figures, result)
+    return _ROW.format(recorded.process, recorded.life, *figures, plain(result))
 
 
 def _explain(rows: list[Replayed]) -> None:
     for row in rows:
         who = f"{row.recorded.process}, life {row.recorded.life}"
         if row.outcome is None:
-            typer.echo(f"{who}: {row.why}")
+            typer.echo(plain(f"{who}: {row.why}"))
         elif row.outcome.difference is not None:
             _show(who, row.outcome.difference)
         elif row.outcome.damaged is not None:
-            typer.echo(f"{who}: {row.recorded.path} is {row.outcome.damaged}")
+            typer.echo(plain(f"{who}: {row.recorded.path} is {row.outcome.damaged}"))
     outcomes = [row.outcome for row in rows if row.outcome is not None]
     same = sum(row.same for row in rows)
     typer.echo(
@@ -84,7 +96,7 @@ def _explain(rows: list[Replayed]) -> None:
 
 
 def _show(who: str, difference: Difference) -> None:
-    typer.echo(f"{who}: event {difference.event:,}, {difference.what}, at {difference.seconds:.2f} s")
+    typer.echo(plain(f"{who}: event {difference.event:,}, {difference.what}, at {difference.seconds:.2f} s"))
     typer.echo(f"    recorded: {_short(difference.recorded)}")
     typer.echo(f"    replayed: {_short(difference.replayed)}")
 
@@ -92,7 +104,7 @@ def _show(who: str, difference: Difference) -> None:
 def _short(output: str | None) -> str:
     if output is None:
         return "nothing more"
-    return output if len(output) <= _SHOWN else f"{output[:_SHOWN]} ..."
+    return plain(output) if len(output) <= _SHOWN else f"{plain(output[:_SHOWN])} ..."
 
 
 def _told(row: Replayed) -> dict[str, Any]:

@@ -123,3 +123,8 @@ def _plain(value: Any) -> str:
     if isinstance(value, dict):
         return "  ".join(f"{name} {_plain(part)}" for name, part in value.items())
     return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}"
+
+
+def plain(text: str) -> str:
+    """A text of a file that may be anybody's, without what a terminal would obey."""
+    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)

@@ -57,12 +57,11 @@ class Replayed:
 
 
 def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
-    """The recordings in a run's folder, in the order of roles and ids. Raises ConfigError if there is none, and
-    StoreError if one is damaged at its beginning."""
-    found: list[tuple[Head, Path]] = []
-    for path in sorted((folder / FOLDER).glob(f"*{SUFFIX}")):
-        with RecordReader(path) as reader:
-            found.append((reader.head, path))
+    """The recordings in a run's folder, in the order of roles and ids, but for those that `unreadable` says. Raises
+    ConfigError if there is none, and StoreError if none of them can be read."""
+    found, refused = _heads(folder)
+    if refused and not found:
+        raise StoreError(refused[0][1])
     if not found:
         raise ConfigError(
             f"{folder} holds no recorded inputs: `swarm up` and `swarm demo` record them with --record-inputs, "
@@ -81,6 +80,25 @@ def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
     if not recorded:
         raise ConfigError(f"no process {process!r} is recorded in {folder}; there are {', '.join(lives)}")
     return recorded
+
+
+def unreadable(folder: Path, process: str | None = None) -> list[str]:
+    """A sentence for each file in a run's folder that is no recording from its first record on, as where a disk was
+    full when the process began."""
+    return [why for path, why in _heads(folder)[1] if process is None or path.name.startswith(f"{process}.")]
+
+
+def _heads(folder: Path) -> tuple[list[tuple[Head, Path]], list[tuple[Path, str]]]:
+    """Recordings with their heads; files that have none, and why."""
+    found: list[tuple[Head, Path]] = []
+    refused: list[tuple[Path, str]] = []
+    for path in sorted((folder / FOLDER).glob(f"*{SUFFIX}")):
+        try:
+            with RecordReader(path) as reader:
+                found.append((reader.head, path))
+        except StoreError as error:
+            refused.append((path, str(error)))
+    return found, refused
 
 
 def replay_run(
@@ -136,11 +154,13 @@ def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
 def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
     """Copy a recording, up to a time, into a folder which `swarm replay` and a test can replay. Raises
     StoreError."""
-    head = recorded.head
+    head, scenario = recorded.head, folder / SCENARIO_FILE
     path = path_of(folder, head.role, head.id, head.incarnation)
     until_ns = None if until_s is None else head.started_ns + int(until_s * NS_PER_S)
     if path.exists():
         raise StoreError(f"{path} is there already: choose another folder")
+    if scenario.exists() and scenario.read_bytes() != head.scenario.encode():
+        raise StoreError(f"{scenario} is there already, and of another run: choose another folder")
     with RecordReader(recorded.path) as reader:
         writer = RecordWriter(path)
         writer.write(head)
@@ -155,9 +175,9 @@ def keep(recorded: Recorded, folder: Path, until_s: float | None) -> Path:
             raise StoreError(writer.cut)
         if reader.damaged is not None:
             raise StoreError(f"{recorded.path} is {reader.damaged}; keep a part before it with --until")
-        (folder / SCENARIO_FILE).write_text(head.scenario, encoding="utf-8")
+        scenario.write_bytes(head.scenario.encode())
     except OSError as error:
-        raise StoreError(f"cannot write {folder / SCENARIO_FILE}: {error.strerror or error}") from error
+        raise StoreError(f"cannot write {scenario}: {error.strerror or error}") from error
     except StoreError:
         path.unlink(missing_ok=True)
         raise

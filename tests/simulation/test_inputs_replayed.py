@@ -44,7 +44,7 @@ from swarm.runtime.recording.records import (
 from swarm.runtime.role import RoleSetup
 from vehicle_agent.agent import Agent
 
-SECONDS = 8
+SECONDS = 6
 
 
 def record(folder: Path, seed: int, seconds: float = SECONDS) -> Path:
@@ -75,7 +75,7 @@ def rewritten(run: Path, folder: Path, process: str, changed: list[Record]) -> P
 def test_every_process_of_a_run_with_faults_gives_the_same_when_it_is_replayed(
     seed: int, run: Path, tmp_path: Path
 ) -> None:
-    replayed = list(replay_run(run if seed == 4 else record(tmp_path, seed, 5)))
+    replayed = list(replay_run(run if seed == 4 else record(tmp_path, seed, 3)))
     assert {each.recorded.head.role for each in replayed} == {"keeper", "planner", "targets", "agent"}
     assert seed != 4 or max(each.recorded.life for each in replayed) > 1  # crashes
     for each in replayed:
@@ -107,7 +107,7 @@ def test_what_a_planner_reads_of_clock_kernels_and_shelf_is_an_input(
 
     monkeypatch.setattr(Recording, "function", functions)
     monkeypatch.setattr(Recording, "outside", shelves)
-    simulate(scenario, seconds=4, record_to=tmp_path)
+    simulate(scenario, seconds=3, record_to=tmp_path)
     for process in ("planner-t0", "planner-t1"):
         (replayed,) = replay_run(tmp_path, process)
         assert replayed.same, replayed
@@ -153,7 +153,7 @@ def test_recording_a_run_does_not_change_it(tmp_path: Path) -> None:
     assert logs[0] == logs[1]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.data())
 def test_an_output_that_was_another_is_found_at_its_event(run: Path, data: st.DataObject) -> None:
     process = data.draw(st.sampled_from(["keeper-0", "planner-t0"]))
@@ -254,6 +254,31 @@ def test_a_damaged_recording_is_said_in_a_sentence(run: Path, data: st.DataObjec
     assert whole == records_of(source)[1 : len(whole) + 1]
 
 
+def test_a_file_that_is_no_recording_is_said_and_the_others_are_replayed(run: Path, tmp_path: Path) -> None:
+    source = next(each.path for each in recordings_of(run, "keeper-0"))
+    (tmp_path / "inputs").mkdir()
+    (tmp_path / "inputs" / source.name).write_bytes(MAGIC + packed(*records_of(source)[:60]))
+    (tmp_path / "inputs" / "agent-a7.5.inputs").touch()  # the disk was full when it began
+    told = CliRunner().invoke(app, ["replay", str(tmp_path)])
+    assert told.exit_code == 1
+    assert "1 of 1 recordings give the same" in told.stdout
+    assert "agent-a7.5.inputs is no recording" in told.stdout.replace("\n", "")
+    assert CliRunner().invoke(app, ["replay", str(tmp_path), "--process", "keeper-0"]).exit_code == 0
+
+
+@pytest.mark.parametrize("field", ["role", "id", "versions"])
+def test_a_recording_names_no_file_elsewhere_and_nothing_that_a_terminal_obeys(
+    field: str, run: Path, tmp_path: Path
+) -> None:
+    head, *whole = records_of(next(each.path for each in recordings_of(run, "keeper-0")))
+    for wrong in ("x/../../y", "\x1b[31m", "a\n", ""):
+        value = {wrong: "\x1b"} if field == "versions" else wrong
+        changed = msgspec.structs.replace(head, **{field: value})
+        (tmp_path / "x.inputs").write_bytes(MAGIC + packed(changed, *whole[:2]))
+        with pytest.raises(StoreError, match="is damaged"):
+            RecordReader(tmp_path / "x.inputs")
+
+
 def test_bytes_that_match_their_checksum_and_are_no_records_are_said_too(run: Path, tmp_path: Path) -> None:
     whole = records_of(next(each.path for each in recordings_of(run, "planner-t0")))
     at = next(n for n, each in enumerate(whole) if isinstance(each, HeardOne))
@@ -277,7 +302,7 @@ def test_a_recording_that_is_full_says_so_and_is_the_same_until_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(records.RecordWriter.__init__, "__defaults__", (5_000,))
-    record(tmp_path, 4, 3)
+    record(tmp_path, 4, 2)
     found = list(replay_run(tmp_path))
     assert any("at most" in each.outcome.ended for each in found if each.outcome is not None)
     assert all(each.same for each in found)
@@ -304,6 +329,12 @@ def test_what_is_kept_of_a_recording_is_replayed_by_itself(run: Path, tmp_path: 
     assert 2.5 < kept.outcome.seconds <= 3.0
     with pytest.raises(StoreError, match="is there already"):
         keep(recorded, tmp_path, 3.0)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "scenario.toml").write_text("name = 'mine'\n")
+    with pytest.raises(StoreError, match=r"scenario\.toml is there already"):
+        keep(recorded, other, 3.0)
+    assert [each.name for each in other.iterdir()] == ["scenario.toml"]
 
 
 def test_the_command_says_what_is_the_same_and_exits_with_1_where_something_differs(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from launch_scripts.report.files import replacing
 from launch_scripts.report.geo.geo_layers import Feature, Layer, iso_time
 from launch_scripts.report.geo.geo_shapes import Ring, in_degrees
 from shared_map.terrain.places import MapFrame
@@ -20,7 +21,7 @@ def write_csv(path: Path, layer: Layer, frame: MapFrame) -> None:
     where = ["wkt"] if _as_shapes(layer) else ["x_m", "y_m", *(["lat", "lon"] if placed else [])]
     timed = [] if _as_shapes(layer) or "at" in layer.fields else ["at"]
     own = [name for name in layer.fields if not timed or name not in ("begins", "ends", "samples", "length_m")]
-    with path.open("w", encoding="utf-8", newline="") as file:
+    with replacing(path) as half, half.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*own, *timed, *where])
         for feature in layer.features:

@@ -6,6 +6,7 @@ import datetime
 import json
 import math
 import struct
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.report.files import replacing
 from launch_scripts.report.geo.geo_shapes import Ring, areas_of, line, point, polygon
 from launch_scripts.report.geo.track_file import RunTracks, Track
 from shared_map.terrain.places import MapFrame
@@ -214,11 +216,16 @@ def write_layers(path: Path, layers: Iterable[Layer], frame: MapFrame) -> None:
         WRITERS[path.suffix.lower()](path, list(layers), frame)
     except OSError as error:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
+    except ValueError as error:  # JSON has no NaN
+        raise StoreError(
+            f"cannot write {path}: a place has no longitude and latitude in {frame.grid.crs[:60]}; "
+            "write a .gpkg, which is in metres of the map"
+        ) from error
 
 
 def _geojson(path: Path, layers: list[Layer], frame: MapFrame) -> None:
     """RFC 7946: one collection in WGS 84; each feature names its layer. Without a place in metres of the map."""
-    with path.open("w", encoding="utf-8") as file:
+    with replacing(path) as half, half.open("w", encoding="utf-8") as file:
         file.write('{"type": "FeatureCollection", "features": [')
         for number, feature in enumerate(_json_features(layers, frame)):
             file.write((",\n" if number else "\n") + json.dumps(feature, allow_nan=False))
@@ -267,18 +274,20 @@ def _gpkg(path: Path, layers: list[Layer], frame: MapFrame) -> None:
             times = {
                 name: np.full(len(layer.features), 100) for name, kind in layer.fields.items() if kind == "time"
             }
-            raw.write(
-                partial,
-                np.array([_wkb(layer.shape, each) for each in layer.features], object),
-                [_column(layer, name, kind) for name, kind in layer.fields.items()],
-                list(layer.fields),
-                layer=layer.name,
-                driver="GPKG",
-                geometry_type=layer.shape,
-                crs=None if frame.grid.crs == "local" else frame.system.to_wkt(),
-                append=number > 0,
-                gdal_tz_offsets=times,  # 100 is UTC
-            )
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "'crs' was not provided")  # metres from anywhere have none
+                raw.write(
+                    partial,
+                    np.array([_wkb(layer.shape, each) for each in layer.features], object),
+                    [_column(layer, name, kind) for name, kind in layer.fields.items()],
+                    list(layer.fields),
+                    layer=layer.name,
+                    driver="GPKG",
+                    geometry_type=layer.shape,
+                    crs=None if frame.grid.crs == "local" else frame.system.to_wkt(),
+                    append=number > 0,
+                    gdal_tz_offsets=times,  # 100 is UTC
+                )
         partial.replace(path)
     except (DataSourceError, DataLayerError) as error:
         raise StoreError(f"cannot write {path}: {error}") from error

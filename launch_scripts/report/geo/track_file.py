@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import struct
 import zipfile
 import zlib
@@ -22,6 +23,7 @@ from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import StoreError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 from swarm.wire.messages.vehicles import Followed
+from swarm.wire.statements import MarkKind
 
 _MARKS: dict[str, Any] = {"cells": np.int64, "kinds": np.uint8, "paces": np.float32, "stamps_ns": np.int64}
 """Columns of marks."""
@@ -29,11 +31,14 @@ _STEP_ROWS, _STEP_COLS = np.array(STEP_ROW, np.int64), np.array(STEP_COL, np.int
 TRACKS_FILE = "tracks.npz"
 _DAMAGES = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, NotImplementedError, SyntaxError),
+    *(MemoryError, OverflowError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
 )
 """What NumPy and zipfile raise on bytes that are no archive of arrays."""
 _MOST_BYTES = 1 << 30
 """Of all arrays, unpacked."""
+_LEAST_M, _FARTHEST_M = 1e-4, 1e12
+"""Cells of no terrain are so small, and no message places anything so far away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,13 +146,12 @@ def tracks_in(content: bytes, path: Path) -> RunTracks:
         if unpacked > _MOST_BYTES:
             raise ValueError(f"{unpacked} bytes when unpacked, at most {_MOST_BYTES}")
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            grid = GridSpec(**json.loads(str(arrays["grid"])))
+            grid = _grid(json.loads(str(arrays["grid"])))
             vehicles, targets = (_tracks(arrays, name, grid) for name in ("vehicles", "targets"))
+            captured_ns, captured = _whole(arrays, "captures_time_ns"), _on_map(arrays["captures_place_m"], grid)
             captures = [
-                Track(str(id), 0, np.array([time_ns], np.int64), _on_map(place[None], grid))
-                for id, time_ns, place in zip(
-                    *(arrays[f"captures_{column}"] for column in ("id", "time_ns", "place_m")), strict=True
-                )
+                Track(str(id), 0, captured_ns[n : n + 1], captured[n : n + 1])
+                for n, (id, _, _) in enumerate(zip(arrays["captures_id"], captured_ns, captured, strict=True))
             ]
             marks = _marks(arrays, grid)
             routes = _routes(arrays, grid)
@@ -156,28 +160,60 @@ def tracks_in(content: bytes, path: Path) -> RunTracks:
     return RunTracks(grid, vehicles, targets, captures, marks, routes)
 
 
+def _grid(fields: dict[str, Any]) -> GridSpec:
+    grid = GridSpec(**fields)
+    lengths = (grid.resolution_m, grid.west_m, grid.north_m)
+    if not (isinstance(grid.rows, int) and isinstance(grid.cols, int) and isinstance(grid.crs, str)):
+        raise ValueError("its grid has no number of cells or no coordinate system")
+    if (
+        not all(isinstance(each, int | float) and abs(each) <= _FARTHEST_M for each in lengths)
+        or lengths[0] < _LEAST_M
+    ):
+        raise ValueError(
+            f"its grid lies farther than {_FARTHEST_M:g} m away, or nowhere, or has cells without a side"
+        )
+    return grid
+
+
+def _whole(arrays: Any, name: str) -> NDArray[np.int64]:
+    """A column of whole numbers."""
+    array = arrays[name]
+    if array.ndim != 1 or array.dtype.kind not in "iu":
+        raise ValueError(f"{name} is no column of whole numbers")
+    return np.asarray(array, np.int64)
+
+
 def _marks(arrays: Any, grid: GridSpec) -> MarkedCells:
     if "marks_cells" not in arrays:
         return MarkedCells(*(np.zeros(0, kind) for kind in _MARKS.values()))
-    marks = MarkedCells(*(arrays[f"marks_{name}"].astype(kind) for name, kind in _MARKS.items()))
+    cells, stamps_ns = (_whole(arrays, f"marks_{name}") for name in ("cells", "stamps_ns"))
+    kinds, paces = (arrays[f"marks_{name}"].astype(_MARKS[name]) for name in ("kinds", "paces"))
+    marks = MarkedCells(cells, kinds, paces, stamps_ns)
     if any(len(getattr(marks, name)) != len(marks.cells) for name in _MARKS):
         raise ValueError("the columns of marks differ in length")
     if len(marks.cells) and not 0 <= marks.cells.min() <= marks.cells.max() < grid.cells:
         raise ValueError("marks lie outside of the grid")
+    if not np.isfinite(marks.paces[marks.kinds == MarkKind.PACE]).all():
+        raise ValueError("a pace of marks is no number")
     return marks
 
 
 def _routes(arrays: Any, grid: GridSpec) -> list[GivenRoute]:
     if "routes_vehicle" not in arrays:
         return []
+    whole = ("time_ns", "start", "steps")
     names = ("vehicle", "target", "time_ns", "start", "cost_s", "bound_s", "steps")
-    columns = [arrays[f"routes_{name}"].tolist() for name in names]
+    columns = [
+        (_whole(arrays, f"routes_{name}") if name in whole else arrays[f"routes_{name}"]).tolist() for name in names
+    ]
+    if min(columns[-1], default=0) < 0:
+        raise ValueError("a route has less than no steps")
     directions = arrays["routes_directions"].astype(np.uint8)
     routes, at = [], 0
     for vehicle, target, time_ns, start, cost_s, bound_s, steps in zip(*columns, strict=True):
         cells = _walked(grid, start, directions[at : at + steps])
         at += steps
-        if cells is not None:
+        if cells is not None and math.isfinite(cost_s):
             gap = cost_s / bound_s if bound_s > 0 else float("inf")
             routes.append(GivenRoute(vehicle, target, time_ns, cost_s, gap, cells))
     return routes
@@ -195,10 +231,14 @@ def _walked(grid: GridSpec, start: int, directions: NDArray[np.uint8]) -> NDArra
 
 
 def _tracks(arrays: Any, name: str, grid: GridSpec) -> list[Track]:
-    ids, pieces, samples = (arrays[f"{name}_{column}"] for column in ("id", "piece", "samples"))
-    times, places = arrays[f"{name}_time_ns"].astype(np.int64), _on_map(arrays[f"{name}_place_m"], grid)
+    ids, (pieces, samples, times) = (
+        arrays[f"{name}_id"],
+        (_whole(arrays, f"{name}_{column}") for column in ("piece", "samples", "time_ns")),
+    )
+    places = _on_map(arrays[f"{name}_place_m"], grid)
     ends = np.cumsum(samples)
-    if not len(ids) == len(pieces) == len(samples) or (len(ends) and ends[-1] != len(times)):
+    lengths_fit = len(ids) == len(pieces) == len(samples) and len(times) == len(places)
+    if not lengths_fit or (len(ends) and (samples.min() < 0 or ends[-1] != len(times))):
         raise ValueError(f"{name} are not as many as their samples say")
     starts = ends - samples
     return [
@@ -209,4 +249,6 @@ def _tracks(arrays: Any, name: str, grid: GridSpec) -> list[Track]:
 
 def _on_map(place_m: NDArray[Any], grid: GridSpec) -> NDArray[np.float64]:
     east_m, south_m = place_m.astype(np.float64).reshape(-1, 2).T
+    if not (np.abs(place_m) <= _FARTHEST_M).all():  # nor is any of them NaN
+        raise ValueError(f"a place lies farther than {_FARTHEST_M:g} m away, or nowhere")
     return np.stack([grid.west_m + east_m, grid.north_m - south_m], axis=1)

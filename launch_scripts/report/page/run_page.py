@@ -33,7 +33,7 @@ def write_page(folder: Path) -> Path:
     path = folder / PAGE_FILE
     try:
         text = page_of(folder, report)
-    except (TypeError, KeyError, ValueError, AttributeError, IndexError, TemplateError) as error:
+    except (TypeError, KeyError, ValueError, AttributeError, IndexError, ArithmeticError, TemplateError) as error:
         raise StoreError(f"{folder / REPORT_FILE} is damaged: {type(error).__name__}: {error}") from error
     try:
         write_file(path, text.encode())

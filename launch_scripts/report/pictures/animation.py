@@ -68,7 +68,7 @@ def ground_of(folder: Path, tracks: RunTracks) -> Image.Image:
     try:
         with Image.open(io.BytesIO(read_bytes(path, FileKind.RUN))) as picture:
             return picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import json
+import math
 import os
 import platform
 from pathlib import Path
@@ -61,7 +62,9 @@ def ended(folder: Path) -> dict[str, Any]:
     """The facts of `run.json` with the time of now as the run's end, for the report. Empty if there are none."""
     try:
         facts = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
+        return {}
+    if not isinstance(facts, dict):
         return {}
     kept = {name: facts[name] for name in ("began", "versions", "machine") if name in facts}
     return {"began": kept.pop("began", None), "ended": _now(), **kept}
@@ -108,12 +111,28 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not path.exists():
         raise ConfigError(f"{folder} has no {REPORT_FILE}: the run has not ended yet, or its launcher was killed")
     try:
-        report = json.loads(read_text(path, FileKind.RUN))
+        report = json.loads(
+            read_text(path, FileKind.RUN), parse_int=_whole, parse_float=_finite, parse_constant=_finite
+        )
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
     if not isinstance(report, dict):
         raise StoreError(f"{path} is damaged: found no object, expected the figures of a run")
     return report
+
+
+def _whole(text: str) -> int:
+    """A number of a report: sums of counts, of which each fits into 64 bits."""
+    if len(text) > 40:
+        raise ValueError(f"found a whole number of {len(text)} digits")
+    return int(text)
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"found {text[:30]}, expected a number")
+    return value
 
 
 def _version(package: str) -> str | None:

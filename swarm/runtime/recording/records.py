@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
 import msgspec
 
@@ -40,6 +40,11 @@ _HEAD = struct.Struct("<II")
 _LENGTH = struct.Struct("<I")
 
 
+_Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,64}\Z")]
+"""A role or an id: part of a file's name where a recording is copied, and shown to people."""
+_Version = Annotated[str, msgspec.Meta(pattern=r"^[ -~]{0,100}\Z")]
+
+
 class Record(msgspec.Struct, frozen=True, array_like=True):
     """One record. Its tag is a number, because a run has millions of them."""
 
@@ -53,8 +58,8 @@ class Head(Record, frozen=True, tag=0):
     versions  package -> version of what made it
     """
 
-    role: str
-    id: str
+    role: _Name
+    id: _Name
     run_id: str
     incarnation: int
     started_ns: int
@@ -63,7 +68,7 @@ class Head(Record, frozen=True, tag=0):
     added: AddedAgent | None
     restarts: int
     before: bytes
-    versions: dict[str, str]
+    versions: dict[_Version, _Version]
 
 
 class LoopFigures(msgspec.Struct, frozen=True, array_like=True):

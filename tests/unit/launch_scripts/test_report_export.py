@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import dataclasses
 import datetime
+import io
 import json
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -273,3 +275,49 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(
         (tmp_path / f"{number}.npz").write_bytes(broken)
         with pytest.raises(StoreError, match="is damaged"):
             read_tracks(tmp_path / f"{number}.npz")
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"vehicles_place_m": np.full((1, 2), np.nan)},
+        {"vehicles_samples": np.array([-1])},
+        {"vehicles_time_ns": np.array([0.5])},
+        {"marks_paces": np.full(1, np.inf, np.float32)},
+        {"routes_steps": np.array([-1])},
+        {"grid": np.array('{"rows": 2.5, "cols": 2, "resolution_m": 1.0}')},
+        {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": Infinity}')},
+        {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": 1e-300}')},
+        {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": 1.0, "crs": 5}')},
+    ],
+)
+def test_tracks_that_nothing_could_have_left_are_damaged(changed: dict[str, NDArray[Any]]) -> None:
+    one: dict[str, NDArray[Any]] = {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": 1.0}')}
+    for name in ("vehicles", "targets"):
+        one |= {
+            f"{name}_id": np.array(["a"]),
+            f"{name}_time_ns": np.array([5]),
+            f"{name}_place_m": np.zeros((1, 2)),
+        }
+        one |= {f"{name}_piece": np.array([0]), f"{name}_samples": np.array([1])}
+    one |= {"captures_id": np.array(["a"]), "captures_time_ns": np.array([5]), "captures_place_m": np.zeros((1, 2))}
+    one |= {"marks_cells": np.array([3]), "marks_kinds": np.array([int(MarkKind.PACE)]), "marks_paces": np.ones(1)}
+    one |= {"marks_stamps_ns": np.array([5]), "routes_vehicle": np.array(["a"]), "routes_target": np.array(["a"])}
+    one |= {"routes_time_ns": np.array([5]), "routes_start": np.array([0]), "routes_cost_s": np.ones(1)}
+    one |= {"routes_bound_s": np.ones(1), "routes_steps": np.array([1]), "routes_directions": np.array([2])}
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **one)
+    assert len(tracks_in(file.getvalue(), Path("t.npz")).routes) == 1
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **{**one, **changed})
+    with pytest.raises(StoreError, match=r"^t\.npz is damaged: "):
+        tracks_in(file.getvalue(), Path("t.npz"))
+
+
+def test_an_array_that_claims_more_memory_than_there_is_is_damage() -> None:
+    file, header = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<i8", "fortran_order": False, "shape": (10**15,)})
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("grid.npy", header.getvalue())
+    with pytest.raises(StoreError, match="is damaged"):
+        tracks_in(file.getvalue(), Path("t.npz"))

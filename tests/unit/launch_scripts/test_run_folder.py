@@ -16,7 +16,7 @@ from launch_scripts.launcher.options import SCENARIOS, find_scenario
 from launch_scripts.report.recorder import Recorder
 from launch_scripts.report.results.result_tables import TABLES
 from launch_scripts.report.results.results import Driven
-from launch_scripts.report.results.run_folder import begin_run, find_run, point_last
+from launch_scripts.report.results.run_folder import begin_run, ended, find_run, point_last, read_report
 from launch_scripts.report.vehicle_columns import VehicleColumns
 from launch_scripts.report.write_report import make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
@@ -24,7 +24,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, StoreError
 from swarm.liveness import Peer
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -141,6 +141,19 @@ def test_a_folder_called_last_is_left_alone_and_said(tmp_path: Path) -> None:
     (tmp_path / "r").mkdir()
     assert "still means another run" in str(point_last(tmp_path / "r"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["LAST", "r"]
+
+
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999", "9" * 400])
+def test_a_number_that_no_report_has_is_damage(number: str, tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text(f'{{"seconds": {number}}}')
+    with pytest.raises(StoreError, match=r"report\.json is damaged"):
+        read_report(tmp_path)
+
+
+@pytest.mark.parametrize("facts", ["5", "[1]", "[" * 100_000, "no JSON"])
+def test_a_damaged_file_of_a_run_does_not_keep_it_from_its_report(facts: str, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text(facts)
+    assert ended(tmp_path) == {}
 
 
 def test_a_run_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:

@@ -51,7 +51,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
     recorder.heard(note, {}, recorder.last_ns or 0)
     (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
-    write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
+    with pytest.MonkeyPatch.context() as patched:  # the picture is another test's
+        patched.setattr("launch_scripts.report.pictures.picture.save_picture", lambda half, *_: half.touch())
+        write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
     return folder
 
 
@@ -163,26 +165,41 @@ def _frames(gif: Any) -> Iterator[Any]:
         yield gif.convert("RGB")
 
 
-def test_a_comparison_says_first_what_makes_runs_unlike_and_draws_each(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def unlike(run: Path, tmp_path: Path) -> tuple[object, ...]:
+    """What compares three runs which differ in seed and terrain."""
     for name, changes in (("r1", {}), ("r2", {"seed": 9}), ("r3", {"terrain": {"digest": "0" * 16}})):
-        shutil.copytree(run, tmp_path / name)
+        (tmp_path / name).mkdir()
         report = json.loads((run / "report.json").read_text()) | changes
         (tmp_path / name / "report.json").write_text(json.dumps(report))
-    words = ("compare", "r1", "r2", "r3", "--runs", tmp_path)
-    for out in ("c.html", "c.png"):
-        assert swarm(monkeypatch, *words, "--out", tmp_path / out) == 0
-        told = capsys.readouterr().out
-        assert "The terrains differ" in told
-        assert "The seeds differ (3, 9, 3)" in told
+        shutil.copy(run / "scenario.toml", tmp_path / name)
+    return "compare", "r1", "r2", "r3", "--runs", tmp_path
+
+
+def test_a_comparison_says_first_what_makes_runs_unlike_and_draws_each(
+    unlike: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert swarm(monkeypatch, *unlike, "--out", tmp_path / "c.html") == 0
+    told = capsys.readouterr().out
+    assert "The terrains differ" in told
+    assert "The seeds differ (3, 9, 3)" in told
     page = Reader((tmp_path / "c.html").read_text())
     assert page.tags.count("script") == 0
     assert [place for place in page.loaded if not place.startswith("#")] == []
     assert "The terrains differ" in "".join(page.words)
-    with Image.open(tmp_path / "c.png") as picture:
-        assert min(picture.size) > 1000
-    assert swarm(monkeypatch, *words, "--out", tmp_path / "c.png") == 2
+    assert swarm(monkeypatch, *unlike, "--out", tmp_path / "c.html") == 2
     assert "is there already; --force replaces it" in capsys.readouterr().err
+    (tmp_path / "r2" / "report.json").write_text('{"seed": "\\u001b[31m"}')
+    assert swarm(monkeypatch, "compare", "r1", "r2", "--runs", tmp_path) == 0
+    assert "\x1b" not in capsys.readouterr().out
     assert swarm(monkeypatch, "compare", "r1", "r1", "--runs", tmp_path, "--json") == 0
     assert json.loads(capsys.readouterr().out)["remarks"] == []
+
+
+@pytest.mark.thorough  # the plots are those of the page
+def test_a_comparison_is_a_picture_too(
+    unlike: tuple[object, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert swarm(monkeypatch, *unlike, "--out", tmp_path / "c.png") == 0
+    with Image.open(tmp_path / "c.png") as picture:
+        assert min(picture.size) > 1000
