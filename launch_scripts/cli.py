@@ -307,6 +307,7 @@ def main() -> int:
     """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
     # A shell starts what it puts into the background deaf to SIGINT. Whoever sends it means it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    _fill_streams()
     try:
         try:
             code = command().main(prog_name="swarm", standalone_mode=False)
@@ -337,6 +338,18 @@ def main() -> int:
         print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
         return StoreError.exit_code
     return code if isinstance(code, int) else 0
+
+
+def _fill_streams() -> None:
+    """Let standard streams that were closed lead nowhere: the next file that is opened would take their place, and
+    get what is printed."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
 
 
 def _leave_output() -> None:

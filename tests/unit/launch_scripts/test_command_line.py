@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -220,3 +221,13 @@ def test_a_check_that_fails_itself_is_a_warning(tmp_path: Path, monkeypatch: pyt
     assert [tuple(found) for found in machine.examine(tmp_path)] == [
         ("warning", "clock", "cannot be looked at: no such thing here")
     ]
+
+
+def test_a_command_whose_streams_are_closed_ends_without_a_traceback() -> None:
+    run = "import sys; from launch_scripts.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$0" -c "$1" demmo <&- >&-', sys.executable, run], stderr=subprocess.PIPE
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"swarm: ")
+    assert done.stderr.count(b"\n") == 1
