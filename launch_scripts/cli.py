@@ -306,7 +306,13 @@ def command() -> Any:
 def main() -> int:
     """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
     # A shell starts what it puts into the background deaf to SIGINT. Whoever sends it means it.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    asked: list[int] = []
+
+    def stop(number: int, frame: object) -> None:
+        asked.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, stop)
     _fill_streams()
     try:
         try:
@@ -323,11 +329,6 @@ def main() -> int:
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
-    except SystemExit as leaving:
-        # So typer leaves at a Ctrl-C, without a word.
-        if isinstance(getattr(leaving.__context__, "__cause__", None), KeyboardInterrupt):
-            print("swarm: stopped", file=sys.stderr)
-        raise
     except BrokenPipeError:
         _leave_output()
         return 0
@@ -337,6 +338,10 @@ def main() -> int:
         _leave_output()
         print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
         return StoreError.exit_code
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    if asked and code == 128 + signal.SIGINT:  # typer leaves at a Ctrl-C without a word, with this code
+        print("swarm: stopped", file=sys.stderr)
     return code if isinstance(code, int) else 0
 
 
