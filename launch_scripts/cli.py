@@ -306,7 +306,14 @@ def command() -> Any:
 def main() -> int:
     """Runs the command. A SwarmError becomes one sentence and its exit code, never a traceback."""
     # A shell starts what it puts into the background deaf to SIGINT. Whoever sends it means it.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    asked: list[int] = []
+
+    def stop(number: int, frame: object) -> None:
+        asked.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, stop)
+    _fill_streams()
     try:
         try:
             code = command().main(prog_name="swarm", standalone_mode=False)
@@ -322,11 +329,6 @@ def main() -> int:
     except SwarmError as error:
         print(f"swarm: {error}", file=sys.stderr)
         return error.exit_code
-    except SystemExit as leaving:
-        # So typer leaves at a Ctrl-C, without a word.
-        if isinstance(getattr(leaving.__context__, "__cause__", None), KeyboardInterrupt):
-            print("swarm: stopped", file=sys.stderr)
-        raise
     except BrokenPipeError:
         _leave_output()
         return 0
@@ -336,7 +338,23 @@ def main() -> int:
         _leave_output()
         print(f"swarm: cannot write the output: {error.strerror}", file=sys.stderr)
         return StoreError.exit_code
+    except KeyboardInterrupt:
+        code = 128 + signal.SIGINT
+    if asked and code == 128 + signal.SIGINT:  # typer leaves at a Ctrl-C without a word, with this code
+        print("swarm: stopped", file=sys.stderr)
     return code if isinstance(code, int) else 0
+
+
+def _fill_streams() -> None:
+    """Let standard streams that were closed lead nowhere: the next file that is opened would take their place, and
+    get what is printed."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", encoding="utf-8"))
 
 
 def _leave_output() -> None:

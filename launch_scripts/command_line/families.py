@@ -11,11 +11,10 @@ import typer
 from typer.core import TyperGroup
 
 from launch_scripts.command_line.usage import kind_of
+from swarm.config.describe import UNBOUNDED
 
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 """Of every command: what it inherits from the first."""
-_UNBOUNDED = 2**53
-"""A limit that a number in JSON has; it says nothing to a reader."""
 
 
 def worded(command: Any) -> Any:
@@ -60,7 +59,7 @@ def _range_of(param: Any) -> str | None:
     low, high = getattr(param, "min", None), getattr(param, "max", None)
     if low is None and high is None:
         return None
-    if high is None or high >= _UNBOUNDED:
+    if high is None or high >= UNBOUNDED:
         return f"at least {low:g}"
     return f"at most {high:g}" if low is None else f"{low:g} to {high:g}"
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from typer.exceptions import TyperException
 
+from swarm.config.describe import UNBOUNDED
 from swarm.config.explain import choice, nearest
 from swarm.config.input_files import shown
 
@@ -58,6 +59,8 @@ def _expected(param: Any, cause: Sequence[Any]) -> str:
     kinds = [kind_of(param)]
     words = {float: "a number", int: "a whole number"}.get(kinds[0], "something else")
     lowest, highest = getattr(param, "min", None), getattr(param, "max", None)
+    if highest is not None and highest >= UNBOUNDED:
+        highest, words = None, f"{words}, smaller than {highest:g}"
     if lowest is not None and highest is not None:
         return f"{words}, {lowest:g} to {highest:.12g}"
     if lowest is not None:

@@ -9,7 +9,14 @@ import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.panels import PREPARE
-from launch_scripts.commands.shared_options import AsJson, PortOption, PresetOption, Runs, ScenarioArgument
+from launch_scripts.commands.shared_options import (
+    MOST_SECONDS,
+    AsJson,
+    PortOption,
+    PresetOption,
+    Runs,
+    ScenarioArgument,
+)
 
 app = typer.Typer()
 
@@ -32,7 +39,9 @@ def new(
             autocompletion=complete.words("swarm.config.scenario", "Walk"),
         ),
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="How long the run lasts.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, max=MOST_SECONDS, help="How long the run lasts.")
+    ] = None,
 ) -> None:
     """Write a scenario of your own, with a comment for every key. On a terminal it asks for what is not given.
 

@@ -11,7 +11,7 @@ import typer
 
 from launch_scripts.command_line import complete
 from launch_scripts.command_line.panels import RUN
-from launch_scripts.commands.shared_options import AsJson, Runs
+from launch_scripts.commands.shared_options import MOST_SECONDS, AsJson, Runs
 
 if TYPE_CHECKING:
     from launch_scripts.chaos.siege import SiegeOptions
@@ -30,7 +30,9 @@ def chaos(
             autocompletion=complete.scenarios,
         ),
     ] = "besieged",
-    seconds: Annotated[float | None, typer.Option(min=1, help="End after so many seconds.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=1, max=MOST_SECONDS, help="End after so many seconds.")
+    ] = None,
     messages: Annotated[
         int | None, typer.Option(min=1, help="End once so many hostile messages have been sent.")
     ] = None,

@@ -221,7 +221,7 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     if as_json:
         typer.echo(json.dumps(status_fields(told), indent=2))
     else:
-        print_status(told, Console())
+        print_status(told, Console(markup=False))
 
 
 @app.command(rich_help_panel=_PANEL)

@@ -16,6 +16,8 @@ from swarm.ranks import HIGHEST_RANK
 if TYPE_CHECKING:
     from swarm.config.scenario import TlsConfig
 
+MOST_SECONDS = 1e12
+"""As the scenario has it."""
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
@@ -103,9 +105,10 @@ class Tls:
 class RunOptions:
     """How a run is started and shown: `swarm demo` and `swarm up`."""
 
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="How long the run lasts once the swarm is up.")] = (
-        None
-    )
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.1, max=MOST_SECONDS, help="How long the run lasts once the swarm is up."),
+    ] = None
     seed: Annotated[int | None, typer.Option(min=0, max=2**53, help="Seed of everything random.")] = None
     runs: Runs = Path("runs")
     port: PortOption = None

@@ -62,4 +62,6 @@ def plain_line(state: RunState, title: str) -> str:
 
 
 def _style(line: TargetLine) -> str | None:
-    return "red" if not line.planner_up else "yellow" if line.lost else None
+    if not line.planner_up:
+        return None if line.starting else "red"
+    return "yellow" if line.lost else None

@@ -12,6 +12,7 @@ import msgspec
 
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_name
+from launch_scripts.report.results.run_folder import LAST
 from shared_map.terrain.importers.sources import is_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
@@ -178,6 +179,8 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
         check_id("run id", run_id)
     except ValueError as error:
         raise ConfigError(str(error)) from error
+    if run_id in (".", "..", LAST):
+        raise ConfigError(f"run id {run_id!r} means another folder of {runs}; choose another")
     run_dir = runs / run_id
     try:
         run_dir.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -75,10 +76,17 @@ def run_swarm(options: UpOptions) -> int:
     if not options.joins:
         check_ports(options.scenario, options.roles)
     run_id, started_ns = run_id_of(options)
+    is_new = not options.joins and options.is_whole and options.run_id is None  # else others may use its folder
     run_dir = make_run_dir(options.runs, run_id)
     log_to(run_dir / "launcher.log")
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
-    return _Run(options, run_id, run_dir, started_ns).run()
+    run = None
+    try:
+        run = _Run(options, run_id, run_dir, started_ns)
+        return run.run()
+    finally:
+        if is_new and (run is None or not run.begun):
+            shutil.rmtree(run_dir, ignore_errors=True)
 
 
 def _counted(processes: Mapping[str, tuple[int, int]]) -> str:
@@ -104,13 +112,13 @@ class _Run:
         self._preparing = "preparing the terrain"
         self._swarm = LocalSwarm(table_of(options), self._setup_of, run_dir)
         self._disk = DiskWatch(run_dir)
+        self.begun = False
+        """Whether all that can be refused before a process starts has been accepted."""
         self._startup_s: float | None = None
         self._up_at_s: float | None = None
         """When the swarm was whole, on the run's clock."""
         self._recorder: Recorder | None = None
         self._metrics = self._open_metrics()
-        for sentence in begin_run(run_dir, options.scenario, run_id):
-            self._terminal.say(sentence, "yellow")
 
     def _open_metrics(self) -> LauncherMetrics | None:
         if self._options.metrics_port is None:
@@ -141,6 +149,9 @@ class _Run:
             return self._stopped_early()
         self._terrain, self._truth = prepared
         check_places(self._scenario, self._terrain, self._truth)
+        self.begun = True
+        for sentence in begin_run(self._run_dir, self._options.scenario, self._run_id):
+            self._terminal.say(sentence, "yellow")
         log.info("terrain is ready")
         self._wait(lambda: self._warm_up.progress, self._warm_up.done)
         if self._stop_asked:

@@ -42,6 +42,11 @@ class UpOptions:
     record_inputs: bool = False
     metrics_port: int | None = None
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing but a router may be lacking."""
+        return set(ROLES[1:]) <= set(self.roles) and self.rank is None
+
 
 def table_of(options: UpOptions) -> list[ProcessSpec]:
     """The processes to start here. Raises ConfigError if there are none."""
@@ -61,9 +66,8 @@ def run_id_of(options: UpOptions) -> tuple[str, int | None]:
     if options.joins:
         log_to(None)  # it may have to wait, and says so
         found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
-    whole = set(ROLES[1:]) <= set(options.roles) and options.rank is None
     run_id = options.run_id
-    if run_id is None and whole:
+    if run_id is None and options.is_whole:
         run_id = new_run_id()
     elif run_id is None:
         run_id = found[0].run_id if found else common_run_id(options.scenario)

@@ -14,7 +14,7 @@ import msgspec
 
 _ROW = re.compile(r"(\w+(?:, \w+)*) {2,}(\S.*)")
 _WORDS = {str: "text in quotes", int: "a whole number", float: "a number", bool: "true or false"}
-_UNBOUNDED = 1e12
+UNBOUNDED = 1e12
 """Limits beyond this keep numbers finite; they say nothing to a reader."""
 
 
@@ -76,7 +76,7 @@ def _bounds(meta: msgspec.Meta) -> list[str]:
 
 
 def _limit(bound: float | None) -> str | None:
-    return None if bound is None or abs(bound) >= _UNBOUNDED else f"{bound:.12g}"
+    return None if bound is None or abs(bound) >= UNBOUNDED else f"{bound:.12g}"
 
 
 def bare(hint: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from swarm.config.describe import bare, expected, hints_of, is_section, is_several, section_in
+from swarm.config.describe import UNBOUNDED, bare, expected, hints_of, is_section, is_several, section_in
 from swarm.config.input_files import shown
 
 _LONGEST_LIST = 200
@@ -118,6 +118,8 @@ def choice(word: str, allowed: Sequence[str], lead: str = " allowed: ") -> str:
 
 def _unknown(key: str, name: str, section: Any, root: type) -> str:
     allowed = list(getattr(section, "__struct_fields__", ()))
+    if not key.isprintable():  # it might steer the terminal
+        key = repr(key)
     where = f"{name}.{key}" if name else key
     if len(key) > 60:
         return f"unknown key {name + '.' if name else ''}{key[:57]}...; {_allowed_here(allowed)}"
@@ -176,7 +178,15 @@ def _wrong(name: str, value: Any, hint: Any) -> str:
     if typing.get_origin(kind) is dict and isinstance(value, dict):
         return f"{name}: found the key {_refused_key(value, typing.get_args(kind)[0])}"
     found = "" if isinstance(value, dict | list) and value else f" found {shown(value)},"
-    return f"{name}:{found} expected {expected(hint)}{_meant_number(key, value, kind)}"
+    return f"{name}:{found} expected {expected(hint)}{_finite(value)}{_meant_number(key, value, kind)}"
+
+
+def _finite(value: Any) -> str:
+    """What `expected` leaves out, as nobody meets it by chance: that there is a largest number."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or abs(value) < UNBOUNDED:
+        return "" if value == value else ", which nan is not"
+    return ", and not as large as that"
 
 
 def _meant_number(key: str, value: Any, kind: Any) -> str:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import datetime
 import re
 import stat
 import tomllib
@@ -158,7 +159,11 @@ def parse_toml(text: str, source: str, error: type[SwarmError]) -> dict[str, Any
 
 
 def shown(value: object) -> str:
-    """A value as a sentence quotes it, however large it is."""
+    """A value as a sentence quotes it, however large it is; dates and truth as TOML writes them."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, datetime.date | datetime.time):
+        return value.isoformat()
     if isinstance(value, int) and value.bit_length() > 256:
         return f"a whole number of {value.bit_length()} bits"
     text = repr(value)

@@ -10,6 +10,8 @@ _PLACED = re.compile(r"(.*) \(at (?:line (\d+), column (\d+)|end of document)\)"
 def toml_mistake(reason: str, text: str) -> str:
     """One sentence from the parser's message, such as "Invalid value (at line 2, column 8)"."""
     placed = _PLACED.fullmatch(reason)
+    if placed is None and reason.startswith("Exceeds the limit"):
+        return "it holds a number of thousands of digits"
     if placed is None:
         return reason[:1].lower() + reason[1:]
     what = placed[1]

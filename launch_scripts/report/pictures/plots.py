@@ -81,7 +81,7 @@ def _states(axes: Axes, report: Report) -> bool:
     if not series["t_s"] or None in counts.values():
         return False
     shown = {state: np.array(row) for state, row in counts.items() if any(row)}
-    if not shown:  # no vehicle was heard of
+    if not shown:  # stopped before any vehicle had told where it is
         return False
     axes.stackplot(series["t_s"], *shown.values(), colors=[STATE_COLOURS[state] for state in shown], linewidth=0)
     axes.set_ylim(0, max(sum(shown.values(), np.zeros(1)).max(), 1))

@@ -166,10 +166,15 @@ def _told(observed: Observed) -> Iterator[Found]:
                 yield alarm, True
 
 
+def starts(observed: Observed, plan: RunPlan, role: str, id: str, now_ns: int) -> bool:
+    """Whether a process has not been seen yet, and has not been waited for for long."""
+    began = plan.started_ns is not None and now_ns - plan.started_ns < STARTING_S * NS_PER_S
+    return began and not observed.knows(role, id)
+
+
 def _missing(observed: Observed, plan: RunPlan, targets: list[str], now_ns: int) -> Iterator[Found]:
-    starting = plan.started_ns is not None and now_ns - plan.started_ns < STARTING_S * NS_PER_S
     for role, id in plan.crew_now(targets):
-        if observed.fills(role, id) or (starting and not observed.knows(role, id)):
+        if observed.fills(role, id) or starts(observed, plan, role, id, now_ns):
             continue
         stats = observed.newest_stats(role, id)
         leads = next((ranked for ranked in observed.ids_up(role) if job_of(ranked) == job_of(id)), None)

@@ -9,7 +9,7 @@ import numpy as np
 
 from launch_scripts.report.latest_state import Observed
 from launch_scripts.report.results.certified_gap import CertifiedGap, certified_gap, gaps_to
-from launch_scripts.report.run_state.alarms import Alarm, alarms_of
+from launch_scripts.report.run_state.alarms import Alarm, alarms_of, starts
 from launch_scripts.report.run_state.plan import RunPlan
 from launch_scripts.report.tracked_targets import TrackedTargets
 from launch_scripts.report.vehicle_columns import VehicleColumns
@@ -25,6 +25,7 @@ class TargetLine:
     """One target at an instant. What of it is shown, and how, `facts.TARGET_FACTS` says.
 
     planner_up  whether its planner or one of its standbys is as it should be
+    starting    whether none of them has been seen yet, in the first seconds of a run
     rank        of the planner that leads; 0 unless a standby does
     nearest_m   distance of the nearest vehicle
     pose_age_s  time since its last pose; None before the first
@@ -45,6 +46,7 @@ class TargetLine:
     routes_served: int | None = None
     strategy: str | None = None
     tracker: str | None = None
+    starting: bool = False
 
     @property
     def title(self) -> str:
@@ -53,7 +55,7 @@ class TargetLine:
         if self.lost:
             unusual.append("lost" if self.pose_age_s is None else f"lost {self.pose_age_s:.0f} s")
         if not self.planner_up:
-            unusual.append("planner down")
+            unusual.append("planner starting" if self.starting else "planner down")
         elif self.rank:
             unusual.append(f"standby {self.rank}")
         return f"{self.id} ({', '.join(unusual)})" if unusual else self.id
@@ -116,7 +118,7 @@ def state_of(
     vehicles = observed.driven(set(crew), now_ns)
     total = observed.total
     well = [observed.fills(role, id) for role, id in crew]
-    lines = _lines(observed, tracked, targets, vehicles, now_ns)
+    lines = _lines(observed, tracked, plan, targets, vehicles, now_ns)
     return RunState(
         elapsed_s=0.0 if began_ns is None else max(now_ns - began_ns, 0) / NS_PER_S,
         targets=lines,
@@ -168,7 +170,12 @@ def _beside(observed: Observed, crew: Collection[tuple[str, str]]) -> dict[str, 
 
 
 def _lines(
-    observed: Observed, tracked: TrackedTargets, targets: Sequence[str], vehicles: VehicleColumns, now_ns: int
+    observed: Observed,
+    tracked: TrackedTargets,
+    plan: RunPlan,
+    targets: Sequence[str],
+    vehicles: VehicleColumns,
+    now_ns: int,
 ) -> tuple[TargetLine, ...]:
     lost = tracked.lost(now_ns)
     captures, gaps = observed.counts_by(CAPTURES_OF), gaps_to(observed)
@@ -187,7 +194,8 @@ def _lines(
                 following=len(vehicles.chasing(id)),
                 nearest_m=nearest_m,
                 growths=observed.of_job("planner", id, "growths", "window_growths"),
-                growth_ms=None if status is None else status.growth_ms,
+                # It is 0 as long as no tree has been grown.
+                growth_ms=None if status is None else status.growth_ms or None,
                 captures=captures.get(id, 0),
                 gap=gaps.get(id),
                 pose_age_s=tracked.age_s(id, now_ns),
@@ -195,6 +203,7 @@ def _lines(
                 routes_served=observed.of_job("planner", id, "routes_served"),
                 strategy=None if status is None else status.strategy,
                 tracker=None if status is None else status.tracker,
+                starting=starts(observed, plan, "planner", id, now_ns),
             )
         )
     return tuple(lines)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 import pytest
 from typer._completion_classes import BashComplete  # what a shell asks: there is no public name for it
 
+from launch_scripts import cli
 from launch_scripts.check import machine
 from launch_scripts.cli import command, main
 from launch_scripts.launcher.options import find_scenario
@@ -220,3 +223,34 @@ def test_a_check_that_fails_itself_is_a_warning(tmp_path: Path, monkeypatch: pyt
     assert [tuple(found) for found in machine.examine(tmp_path)] == [
         ("warning", "clock", "cannot be looked at: no such thing here")
     ]
+
+
+def test_a_command_whose_streams_are_closed_ends_without_a_traceback() -> None:
+    run = "import sys; from launch_scripts.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$0" -c "$1" demmo <&- >&-', sys.executable, run], stderr=subprocess.PIPE
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"swarm: ")
+    assert done.stderr.count(b"\n") == 1
+
+
+@pytest.mark.parametrize("code", [130, None])
+def test_a_ctrl_c_before_anything_runs_is_answered_with_a_word(
+    code: int | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(**options: object) -> int:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            if code is None:
+                raise
+        return 130
+
+    monkeypatch.setattr(cli, "command", lambda: SimpleNamespace(main=interrupted))
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        assert main() == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr().err == "swarm: stopped\n"

@@ -313,6 +313,9 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
         return Beat(role="planner", id=id, incarnation=1, ready=True, leads=leads)
 
     assert titles() == ["t0 (planner down)", "t1 (planner down)"]
+    begun = Recorder(standing_by, GRID, 1)
+    assert begun.summary(29 * NS_PER_S).targets[0].title == "t0 (planner starting)"
+    assert begun.summary(31 * NS_PER_S).targets[0].title == "t0 (planner down)"
     for id in ("t0", "t0.r1", "t1"):
         recorder.alive(Peer("planner", id, 1), True, 0)
     hear(recorder, beat("t0", True), beat("t0.r1", False), beat("t1", True))

@@ -10,13 +10,14 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.text import Text
 from numpy.typing import NDArray
 from support.fake_run import fake_run
 
 from launch_scripts.report.geo.track_file import packed_tracks, tracks_in
-from launch_scripts.report.pictures import picture
+from launch_scripts.report.pictures import picture, plots
 from launch_scripts.report.pictures.ground_picture import ground_picture
 from launch_scripts.report.pictures.hillshade import hillshade
 from launch_scripts.report.pictures.plot_style import STYLE
@@ -28,6 +29,7 @@ from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.liveness import Peer
+from swarm.wire.messages.vehicles import VehicleState
 
 ASKED_FOR = (
     *(
@@ -146,6 +148,9 @@ def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(scenario: Scenar
     write_report(tmp_path, report, recorder, terrain)
     assert report["captures"] is None
     assert (tmp_path / "report.png").stat().st_size > 10_000
+    # It may be stopped before a vehicle has told where it is.
+    series = {"t_s": [0.5], **{state.name.lower(): [0] for state in VehicleState}}
+    assert not plots._states(Figure().add_subplot(), {"series": series})
 
 
 def test_a_folder_that_cannot_be_written_is_one_clear_sentence(scenario: Scenario, tmp_path: Path) -> None:
