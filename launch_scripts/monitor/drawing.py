@@ -14,6 +14,7 @@ import rerun as rr
 
 from launch_scripts.monitor.movers.looks import HUES
 from launch_scripts.monitor.serving.sinks import Streams
+from launch_scripts.monitor.shown_text import shown
 from launch_scripts.report.samples import Sample
 from swarm.wire.messages.vehicles import VehicleState
 
@@ -64,4 +65,4 @@ class Drawing:
         self._rec.log("summary", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
 
     def note(self, text: str, level: str) -> None:
-        self._rec.log("log", rr.TextLog(text, level=level))
+        self._rec.log("log", rr.TextLog(shown(text), level=level))

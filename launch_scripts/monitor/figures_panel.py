@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from launch_scripts.monitor.shown_text import in_markdown
 from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.alarms import KINDS
 from launch_scripts.report.run_state.state import RunState
@@ -20,12 +21,12 @@ def level_of(kind: str) -> str:
 def summary_markdown(setup: RoleSetup, state: RunState) -> str:
     """The state of a run beside the view."""
     time = facts.fact("elapsed_s")
-    lines = [f"**{setup.scenario.name}**, {time.label} {time.shown(state)}  "]
+    lines = [f"**{in_markdown(setup.scenario.name)}**, {time.label} {time.shown(state)}  "]
     lines += [f"{line}  " for line in facts.lines(state)]
-    lines += [f"**{line}**  " for line in facts.alarm_lines(state, _SHOWN_ALARMS)]
+    lines += [f"**{in_markdown(line)}**  " for line in facts.alarm_lines(state, _SHOWN_ALARMS)]
     labels, rows = facts.table(state)
     lines += ["", f"| {' | '.join(labels)} |", f"|{'---|' * len(labels)}"]
-    lines += [f"| {' | '.join(row)} |" for row in rows[:_SHOWN_TARGETS]]
+    lines += [f"| {' | '.join(map(in_markdown, row))} |" for row in rows[:_SHOWN_TARGETS]]
     if len(rows) > _SHOWN_TARGETS:
         lines.append(f"\n{len(rows) - _SHOWN_TARGETS} more targets")
     return "\n".join(lines)

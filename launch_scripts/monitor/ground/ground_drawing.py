@@ -14,6 +14,7 @@ from launch_scripts.monitor.ground.terrain_mesh import Bytes, Floats, MeshTile, 
 from launch_scripts.monitor.ground.windows import SIDE_POINTS
 from launch_scripts.monitor.ground.zones import Area, borders, title_places
 from launch_scripts.monitor.serving.sinks import Streams
+from launch_scripts.monitor.shown_text import shown
 
 _MARGIN_COLOUR = (200, 206, 214)
 _NAMES_SHOWN = 40
@@ -111,4 +112,6 @@ class GroundDrawing:
 
 
 def _texts(places: Floats, texts: list[str], colours: Sequence[tuple[int, ...]] | Bytes) -> rr.Points3D:
-    return rr.Points3D(places, labels=texts, colors=colours, radii=[_NO_BALL], show_labels=True)
+    return rr.Points3D(
+        places, labels=[shown(text, 60) for text in texts], colors=colours, radii=[_NO_BALL], show_labels=True
+    )

@@ -39,6 +39,8 @@ _ALL_NAMED, _NAMED_SHARE = 4, 0.12
 """So many windows all have names. Of more, those of a share of the terrain's width: in a small one stands its
 target, which has a name."""
 _ZONES_AGAIN_NS = 10 * NS_PER_S
+_MOST_TARGETS = 256
+"""Targets beside the scenario's of which planners may tell: nothing grows with the names that anybody makes up."""
 _NEAREST_NS = 8 * NS_PER_S
 
 
@@ -48,8 +50,8 @@ class _Tiles:
     pictures is drawn once for all.
 
     layer      whose tiles these are
-    every_ns   how often tiles that are out of date are drawn; if none is, one is sent again, as a viewer that joins
-               late has only what the server still holds
+    every_ns   how often tiles that are out of date are drawn; one more is sent again, as a viewer that joins late
+               has only what the server still holds
     at_once    how many at most
     """
 
@@ -64,10 +66,9 @@ class _Tiles:
         self._next = 0
 
     def refresh(self, tiles: int) -> None:
-        """One of so many tiles is out of date if none was."""
-        if not self.stale:
-            self.stale[self._next] = None
-            self._next = (self._next + 1) % tiles
+        """One more of so many tiles is out of date, also while others are: in a busy swarm some always are."""
+        self.stale[self._next] = None
+        self._next = (self._next + 1) % tiles
 
 
 class GroundView:
@@ -130,6 +131,8 @@ class GroundView:
             self._draw_tiles(layer, self._mesh.tiles)
 
     def hear_status(self, status: PlannerStatus) -> None:
+        if status.target not in self._windows and len(self._windows) >= _MOST_TARGETS + len(self._target_ids):
+            return
         self.samples.hear_target(status.target)
         window = tuple(status.window)
         if self._windows.get(status.target) != window:

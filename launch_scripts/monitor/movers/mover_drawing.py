@@ -21,6 +21,7 @@ from launch_scripts.monitor.movers.levels import Level
 from launch_scripts.monitor.movers.looks import BODY_COLOUR, SIGHTED_COLOUR, Colour, Looks
 from launch_scripts.monitor.movers.strips import Strips
 from launch_scripts.monitor.serving.sinks import Streams
+from launch_scripts.monitor.shown_text import shown
 
 _LABEL_COLOUR: Colour = (240, 243, 246)
 FOLLOWED_ENTITY = "world/followed"
@@ -128,7 +129,13 @@ class MoverDrawing:
         """A pole with a ball and its words for each."""
         told = np.array(colours, np.uint8).reshape(-1, 3)
         self.lines("world/alarms/poles", poles, told)
-        balls = rr.Points3D(positions, colors=told, radii=[_screen(5.0)], labels=texts, show_labels=True)
+        balls = rr.Points3D(
+            positions,
+            colors=told,
+            radii=[_screen(5.0)],
+            labels=[shown(text, 60) for text in texts],
+            show_labels=True,
+        )
         self._rec.log("world/alarms/marks", balls)
 
     def followed(self, position: Floats) -> None:

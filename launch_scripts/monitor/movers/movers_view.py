@@ -72,6 +72,9 @@ class MoversView:
         self._drawing.begin()
         self._vehicles.draw_anew()
         self._targets.draw_anew()
+        if self._follow is not None:  # the middle, until it is known: the world's origin is a corner off the ground
+            middle = self._mesh.width_m / 2, self._mesh.depth_m / 2
+            self._drawing.followed(followed_point(self._mesh, middle))
 
     def hear(self, message: Message, now_ns: int) -> None:
         match message:
