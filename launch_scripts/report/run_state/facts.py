@@ -157,19 +157,19 @@ TARGET_FACTS: tuple[TargetFact, ...] = (
     TargetFact("target", "target", "", lambda t: t.title, _word, "Its id, and what is unusual about it."),
     TargetFact("chased_by", "following", "", lambda t: t.following, count, "Vehicles that go for it."),
     TargetFact("nearest_m", "nearest", "m", lambda t: t.nearest_m, distance, "Distance of the nearest vehicle."),
-    TargetFact("re_plans", "re-plans", "", lambda t: t.growths, count, "How often its tree was grown or repaired."),
-    TargetFact("growth_ms", "tree", "ms", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
+    TargetFact("captures", "captures", "", lambda t: t.captures, count, "How often it was caught."),
     TargetFact(
         "certified_gap", "certified gap", "", lambda t: t.gap, _gap_mean,
         "How far above the optimum the routes to it can be at most, in the mean.",
     ),
-    TargetFact("captures", "captures", "", lambda t: t.captures, count, "How often it was caught."),
+    TargetFact("re_plans", "re-plans", "", lambda t: t.growths, count, "How often its tree was grown or repaired."),
+    TargetFact("growth_ms", "tree", "ms", lambda t: t.growth_ms, duration, "What growing its whole tree took."),
     TargetFact("routes_served", "served", "", lambda t: t.routes_served, count, "Routes given to it.", False),
     TargetFact("strategy", "strategy", "", lambda t: t.strategy, _word, "How its tree is kept.", False),
     TargetFact("pose_age_s", "seen", "s", lambda t: t.pose_age_s, seconds, "Time since its last pose.", False),
     TargetFact("tracker", "tracker", "", lambda t: t.tracker, _word, "Who tells where it is.", False),
 )  # fmt: skip
-"""What is shown of each target."""
+"""What is shown of each target, what matters most first: a narrow panel cuts off the end."""
 
 _BY_NAME = {fact.name: fact for fact in FACTS}
 

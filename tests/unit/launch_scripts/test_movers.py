@@ -137,7 +137,7 @@ def test_a_route_without_a_bound_claims_no_gap() -> None:
 def test_who_points_at_a_target_reads_how_its_chase_goes() -> None:
     line = TargetLine("t3", True, 0, 16, 412.0, 9, 1.0, captures=2, gap=CertifiedGap(1.0105), lost=False)
     assert target_details(line) == (
-        "t3: following 16, nearest 412 m, re-plans 9, tree 1.0 ms, certified gap 1.05%, captures 2"
+        "t3: following 16, nearest 412 m, captures 2, certified gap 1.05%, re-plans 9, tree 1.0 ms"
     )
 
 

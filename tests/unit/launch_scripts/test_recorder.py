@@ -460,7 +460,7 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(recorder: Recor
         )
 
     hour = record(0, 12_000, 2)
-    day = record(12_000, 40_000, 2)
+    day = record(12_000, 20_000, 2)
     assert day < 1.5 * hour
     assert len(recorder.captures) == recorder.captures.maxlen
 
