@@ -18,7 +18,7 @@ from launch_scripts.report.results.certified_gap import percent
 from launch_scripts.report.results.result_tables import TABLES
 from launch_scripts.report.results.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.report.run_state.alarms import Alarm
-from launch_scripts.report.run_state.facts import count, duration, fact
+from launch_scripts.report.run_state.facts import count, duration, fact, grouped, together
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import StoreError
 
@@ -135,16 +135,26 @@ def _timing(report: Mapping[str, Any], name: str, label: str, meaning: str) -> C
     return label, duration(quantiles["p50"]), f"{meaning}; p99 {duration(quantiles['p99'])}.", ""
 
 
-def _alarms(report: Mapping[str, Any]) -> list[tuple[Alarm, str]]:
-    """What went wrong, the serious first, each with its place in words."""
-    told = [
-        (
-            Alarm(row["kind"], row["about"], row["text"], row["since_s"], row["over_s"], target=row["target"]),
-            "" if row["row"] is None else f"row {row['row']}, col {row['col']}",
-        )
-        for row in report.get("alarms") or []
+def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
+    """What went wrong, the serious first: a line, whether it is serious, and the lines that it stands for."""
+    places: dict[int, str] = {}
+    told: list[Alarm] = []
+    for row in report.get("alarms") or []:
+        alarm = Alarm(row["kind"], row["about"], row["text"], row["since_s"], row["over_s"], target=row["target"])
+        places[id(alarm)] = "" if row["row"] is None else f"row {row['row']}, col {row['col']}"
+        told.append(alarm)
+
+    def line(alarm: Alarm) -> str:
+        parts = (f"{alarm.label}: {alarm.text}", places[id(alarm)], alarm.when)
+        return ", ".join(part for part in parts if part)
+
+    groups = [
+        (together(group), group[0].serious, [line(alarm) for alarm in group])
+        if len(group) > 1
+        else (line(group[0]), group[0].serious, [])
+        for group in grouped(told)
     ]
-    return sorted(told, key=lambda alarm: not alarm[0].serious)
+    return sorted(groups, key=lambda group: not group[1])
 
 
 def _left_behind(report: Mapping[str, Any]) -> list[str]:

@@ -5,7 +5,7 @@ Who shows a fact takes its label and its text from here, so that it reads the sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -220,19 +220,24 @@ def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
     over  also what is over
     """
     alarms = state.alarms if over else state.standing_alarms
-    kinds: dict[tuple[str, bool], list[Alarm]] = {}
-    for alarm in alarms:
-        kinds.setdefault((alarm.kind, alarm.lasts), []).append(alarm)
     found: list[str] = []
-    for of_kind in kinds.values():
-        if len(of_kind) > _SAID_SINGLY:
-            found.append(_together(of_kind))
-        else:
-            found += [alarm.line(state.grid) for alarm in of_kind]
+    for group in grouped(alarms):
+        found += [together(group)] if len(group) > 1 else [alarm.line(state.grid) for alarm in group]
     return [*found[:most], f"... {len(found) - most} more"] if len(found) > most else found
 
 
-def _together(alarms: Sequence[Alarm]) -> str:
+def grouped(alarms: Iterable[Alarm]) -> list[list[Alarm]]:
+    """Alarms that people should read as one: many of a kind, all over or all not; others each alone."""
+    kinds: dict[tuple[str, bool], list[Alarm]] = {}
+    for alarm in alarms:
+        kinds.setdefault((alarm.kind, alarm.lasts), []).append(alarm)
+    found: list[list[Alarm]] = []
+    for of_kind in kinds.values():
+        found += [of_kind] if len(of_kind) > _SAID_SINGLY else [[alarm] for alarm in of_kind]
+    return found
+
+
+def together(alarms: Sequence[Alarm]) -> str:
     """Many alarms of one kind in a line."""
     first = min(alarms, key=lambda alarm: (alarm.since_s is None, alarm.since_s or 0.0))
     names = list(dict.fromkeys(alarm.about for alarm in alarms))
