@@ -124,7 +124,7 @@ def test_the_summary_says_what_is_not_known_yet_with_a_dash() -> None:
     setup = RoleSetup(Scenario(), "r", "monitor", "0", 1, 0)
     text = summary_markdown(setup, Recorder(setup.scenario, hill(4, 4).grid).summary(0))
     assert "captures -  marks -" in text
-    assert "| t (planner down) | 0 | - | - | - | - | 0 |" in text
+    assert "| t (planner down) | 0 | - | 0 | - | - | - |" in text
 
 
 def test_what_should_worry_a_person_is_a_warning() -> None:
