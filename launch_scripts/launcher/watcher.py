@@ -32,6 +32,7 @@ class Watcher:
         self.ever_up: set[tuple[str, str]] = set()
         """(role, id) of processes whose liveliness token has been seen."""
         self.routes_served = False
+        self._hears_all_routes = True
         self.alive: set[tuple[str, str]] = set()
         """(role, id) of processes whose liveliness token is up."""
         self._bus = bus
@@ -40,9 +41,8 @@ class Watcher:
 
     def begin(self) -> None:
         for topic, every_s in RECORDED.items():
-            self._bus.subscribe(topic, self._inbox.post, every_s=every_s)
-        # The first tells that routes are served, sooner than any figures do.
-        self._bus.subscribe(FOLLOWED, self._inbox.post)
+            # The first route tells that routes are served, sooner than any figures do.
+            self._bus.subscribe(topic, self._inbox.post, every_s=0.0 if topic is FOLLOWED else every_s)
         self._bus.watch_alive(self._inbox.post)
         self._bus.ask(STATS, Nothing(), self._inbox.post, tag=_GONE_TAG)  # of a run that this is a part of
 
@@ -71,8 +71,11 @@ class Watcher:
                     case Note():
                         self._note(message)
                     case Followed():
+                        if self._hears_all_routes:
+                            self._hears_all_routes = False
+                            self._bus.unsubscribe(FOLLOWED)
+                            self._bus.subscribe(FOLLOWED, self._inbox.post, every_s=RECORDED[FOLLOWED])
                         self.routes_served = True
-                        self._bus.unsubscribe(FOLLOWED)
                     case PlannerStatus(routes_served=served) if served:
                         self.routes_served = True
                 self.recorder.heard(message, fields, now_ns)

@@ -12,6 +12,8 @@ import pytest
 from support.live_swarm import SWARM, LiveSwarm, folders_of_runs
 from support.processes import eventually, session_of
 
+from launch_scripts.report.geo.track_file import TRACKS_FILE, read_tracks
+
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
 
@@ -37,6 +39,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
         assert 0 < report[name]["p50"] <= report[name]["p99"], name
     assert 1.0 <= report["gap"]["mean"] <= report["gap"]["max"] < 1.5
     assert report["payloads_dropped"] == 0
+    assert len(read_tracks(run_dir / TRACKS_FILE).routes) >= 100, "routes that vehicles began are kept"
     for name in ("run.rrd", "report.png", "router-0.log", "monitor-0.log", "agent-a3.log", "planner-t9.log"):
         assert (run_dir / name).stat().st_size > 0, name
     assert "live view: http://127.0.0.1:" in err
