@@ -17,7 +17,7 @@ from swarm.wire.topics import FLEET, LEAD, ORDERS, POSE, STATS, STATUS, Topic
 
 HEARD: dict[Topic, float] = {STATS: 0.0, STATUS: 0.0, POSE: 0.0, LEAD: 0.5, ORDERS: 0.5, FLEET: 0.4}
 """What a state is made of, and how often the newest of each key is needed, in seconds; 0 for all that comes.
-Places are sampled every 0.5 s, and each sample must find newer ones: else all vehicles seem to stand now and then."""
+Places are sampled every 0.5 s, and each must find newer ones: else all vehicles seem to stand now and then."""
 
 
 class RunModel:
