@@ -38,8 +38,6 @@ class ExitReason:
 
 def run_child(entry: str, setup: RoleSetup, log_path: Path, pipe: Connection) -> None:
     """Runs a role until it is told to stop. Ends the process with the role's exit code."""
-    with contextlib.suppress(OSError):  # not every system lets a process choose
-        os.nice(NICENESS.get(setup.role, 0))  # before there are other threads, which inherit it
     _redirect(log_path)
     # The launcher alone decides when to stop: it blocks SIGINT for all its processes, and SIGTERM until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
@@ -47,7 +45,7 @@ def run_child(entry: str, setup: RoleSetup, log_path: Path, pipe: Connection) ->
     log = logging.getLogger(__name__)
     log.info("%s %s starts, pid %d, incarnation %d", setup.role, setup.id, os.getpid(), setup.incarnation)
     try:
-        load_entry(entry)(setup, wait_for_launcher)
+        load_entry(entry)(setup, lambda: _run_until_launcher_ends(NICENESS.get(setup.role, 0)))
     except SwarmError as error:
         log.error("%s", error)
         pipe.send(ExitReason(str(error), error.exit_code, refused=True))
@@ -73,6 +71,16 @@ def wait_for_launcher() -> None:
         threading.Event().wait()
     else:
         wait([parent.sentinel])
+
+
+def _run_until_launcher_ends(niceness: int) -> None:
+    """Blocks until the launcher is gone. A role calls it once it is built, and gives way to others from then on: not
+    before, for all wait for whoever still starts."""
+    with contextlib.suppress(OSError):  # not every system lets a process choose
+        for thread in map(int, os.listdir("/proc/self/task")):
+            now = os.getpriority(os.PRIO_PROCESS, thread)
+            os.setpriority(os.PRIO_PROCESS, thread, min(now + niceness, 19))
+    wait_for_launcher()
 
 
 def _watch_launcher() -> None:

@@ -134,7 +134,8 @@ def test_processes_end_role_by_role_and_each_has_a_log(swarms: list[LocalSwarm],
         assert running.process is not None
         assert running.process.pid is not None
         niceness = min(ours + NICENESS[running.spec.role], 19)
-        assert os.getpriority(os.PRIO_PROCESS, running.process.pid) == niceness
+        pid = running.process.pid
+        eventually(lambda pid=pid, niceness=niceness: os.getpriority(os.PRIO_PROCESS, pid) == niceness, 5)
     assert swarm.stop(lambda: time.sleep(0.02)) == []
     assert order.read_text().split()[4:] == ["-agent-a0", "-planner-t0", "-keeper-0", "-router-0"]
     assert "hello from t0" in (tmp_path / "planner-t0.log").read_text()
