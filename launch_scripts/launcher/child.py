@@ -74,8 +74,8 @@ def wait_for_launcher() -> None:
 
 
 def _run_until_launcher_ends(niceness: int) -> None:
-    """Blocks until the launcher is gone. A role calls it once it is built, and gives way to others from then on: not
-    before, for all wait for whoever still starts."""
+    """Blocks until the launcher is gone. A role calls it once it is built, and gives way to others from then on.
+    It does not before: all wait for whoever still starts."""
     with contextlib.suppress(OSError):  # not every system lets a process choose
         for thread in map(int, os.listdir("/proc/self/task")):
             now = os.getpriority(os.PRIO_PROCESS, thread)
