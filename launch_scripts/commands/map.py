@@ -121,12 +121,6 @@ def export(
     print(f"{out}: {sum(len(each.kinds) for each in sets)} marks in {len(sets)} sets")
 
 
-def marks_of(store: Path) -> tuple[GridSpec, Layer]:
-    """The grid of a store, and its winning marks as polygons."""
-    _, grid, sets = _read(store)
-    return grid, _layer(grid, sets)
-
-
 def _layer(grid: GridSpec, sets: list[MarkSet]) -> Layer:
     pace, kind, stamps_ns = stored_marks.to_cells(grid, sets, time.time_ns())
     return mark_layer(grid, kind, pace, stamps_ns)

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-_PANEL = "Ask a running swarm"
 _CONNECT_S = 3.0
 _STATUS_LISTEN_S, _STATUS_MOST_S = 1.5, 4.0
 """`swarm status` listens for so long; longer while a process that has answered has not said how it is."""
@@ -89,7 +88,7 @@ class Where:
         return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ASK)
 @spread
 def route(
     where: Where,
@@ -186,7 +185,7 @@ def _route_on_terrain(
     typer.echo(profile_of(found))
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ASK)
 @spread
 def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Show how a running swarm is: its figures, who takes part, its targets, and what went wrong.
@@ -224,7 +223,7 @@ def status(where: Where, tls: Tls, as_json: AsJson = False) -> None:
         print_status(told, Console(markup=False))
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ASK)
 @spread
 def top(
     where: Where,
@@ -249,7 +248,7 @@ def top(
     show(where.network(tls), where, each=each, once=once, as_json=as_json)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ASK)
 @spread
 def metrics(
     where: Where,

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-_PANEL = "One role, by hand"
-
 
 @dataclass(frozen=True)
 class Place:
@@ -62,7 +60,7 @@ class Joins:
     at: str | None
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ROLE)
 @spread
 def router(
     place: Place,
@@ -78,7 +76,7 @@ def router(
     run_role("router", "0", place, tls, listen=listen)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ROLE)
 @spread
 def keeper(
     part: Part,
@@ -100,7 +98,7 @@ def keeper(
     run_role("keeper", id, part, tls, store_path=store, rebuild=rebuild)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ROLE)
 @spread
 def planner(
     target: Annotated[
@@ -120,7 +118,7 @@ def planner(
     run_role("planner", ranked_id(target, rank), part, tls)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ROLE)
 @spread
 def agent(
     id: Annotated[
@@ -141,7 +139,7 @@ def agent(
     run_role("agent", id, part, tls)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ROLE)
 @spread
 def targets(part: Part, tls: Tls, rank: Rank = 0) -> None:
     """Move the simulated targets and referee the run, or stand by to do so.
@@ -151,7 +149,7 @@ def targets(part: Part, tls: Tls, rank: Rank = 0) -> None:
     run_role("targets", ranked_id("0", rank), part, tls)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ROLE)
 @spread
 def monitor(part: Part, tls: Tls) -> None:
     """Show and record the run.

@@ -35,16 +35,22 @@ def fitted(state: RunState, above: list[RenderableType], console: Console) -> Gr
 
 def targets_table(state: RunState, most: int) -> Table:
     """A line for each target, `most` at most."""
-    shown = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
     labels, rows = facts.table(state)
-    for n, label in enumerate(labels):
-        shown.add_column(label, justify="right" if n else "left")
+    shown = columns(*labels)
     kept = most if len(rows) <= most else most - 1
     for line, row in list(zip(state.targets, rows, strict=True))[:kept]:
         shown.add_row(*row, style=_style(line))
     if len(rows) > kept:
         shown.add_row(f"... {len(rows) - kept} more")
     return shown
+
+
+def columns(*labels: str) -> Table:
+    """A table without lines, whose first column has words and the others numbers."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
+    for n, label in enumerate(labels):
+        table.add_column(label, justify="right" if n else "left")
+    return table
 
 
 def plain_line(state: RunState, title: str) -> str:

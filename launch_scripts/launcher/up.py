@@ -257,7 +257,7 @@ class _Run:
         self._book = watcher.recorder.book
         ordered = self._ordered_planners()
         while not self._stop_asked:
-            ordered.look(watcher.recorder.book, watcher.alive, time.monotonic())
+            ordered.look(watcher.recorder.book, set(watcher.recorder.observed.up()), time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S)
             self._tell(watcher)
@@ -297,7 +297,7 @@ class _Run:
 
     def _missing(self, watcher: Watcher) -> list[str]:
         specs = [running.spec for running in self._swarm.running]
-        return [spec.name for spec in specs if (spec.role, spec.id) not in watcher.ever_up]
+        return [spec.name for spec in specs if not watcher.recorder.observed.was_up(spec.role, spec.id)]
 
     def _tell(self, watcher: Watcher) -> None:
         if self._metrics is not None:

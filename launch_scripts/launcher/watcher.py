@@ -29,12 +29,8 @@ class Watcher:
         self.recorder = recorder
         self.notes: list[Note] = []
         self.live_view: str | None = None
-        self.ever_up: set[tuple[str, str]] = set()
-        """(role, id) of processes whose liveliness token has been seen."""
         self.routes_served = False
         self._hears_all_routes = True
-        self.alive: set[tuple[str, str]] = set()
-        """(role, id) of processes whose liveliness token is up."""
         self._bus = bus
         self._clock = clock
         self._inbox = Inbox()
@@ -82,11 +78,8 @@ class Watcher:
             case Replied(tag=tag, message=Stats() as stats) if tag == _GONE_TAG:
                 self.recorder.heard(stats, {}, now_ns)
             case Appeared(peer):
-                self.ever_up.add((peer.role, peer.id))
-                self.alive.add((peer.role, peer.id))
                 self.recorder.alive(peer, True, now_ns)
             case Disappeared(peer):
-                self.alive.discard((peer.role, peer.id))
                 self.recorder.alive(peer, False, now_ns)
 
     def _note(self, note: Note) -> None:

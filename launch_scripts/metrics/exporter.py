@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 from launch_scripts.metrics.families import Figures, Run
 from launch_scripts.report.results.counts import Counts
+from launch_scripts.report.run_state.plan import run_of_most
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Replied
 from swarm.clock import NS_PER_S
 from swarm.liveness import Roster
@@ -73,10 +72,11 @@ class Exporter:
 
     def _go_by(self, answers: list[RunInfo]) -> None:
         """Goes by the run of most answers. What an earlier one counted is forgotten: it is no part of this."""
-        runs = Counter(Run(info.run_id, info.scenario, info.started_ns) for info in answers)
-        if not runs:
+        of_most = run_of_most(answers)
+        members = [info for info in answers if (info.run_id, info.terrain) == of_most]
+        if not members:
             return
-        run = runs.most_common(1)[0][0]
+        run = Run(members[0].run_id, members[0].scenario, members[0].started_ns)
         if self._run is not None and run.run_id != self._run.run_id:
             self._counts, self._status = Counts(), {}
         self._run = run

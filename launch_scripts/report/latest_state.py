@@ -57,12 +57,11 @@ class Observed(Counts):
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
         self._alive: dict[tuple[str, str], set[int]] = {}
-        self._incarnations: dict[tuple[str, str], set[int]] = {}
+        """(role, id) of every process that has ever been seen alive -> incarnations whose token is up."""
         self._told_ns: dict[tuple[str, str], int] = {}
         """(role, id) -> when the process told its counts last, or appeared."""
         self._fleet_told_ns: dict[str, int] = {}
         """Agent -> when it told of vehicles last."""
-        self._was_up: set[tuple[str, str]] = set()
 
     def heard(self, message: Message, now_ns: int) -> None:
         """Take in a message; of poses those only that count."""
@@ -70,7 +69,6 @@ class Observed(Counts):
             case Stats():
                 self.count(message)
                 self._told_ns[message.role, message.id] = now_ns
-                self._seen(message.role, message.id, message.incarnation)
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
                 self.status[message.target] = message
@@ -93,17 +91,12 @@ class Observed(Counts):
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """A liveliness token rose or fell."""
-        incarnations = self._alive.setdefault((peer.role, peer.id), set())
+        key = (peer.role, peer.id)
         if up:
-            incarnations.add(peer.incarnation)
-            self._was_up.add((peer.role, peer.id))
-            self._told_ns[peer.role, peer.id] = now_ns
-            self._seen(peer.role, peer.id, peer.incarnation)
-        else:
-            incarnations.discard(peer.incarnation)
-
-    def _seen(self, role: str, id: str, incarnation: int) -> None:
-        self._incarnations.setdefault((role, id), set()).add(incarnation)
+            self._alive.setdefault(key, set()).add(peer.incarnation)
+            self._told_ns[key] = now_ns
+        elif key in self._alive:
+            self._alive[key].discard(peer.incarnation)
 
     # --- processes ------------------------------------------------------------------------------------------------
 
@@ -117,7 +110,7 @@ class Observed(Counts):
 
     def was_up(self, role: str, id: str) -> bool:
         """Whether the process has ever been seen alive."""
-        return (role, id) in self._was_up
+        return (role, id) in self._alive
 
     def knows(self, role: str, id: str) -> bool:
         """Whether the process has ever been seen alive, or what it counted is known."""
@@ -169,16 +162,6 @@ class Observed(Counts):
     def rank(self, role: str, job: str) -> int:
         """Rank of the process that leads."""
         return self._ranks.get((role, job), 0)
-
-    @property
-    def processes(self) -> int:
-        """Number of processes so far, restarts not counted."""
-        return len(self._incarnations)
-
-    @property
-    def restarts(self) -> int:
-        """Later incarnations of processes that were there before."""
-        return sum(len(incarnations) - 1 for incarnations in self._incarnations.values())
 
     # --- places ---------------------------------------------------------------------------------------------------
 

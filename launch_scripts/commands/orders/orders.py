@@ -8,17 +8,15 @@ from typing import Annotated
 
 import typer
 
-from launch_scripts.command_line import complete
+from launch_scripts.command_line import complete, panels
 from launch_scripts.commands.orders.order_options import checked, give
 from launch_scripts.commands.query import Where
 from launch_scripts.commands.shared_options import AsJson, Tls, spread
 
 app = typer.Typer()
 
-_PANEL = "Give a running swarm orders"
 
-
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ORDER)
 @spread
 def pause(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Stop all vehicles and simulated targets where they are. Returns once all processes obey.
@@ -32,7 +30,7 @@ def pause(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     give([GiveOrder(subject="pause")], where, tls, as_json)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ORDER)
 @spread
 def resume(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Let all go on after a pause.
@@ -44,7 +42,7 @@ def resume(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     give([GiveOrder(subject="pause", off=True)], where, tls, as_json)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ORDER)
 @spread
 def group(
     name: Annotated[str, typer.Argument(metavar="GROUP", help="The group.", autocompletion=complete.group_names)],
@@ -79,7 +77,7 @@ def group(
     give([checked(GiveOrder, fields)], where, tls, as_json)
 
 
-@app.command(name="set", rich_help_panel=_PANEL)
+@app.command(name="set", rich_help_panel=panels.ORDER)
 @spread
 def set_(
     key: Annotated[
@@ -115,7 +113,7 @@ def set_(
     give([checked(GiveOrder, fields)], where, tls, as_json)
 
 
-@app.command(rich_help_panel=_PANEL)
+@app.command(rich_help_panel=panels.ORDER)
 @spread
 def orders(where: Where, tls: Tls, as_json: AsJson = False) -> None:
     """Print what is ordered and not taken back. Zones are in `swarm zone list`.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +10,11 @@ from rich.console import Console
 from rich.table import Table
 
 from launch_scripts.commands.run_frame import frame_of_members
-from launch_scripts.launcher.live_table import targets_table
+from launch_scripts.launcher.live_table import columns, targets_table
 from launch_scripts.report.results.certified_gap import gaps_to
 from launch_scripts.report.run_state import facts
 from launch_scripts.report.run_state.model import HEARD, RunModel
-from launch_scripts.report.run_state.plan import plan_of_members
+from launch_scripts.report.run_state.plan import plan_of_members, run_of_most
 from launch_scripts.report.run_state.state import RunState
 from shared_map.terrain.places import MapFrame
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
@@ -100,9 +99,7 @@ class StatusWatch:
         """What was told so far; None if nobody has answered."""
         if not self._found:
             return None
-        # The run is that of most; routers belong to none; whoever answers with another is a stranger.
-        runs = Counter((info.run_id, info.terrain) for info in self._found if info.run_id)
-        run = runs.most_common(1)[0][0] if runs else ("", "")
+        run = run_of_most(self._found)  # whoever answers with another is a stranger
         found = sorted(self._found, key=lambda info: (not info.run_id, info.role, info.id))
         strangers = [info for info in found if info.run_id and (info.run_id, info.terrain) != run]
         members = [info for info in found if info not in strangers]
@@ -155,7 +152,7 @@ def print_status(status: Status, console: Console) -> None:
 
 
 def _processes(status: Status) -> Table:
-    crew = _table("process", "up", "messages out", "in", "dropped")
+    crew = columns("process", "up", "messages out", "in", "dropped")
     for info in status.members:
         stats = status.model.observed.newest_stats(info.role, info.id)
         counts = {} if stats is None else stats.counts
@@ -168,18 +165,11 @@ def _processes(status: Status) -> Table:
 
 def _planning(state: RunState) -> Table:
     """What of the targets no other table has: beside the rest it would be wider than a terminal."""
-    columns = [facts.TARGET_FACTS[0], *(column for column in facts.TARGET_FACTS if not column.always)]
-    shown = _table(*(column.label for column in columns))
+    told = [facts.TARGET_FACTS[0], *(column for column in facts.TARGET_FACTS if not column.always)]
+    shown = columns(*(column.label for column in told))
     for line in state.targets:
-        shown.add_row(*(column.shown(line) for column in columns), style="yellow" if line.lost else None)
+        shown.add_row(*(column.shown(line) for column in told), style="yellow" if line.lost else None)
     return shown
-
-
-def _table(*labels: str) -> Table:
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    for n, label in enumerate(labels):
-        table.add_column(label, justify="right" if n else "left")
-    return table
 
 
 def status_fields(status: Status) -> dict[str, Any]:

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.commands.running.observer import RunObserver
 from launch_scripts.launcher.lasting_output import make_output_last
-from launch_scripts.launcher.live_table import fitted
+from launch_scripts.launcher.live_table import columns, fitted
 from launch_scripts.launcher.watcher import ask_run
 from launch_scripts.process_table import ROLES
 from launch_scripts.report.run_state import facts
+from launch_scripts.report.run_state.plan import run_of_most
 from launch_scripts.report.run_state.process_load import ProcessLoad, RoleLoad, by_role
 from launch_scripts.report.run_state.state import RunState
 from swarm.bus.zenoh_bus import open_bus
@@ -73,10 +73,7 @@ def top(network: NetworkConfig, where: object, *, each: bool, once: bool, as_jso
 
 def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
     """The run at an instant, at most 80 columns wide."""
-    load = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-    load.add_column("process" if each else "role")
-    for label in ("up", "CPU %", "memory", "late/s", "messages/s", "restarts"):
-        load.add_column(label, justify="right")
+    load = columns("process" if each else "role", "up", "CPU %", "memory", "late/s", "messages/s", "restarts")
     if not each:
         load.add_column("busiest", no_wrap=True, overflow="ellipsis")
     lines: Sequence[ProcessLoad | RoleLoad] = processes if each else by_role(processes, ROLES)
@@ -142,9 +139,8 @@ def _members(bus: Bus, where: object) -> list[RunInfo]:
     until_s = time.monotonic() + _ANSWER_WITHIN_S
     while True:
         found = ask_run(bus, routers=True)
-        told = [info.run_id for info in found if info.run_id]
-        if told:
-            run_id = max(dict.fromkeys(told), key=told.count)
+        run_id, _ = run_of_most(found)
+        if run_id:
             return [info for info in found if info.run_id == run_id]
         if not found or time.monotonic() > until_s:
             who = "nobody answers" if not found else "only routers answer"

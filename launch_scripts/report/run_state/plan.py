@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -48,6 +49,12 @@ class RunPlan:
 def plan_of(scenario: Scenario, started_ns: int | None = None) -> RunPlan:
     """By the scenario."""
     return RunPlan(tuple(scenario.target_ids), tuple(crew_of(scenario)), scenario.vehicle_count, started_ns)
+
+
+def run_of_most(found: Iterable[RunInfo]) -> tuple[str, str]:
+    """(run id, terrain) that most answers name; empty texts where only routers answer, which belong to no run."""
+    runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
+    return runs.most_common(1)[0][0] if runs else ("", "")
 
 
 def plan_of_members(members: Iterable[RunInfo]) -> RunPlan:

@@ -110,10 +110,6 @@ def event_of(call: Call, answerer: Answerer | None = None) -> Event:
     raise StoreError("a record that is no event")
 
 
-def key_of(topic: Topic, fields: Sequence[str]) -> str:
-    return topic.below(dict(zip(topic.fields, fields, strict=True)))
-
-
 def _topic(name: str) -> Topic:
     if name not in _TOPICS:
         raise StoreError(f"this build has no topic {name!r}")
