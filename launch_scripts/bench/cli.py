@@ -11,7 +11,7 @@ import typer
 from launch_scripts.bench.options import AsJson, Picture, check_picture, names_of, numbers_of
 from launch_scripts.bench.show import progress_of, show
 from launch_scripts.bench.whole_swarm import commands as whole_swarm
-from swarm.config.scenario import Strategy
+from swarm.config.values import Strategy
 from swarm.errors import ConfigError
 
 app = typer.Typer(

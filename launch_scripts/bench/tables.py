@@ -8,7 +8,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from swarm.config.scenario import Strategy
+from swarm.config.values import Strategy
 
 Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""

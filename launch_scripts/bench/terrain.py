@@ -112,7 +112,8 @@ def _plain(folder: Path) -> None:
 
 def _swarm(folder: Path, name: str) -> None:
     from shared_map.terrain.terrain import build_terrain
-    from swarm.config.scenario import CostConfig, Scenario, TerrainConfig
+    from swarm.config.ground import CostConfig, TerrainConfig
+    from swarm.config.scenario import Scenario
 
     photo = None if name == "swarm without photo" else str(folder / "photo.tif")
     cost = CostConfig(vehicle_radius_m=WIDE_M if name == "swarm with wide vehicles" else 0.0)

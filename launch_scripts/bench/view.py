@@ -31,15 +31,8 @@ from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.agents import AgentPlan, plan_agents
-from swarm.config.scenario import (
-    GroupConfig,
-    MonitorConfig,
-    PlannerConfig,
-    Scenario,
-    TargetConfig,
-    TerrainConfig,
-    VehicleConfig,
-)
+from swarm.config.ground import TerrainConfig
+from swarm.config.scenario import GroupConfig, MonitorConfig, PlannerConfig, Scenario, TargetConfig, VehicleConfig
 from swarm.grid import STEP_COL, STEP_ROW, walk
 from swarm.liveness import Peer
 from swarm.runtime.role import RoleSetup

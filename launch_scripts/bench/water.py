@@ -45,7 +45,7 @@ def run_on(dem: Path, truth: Path) -> dict[str, Any]:
     from shared_map.terrain.importers.rasters.rasters import opened
     from shared_map.terrain.importers.sources import load_source
     from shared_map.terrain.layers import TerrainClass
-    from swarm.config.scenario import TerrainConfig
+    from swarm.config.ground import TerrainConfig
 
     source = load_source(TerrainConfig(source=str(dem)), seed=1)
     with opened(truth, "truth") as dataset:

@@ -36,7 +36,7 @@ def new(
         str | None,
         typer.Option(
             help="How targets move: still, random, waypoints or evade.",
-            autocompletion=complete.words("swarm.config.scenario", "Walk"),
+            autocompletion=complete.words("swarm.config.values", "Walk"),
         ),
     ] = None,
     seconds: Annotated[

@@ -41,7 +41,7 @@ PresetOption = Annotated[
     typer.Option(
         "--preset",
         help="With a terrain file: hiker, wheeled, tracked or quadruped, as cost.preset.",
-        autocompletion=complete.words("swarm.config.scenario", "Preset"),
+        autocompletion=complete.words("swarm.config.values", "Preset"),
     ),
 ]
 Rank = Annotated[

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import msgspec
 
-from swarm.config.scenario import CommonName, NetworkConfig
+from swarm.config.scenario import NetworkConfig
+from swarm.config.values import CommonName
 from swarm.errors import ConfigError, StoreError
 
 FILE = "revoked"

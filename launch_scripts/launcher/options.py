@@ -17,9 +17,10 @@ from shared_map.terrain.importers.sources import is_terrain
 from swarm.config.agents import plan_agents
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import explain, nearest
+from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, check_bytes, shown
 from swarm.config.load import check_endpoint, load_scenario
-from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TerrainConfig, TlsConfig
+from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.errors import ConfigError, StoreError
 from swarm.wire.fields import check_id
 

@@ -17,7 +17,7 @@ from launch_scripts.monitor.serving.sinks import Sinks, new_recording_path
 from shared_map.terrain.terrain import load_terrain, load_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
-from swarm.config.scenario import HiddenConfig
+from swarm.config.ground import HiddenConfig
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process, end_with
 from swarm.runtime.role import RoleSetup

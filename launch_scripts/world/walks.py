@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.arrays import CellsOf
-from swarm.config.scenario import CostConfig, TargetConfig
+from swarm.config.ground import CostConfig
+from swarm.config.scenario import TargetConfig
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 from swarm.plugins.find import Plugin

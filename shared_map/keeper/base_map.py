@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import Terrain, finished
-from swarm.config.scenario import CostConfig
+from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
 from swarm.wire.messages.base_map import BASE_DIGEST_BYTES, BaseMap, BaseMapTile

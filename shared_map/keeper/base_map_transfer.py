@@ -12,7 +12,7 @@ from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, describe, pa
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, Replied
-from swarm.config.scenario import CostConfig
+from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile

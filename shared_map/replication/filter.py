@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 
 from shared_map.replication.tiles import region_tiles
-from swarm.config.scenario import RESERVED_GROUP, Scenario
+from swarm.config.scenario import Scenario
+from swarm.config.values import RESERVED_GROUP
 from swarm.grid import GridSpec
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import RESERVED_GROUP
+from swarm.config.values import RESERVED_GROUP
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.marks import SEQ_STEP, MarkSet

@@ -15,7 +15,7 @@ from shared_map.terrain.layers import LETHAL, TerrainClass
 from shared_map.terrain.row_bands import bands
 from shared_map.terrain.synthetic.noise import fractal_noise
 from shared_map.terrain.zones import paint_zones
-from swarm.config.scenario import CostConfig, HiddenConfig
+from swarm.config.ground import CostConfig, HiddenConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
 RUBBLE_FACTOR = np.float32(3.0)

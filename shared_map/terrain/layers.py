@@ -33,7 +33,7 @@ import numpy as np
 from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.row_bands import in_bands
 from shared_map.terrain.slope_rules import along_slope_factor, factor_bounds, slope_factor
-from swarm.config.scenario import CostConfig
+from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec
 from swarm.wire.statements import PACE_LEAST, PACE_MOST
 

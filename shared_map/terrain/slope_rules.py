@@ -16,7 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shared_map.arrays import Floats
-from swarm.config.scenario import CostConfig, SlopeRule
+from swarm.config.ground import CostConfig
+from swarm.config.values import SlopeRule
 
 MOST_FACTOR = 100.0
 """No slope raises a pace more, unless `steep_factor` says so: costly is not lethal."""
@@ -314,4 +315,4 @@ SLOPE_RULES: Mapping[SlopeRule, RuleRow] = {
     ),
     "table": _by_direction(_table, "points of one's own: slope_table or slope_csv", "the scenario"),
 }
-"""Every rule; a new one is a row here and its name in `swarm.config.scenario.SlopeRule`."""
+"""Every rule; a new one is a row here and its name in `swarm.config.values.SlopeRule`."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shared_map.arrays import Floats
 from shared_map.terrain.slope_rules import directional_factor, step_limits_deg
-from swarm.config.scenario import CostConfig
+from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec
 
 ENTRIES = 512

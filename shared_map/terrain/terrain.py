@@ -36,9 +36,10 @@ from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded
 from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.zones import ZoneFacts, files_of_zone, paint_zones
+from swarm.config.ground import CostConfig
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.plugin_names import cost_layers_of
-from swarm.config.scenario import CostConfig, Scenario
+from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.plugins.find import source_of

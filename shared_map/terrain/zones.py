@@ -13,7 +13,7 @@ from shared_map.arrays import Bools, Bytes, Floats
 from shared_map.terrain.importers.rasters.rasters import mask_of
 from shared_map.terrain.layers import LETHAL, TerrainClass, polygon_mask
 from shared_map.terrain.places import MapFrame
-from swarm.config.scenario import CostConfig, ZoneConfig
+from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 from swarm.places import corners_of, extent_of

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from swarm.config.explain import nearest
+from swarm.config.ground import CostConfig
 from swarm.config.input_files import FileKind, read_text, shown
-from swarm.config.scenario import CostConfig, Preset, Slope, SlopeFactor
+from swarm.config.values import Preset, Slope, SlopeFactor
 from swarm.errors import ConfigError
 
 
@@ -86,7 +87,7 @@ PRESETS: Mapping[Preset, PresetRow] = {
         },
     ),
 }
-"""Every preset; a new one is a row here and its name in `swarm.config.scenario.Preset`."""
+"""Every preset; a new one is a row here and its name in `swarm.config.values.Preset`."""
 
 
 def with_preset(raw: dict[str, Any]) -> dict[str, Any]:

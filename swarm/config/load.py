@@ -14,17 +14,11 @@ import msgspec
 
 from swarm.config.cost_rules import check_cost, with_preset, with_slope_csv
 from swarm.config.explain import choice, explain, located, nearest
+from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.plugin_names import check_name, plugins_of
-from swarm.config.scenario import (
-    MOST_TARGETS,
-    RESERVED_GROUP,
-    PlannerConfig,
-    Scenario,
-    TlsConfig,
-    ZoneConfig,
-    ids_of,
-)
+from swarm.config.scenario import PlannerConfig, Scenario, TlsConfig, ids_of
+from swarm.config.values import MOST_TARGETS, RESERVED_GROUP
 from swarm.errors import ConfigError
 from swarm.places import read_place
 from swarm.ranks import split_rank

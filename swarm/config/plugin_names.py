@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 from swarm.config.explain import nearest
 from swarm.config.input_files import shown
-from swarm.config.scenario import Assigner, Dynamics, Scenario, Sensor, Strategy, TargetConfig, Walk
+from swarm.config.scenario import Scenario, TargetConfig
+from swarm.config.values import Assigner, Dynamics, Sensor, Strategy, Walk
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -1,285 +1,38 @@
 """A scenario: frozen settings, read once from a TOML file and handed down by section.
 
-Every setting is declared here: its unit in its name, its range in its type, its meaning as one row of its section's
-docstring (`swarm.config.describe` reads the rows). A wrong key, type or value is rejected with the file, the key,
-what was found and what is allowed.
+Every setting is declared here, those of the ground in `swarm.config.ground`: its unit in its name, its range in its
+type, its meaning as one row of its section's docstring (`swarm.config.describe` reads the rows). A wrong key, type
+or value is rejected with the file, the key, what was found and what is allowed.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from swarm.ranks import HIGHEST_RANK
-
-Positive = Annotated[float, Meta(gt=0, le=1e12)]
-NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
-Count = Annotated[int, Meta(ge=1, le=100_000)]
-Standbys = Annotated[int, Meta(ge=0, le=HIGHEST_RANK)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
-GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
-ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}$")]
-CommonName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}(~[0-9]{1,4})?$")]
-Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
-Point = tuple[Metres, Metres]
-Polygon = Annotated[tuple[Point, ...], Meta(min_length=3, max_length=10_000)]
-PlaceText = str
-"""A place as `swarm.places` reads it. No `Meta`: msgspec 0.22 crashes on a union of a bounded text and a pair."""
-
-RESERVED_GROUP = "operator"
-"""No group is called so: zones are marks of this one, which every group hears."""
-MOST_TARGETS = 1000
-"""Of all entries together."""
-
-Strategy = Literal[
-    "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
-]
-SlopeRule = Literal[
-    "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
-]
-
-Preset = Literal["hiker", "wheeled", "tracked", "quadruped"]
-
-Slope = Annotated[float, Meta(gt=-90, lt=90)]
-SlopeFactor = Annotated[float, Meta(ge=0.01, le=100)]
-SpeedOnGround = Annotated[float, Meta(ge=0.01, le=340)]
-"""m/s; what a map can tell of a cell (`swarm.wire.statements.PACE_LEAST` and `PACE_MOST`)."""
-
-Walk = Literal["still", "random", "waypoints", "evade", "external"]
-
-Sensor = Literal["truth"]
-
-Assigner = Literal["spread"]
-
-Dynamics = Literal["ground"]
-
-
-def _plugin(built_in: Any = None) -> Meta:
-    """Names of one kind: those that are built in, and those of plug-ins (`swarm.config.plugin_names`)."""
-    names = list(get_args(built_in))
-    return Meta(
-        pattern=r"^[\w.+-]{1,100}(:[\w.]{1,100})?$",
-        extra={"built_in": names},
-        extra_json_schema={"examples": [*names, "module:Name"]},
-    )
-
-
-Options = dict[str, Any]
-"""What is said to a plug-in: its own struct checks it."""
-
-ClassName = Literal[
-    "unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow", "shrub", "wetland"
-]
-
-CoverGround = Literal[ClassName, "lethal"] | Positive
-"""What a code of a land-cover map stands for: a class, or a pace relative to open ground."""
-
-CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}$")]
-
-ElevationEncoding = Literal["metres", "terrain-rgb", "terrarium"]
-
-
-class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of the sections of a scenario."""
-
-
-class WayConfig(Section, frozen=True, kw_only=True):
-    """What a class of features in a file of zones is worth.
-
-    width_m  of its lines; a width that a line has of its own counts more
-    factor   pace relative to the road pace (kind road), or to the ground; "ignored" leaves such features out
-    """
-
-    width_m: Annotated[float, Meta(ge=0, le=10_000)] | None = None
-    factor: Positive | Literal["lethal", "ignored"] = 1.0
-
-
-class ZoneConfig(Section, frozen=True, kw_only=True):
-    """A part of the terrain with a cost of its own. Give one of `polygon`, `polygon_m`, `mask` and `file`.
-
-    kind          forbidden is lethal; water is lethal or slow, by its class, and bridges cross it; road sets the
-                  road pace; pace sets the pace of open ground; factor multiplies it; preferred halves it; rough
-                  doubles it
-    polygon       corners as places: "46.81,9.85" (latitude, longitude), "xy:779600,190400" in metres of the map,
-                  "cell:40,200"
-    polygon_m     [east, south] corners in metres from the north-west corner of the terrain
-    mask          an image file with as many pixels as the terrain has cells: the zone is where it is not 0
-    file          a GeoJSON, GeoPackage or Shapefile (or a .zip of one), in any coordinate system; for pace and
-                  factor also a raster of them
-    layer         which layer of a file that has several
-    crs           coordinate system of the file, where it does not say it; "local": metres of the terrain's own map
-    attribute     column of the file with the pace, the factor, or the class of each feature; of roads and water
-                  that of OpenStreetMap is known
-    factor        of kind factor, where no column says it
-    pace_s_per_m  of kind pace, where no column says it
-    width_m       width of lines, where neither they nor their class say it
-    classes       class -> its width and factor, beside the built-in ones of roads and water
-    name          how messages call the zone; its kind if empty
-    """
-
-    kind: Literal["forbidden", "water", "road", "pace", "factor", "preferred", "rough"]
-    polygon: Annotated[tuple[PlaceText, ...], Meta(min_length=3, max_length=10_000)] | None = None
-    polygon_m: Polygon | None = None
-    mask: str | None = None
-    file: str | None = None
-    layer: Annotated[str, Meta(max_length=200)] | None = None
-    crs: str | None = None
-    attribute: Annotated[str, Meta(max_length=200)] | None = None
-    factor: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
-    pace_s_per_m: Annotated[float, Meta(ge=0.003, le=100)] | None = None
-    width_m: Annotated[float, Meta(gt=0, le=10_000)] | None = None
-    classes: dict[Annotated[str, Meta(max_length=200)], WayConfig] = msgspec.field(default_factory=dict)
-    name: str = ""
-
-    @property
-    def value(self) -> float | None:
-        """The factor or the pace, of these kinds."""
-        return {"factor": self.factor, "pace": self.pace_s_per_m}.get(self.kind)
-
-    @property
-    def called(self) -> str:
-        """How messages call it."""
-        return self.name or self.kind
-
-
-class HiddenConfig(Section, frozen=True, kw_only=True):
-    """What is true of the terrain and missing from the map, until vehicles find it.
-
-    closed_roads   barriers: a stretch of road and the cells beside it is lethal
-    rubble_fields  ragged patches, 4 to 10 cells in radius, of three times the pace
-    flooded_share  share of the passable cells which is one flooded, lethal valley
-    zones          zones painted on the truth only
-    """
-
-    closed_roads: Annotated[int, Meta(ge=0, le=1000)] = 0
-    rubble_fields: Annotated[int, Meta(ge=0, le=10_000)] = 0
-    flooded_share: Annotated[float, Meta(ge=0, le=0.3)] = 0.0
-    zones: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
-
-
-class TerrainConfig(Section, frozen=True, kw_only=True):
-    """Where elevation and photo come from.
-
-    source         "jacksboro" (built in), "synthetic", or a file: .tif, .tiff, .img, .hgt, .bil, .flt, .dem, .dt2,
-                   .nc, .vrt, one of these in a .zip, .asc, .npz, .png, .csv, .xyz, .map (MovingAI), .yaml or
-                   .yml (ROS)
-    photo          a colour GeoTIFF on the same ground, or nothing
-    labels         a TOML file of labelled polygons and points, from which to learn what the photo shows
-    cover          a raster of land-cover codes on the same ground: ESA WorldCover, CORINE, NLCD, or codes of one's
-                   own; also an image of such a map in the colours of its published legend
-    cover_codes    what the codes mean, where they do not show it: "worldcover", "corine", "corine-level-3", "nlcd",
-                   or a CSV file with lines of code and class (or pace relative to open ground, or "lethal")
-    cover_classes  single codes with the class (or pace, or "lethal") that counts instead of the table's
-    resolution_m   cell size to bring everything to; the source's own if not given
-    crs            coordinate system of the source where the file does not say it, such as "EPSG:32632"
-    height_scale   metres per unit of height, where the file does not say it (.png)
-    elevation_encoding  what stands for a height, where the file does not show it: numbers, or the colours of
-                   Terrain-RGB or Terrarium tiles
-    nodata         voids are lethal, or filled from their surroundings
-    nodata_values  heights, as they are stored in the source, that stand for no height beside those that it declares
-    level_is       what level ground of a file is taken for where no photo shows it: elevation models are levelled
-                   on lakes and the sea
-    water_below_m  ground of a file lower than this is water where no photo shows it; 0 for a coast
-    roads          how many roads to lay between seeded places, as there is no map of them
-    rows           synthetic: cells from north to south
-    cols           synthetic: cells from west to east
-    relief_m       synthetic: height of the highest cell above the lowest
-    rivers         synthetic: how many rivers cross the terrain
-    hidden         what is true of the terrain and missing from the map
-    """
-
-    source: Annotated[str, Meta(min_length=1)] = "jacksboro"
-    photo: str | None = None
-    labels: str | None = None
-    cover: str | None = None
-    cover_codes: Annotated[str, Meta(min_length=1)] | None = None
-    cover_classes: Annotated[dict[CoverCode, CoverGround], Meta(max_length=10_000)] = msgspec.field(
-        default_factory=dict
-    )
-    resolution_m: Positive | None = None
-    crs: str | None = None
-    height_scale: Positive | None = None
-    elevation_encoding: ElevationEncoding | None = None
-    nodata: Literal["lethal", "fill"] = "lethal"
-    nodata_values: Annotated[tuple[Annotated[float, Meta(ge=-1e9, le=1e9)], ...], Meta(max_length=20)] = ()
-    level_is: Literal["water", "ground"] = "water"
-    water_below_m: Annotated[float, Meta(ge=-20_000, le=20_000)] | None = None
-    roads: Annotated[int, Meta(ge=0, le=200)] = 0
-    rows: Annotated[int, Meta(ge=1, le=16384)] = 256
-    cols: Annotated[int, Meta(ge=1, le=16384)] = 256
-    relief_m: Annotated[float, Meta(ge=0, le=20_000)] = 400.0
-    rivers: Annotated[int, Meta(ge=0, le=50)] = 0
-    hidden: HiddenConfig = HiddenConfig()
-
-
-class CostLayerConfig(Section, frozen=True, kw_only=True):
-    """A rule of the user's own: it changes the pace that slope and ground give, before zones are painted.
-
-    layer    a plug-in
-    options  what it takes
-    """
-
-    layer: Annotated[str, _plugin()]
-    options: Options = msgspec.field(default_factory=dict)
-
-
-class CostConfig(Section, frozen=True, kw_only=True):
-    """How terrain becomes pace.
-
-    preset                  a class of vehicles, whose settings stand for those that are not given here
-    flat_speed_m_per_s      speed on level open ground
-    road_speed_m_per_s      speed on roads
-    slope_rule              what slope does to pace; `swarm terrain rules` shows all, and where they come from
-    directional             uphill is not downhill: a step costs by what it climbs along its way, instead of a cell
-                            by how steep it is; every strategy of the planner goes with it
-    steep_factor            linear, quadratic: pace at `max_slope_deg` over the flat pace
-    rolling_resistance      energy: share of its weight that a vehicle needs to roll on level open ground
-    power_reserve           energy: power of the motor over what it needs on level ground at the flat speed
-    braking_share           energy: power that the brakes can hold for long over that of the motor
-    critical_slope_percent  herzog_wheeled: the slope that doubles the pace
-    slope_table             table: points [degrees, factor on the flat pace], negative is downhill; straight lines
-                            between them, and beyond the last the same factor
-    slope_csv               table: a .csv file with such points instead. Its first line names two columns:
-                            slope_deg or slope_percent; factor, pace_s_per_m or speed_m_per_s
-    top_speed_m_per_s       no slope makes a vehicle quicker than this on open ground
-    cross_slope_factor      pace along a slope of `max_slope_deg` over that straight up or down it
-    max_slope_deg           steeper ground is lethal
-    max_climb_deg           directional: no step climbs steeper along its way; `max_slope_deg` if not given
-    max_descent_deg         directional: no step descends steeper along its way; `max_slope_deg` if not given
-    rough_per_m             share by which a metre of roughness (neighbours off the even slope) raises the pace
-    classes                 whether what covers the ground (water, forest, rock ...) counts
-    class_factor            pace of a class relative to open ground, or "lethal", instead of the built-in factors
-    vehicle_radius_m        cells in whose middle a vehicle of this radius touches a lethal cell are lethal
-                            (inflation)
-    layers                  rules of the user's own, one after the other; what is a void stays lethal
-    zones                   parts of the terrain with a cost of their own, painted in order; forbidden ones last
-    """
-
-    preset: Preset | None = None
-    flat_speed_m_per_s: SpeedOnGround = 10.0
-    road_speed_m_per_s: SpeedOnGround = 20.0
-    slope_rule: SlopeRule = "quadratic"
-    directional: bool = False
-    steep_factor: Annotated[float, Meta(ge=1)] = 6.0
-    rolling_resistance: Annotated[float, Meta(ge=0.01, le=1)] = 0.08
-    power_reserve: Annotated[float, Meta(ge=1, le=100)] = 1.0
-    braking_share: Annotated[float, Meta(ge=0.1, le=100)] = 1.0
-    critical_slope_percent: Annotated[float, Meta(ge=1, le=100)] = 12.0
-    slope_table: Annotated[tuple[tuple[Slope, SlopeFactor], ...], Meta(max_length=1000)] = ()
-    slope_csv: str | None = None
-    top_speed_m_per_s: SpeedOnGround | None = None
-    cross_slope_factor: Annotated[float, Meta(ge=1, le=100)] = 1.0
-    max_slope_deg: Annotated[float, Meta(gt=0, le=90)] = 35.0
-    max_climb_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
-    max_descent_deg: Annotated[float, Meta(gt=0, le=90)] | None = None
-    rough_per_m: NotNegative = 0.0
-    classes: bool = True
-    class_factor: dict[ClassName, Positive | Literal["lethal"]] = msgspec.field(default_factory=dict)
-    vehicle_radius_m: NotNegative = 0.0
-    layers: Annotated[tuple[CostLayerConfig, ...], Meta(max_length=32)] = ()
-    zones: Annotated[tuple[ZoneConfig, ...], Meta(max_length=1000)] = ()
+from swarm.config.ground import CostConfig, TerrainConfig
+from swarm.config.values import (
+    MOST_TARGETS,
+    Assigner,
+    CommonName,
+    Count,
+    Dynamics,
+    GroupName,
+    Name,
+    NotNegative,
+    Options,
+    PlaceText,
+    Positive,
+    ProcessName,
+    Section,
+    Sensor,
+    Standbys,
+    Strategy,
+    Walk,
+    plugin_name,
+)
 
 
 class TargetConfig(Section, frozen=True, kw_only=True):
@@ -302,7 +55,7 @@ class TargetConfig(Section, frozen=True, kw_only=True):
 
     name: Name = "t"
     count: Annotated[int, Meta(ge=1, le=MOST_TARGETS)] = 1
-    walk: Annotated[str, _plugin(Walk)] = "waypoints"
+    walk: Annotated[str, plugin_name(Walk)] = "waypoints"
     walk_options: Options = msgspec.field(default_factory=dict)
     speed_m_per_s: NotNegative = 4.0
     tracker: Literal["always", "sighted"] = "always"
@@ -378,11 +131,11 @@ class VehicleConfig(Section, frozen=True, kw_only=True):
     route_cells: Annotated[int, Meta(ge=0)] = 0
     reserve_cells: Annotated[int, Meta(ge=1, le=16)] = 3
     reassign_s: Positive = 5.0
-    sensor: Annotated[str, _plugin(Sensor)] = "truth"
+    sensor: Annotated[str, plugin_name(Sensor)] = "truth"
     sensor_options: Options = msgspec.field(default_factory=dict)
-    assignment: Annotated[str, _plugin(Assigner)] = "spread"
+    assignment: Annotated[str, plugin_name(Assigner)] = "spread"
     assignment_options: Options = msgspec.field(default_factory=dict)
-    dynamics: Annotated[str, _plugin(Dynamics)] = "ground"
+    dynamics: Annotated[str, plugin_name(Dynamics)] = "ground"
     dynamics_options: Options = msgspec.field(default_factory=dict)
 
 
@@ -403,7 +156,7 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     push_s            newer routes are pushed to a vehicle at most this often
     """
 
-    strategy: Annotated[str, _plugin(Strategy)] = "auto"
+    strategy: Annotated[str, plugin_name(Strategy)] = "auto"
     strategy_options: Options = msgspec.field(default_factory=dict)
     tick_hz: Annotated[float, Meta(gt=0, le=100)] = 10.0
     edge: Literal["octile", "paper"] = "octile"

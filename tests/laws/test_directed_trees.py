@@ -30,7 +30,9 @@ from planner_service.tree.corridors import find_corridors
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
-from swarm.config.scenario import CostConfig, PlannerConfig, SlopeRule
+from swarm.config.ground import CostConfig
+from swarm.config.scenario import PlannerConfig
+from swarm.config.values import SlopeRule
 from swarm.grid import GridSpec, Window
 
 SLOPES: tuple[SlopeRule, ...] = ("energy", "tobler", "quadratic")

@@ -22,9 +22,9 @@ from shared_map.keeper.export import from_json
 from shared_map.terrain.importers.grids.array_files import read_npy
 from shared_map.terrain.importers.photos.labels import read_labels
 from shared_map.terrain.importers.sources import load_source
+from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, parse_toml, read_bytes
 from swarm.config.load import load_scenario
-from swarm.config.scenario import TerrainConfig
 from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.grid import GridSpec
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 from shared_map.arrays import Floats
 from shared_map.terrain.importers.sources import Source, load_source
 from shared_map.terrain.layers import TerrainClass
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 
 SIDE = 200
 

@@ -16,7 +16,8 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Replied
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import PlannerConfig, Scenario, Strategy, TargetConfig
+from swarm.config.scenario import PlannerConfig, Scenario, TargetConfig
+from swarm.config.values import Strategy
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages.base import Message
 from swarm.wire.messages.planning import RouteReply, RouteRequest

@@ -11,7 +11,7 @@ import shapely
 from rasterio.warp import transform as to_crs
 
 from shared_map.terrain.zones import paint_zones
-from swarm.config.scenario import CostConfig, ZoneConfig
+from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.grid import GridSpec
 
 UTM = GridSpec(40, 50, 10.0, 500_000.0, 5_200_000.0, "EPSG:32632")

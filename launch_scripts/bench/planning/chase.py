@@ -24,7 +24,8 @@ from launch_scripts.bench.tables import Progress
 from launch_scripts.world.walks import WALKS, Budget, Walker, WalkWorld
 from planner_service.strategy import ROWS, STAGES, OnMove
 from planner_service.target_tree import TargetTree
-from swarm.config.scenario import PlannerConfig, Strategy, Walk
+from swarm.config.scenario import PlannerConfig
+from swarm.config.values import Strategy, Walk
 from swarm.errors import ConfigError
 from swarm.grid import walk
 from swarm.wire.routes import OK, RouteBatch

@@ -14,7 +14,8 @@ from launch_scripts.bench.machine import machine
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.config.scenario import CostConfig, PlannerConfig, Scenario, TerrainConfig
+from swarm.config.ground import CostConfig, TerrainConfig
+from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.grid import Window
 
 _HALVES = (16, 32, 64)

@@ -104,7 +104,8 @@ def from_file(path: Path) -> Pace:
             pace = factor
         case _:
             from shared_map.terrain.terrain import build_terrain
-            from swarm.config.scenario import Scenario, TerrainConfig
+            from swarm.config.ground import TerrainConfig
+            from swarm.config.scenario import Scenario
 
             pace = build_terrain(Scenario(terrain=TerrainConfig(source=str(path)))).pace_s_per_m
     return np.ascontiguousarray(pace, np.float32)

@@ -14,7 +14,8 @@ from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, label_of, number, percent, table
 from launch_scripts.world.walks import FLEEING, STANDING
 from planner_service.kernel_build import load_all
-from swarm.config.scenario import PlannerConfig, Strategy, Walk
+from swarm.config.scenario import PlannerConfig
+from swarm.config.values import Strategy, Walk
 
 WALKS: tuple[Walk, ...] = tuple(walk for walk in get_args(Walk) if walk not in STANDING)
 

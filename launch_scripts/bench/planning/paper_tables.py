@@ -17,7 +17,8 @@ from launch_scripts.bench.planning.chase import Plan, chase
 from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, label_of, number, percent, table, times
 from planner_service.kernel_build import load_all
-from swarm.config.scenario import PlannerConfig, Strategy
+from swarm.config.scenario import PlannerConfig
+from swarm.config.values import Strategy
 
 PAPERS: Strategy = "variable_range+multi_resolution"
 COMPARED: tuple[Strategy, ...] = ("full", PAPERS, "rotation")

@@ -19,7 +19,7 @@ from launch_scripts.bench.tables import label_of, on_machine
 from launch_scripts.report.pictures.palette import BLUE, FAINT, GREEN, INK, ORANGE, PINK, SKY, VIOLET
 from launch_scripts.report.pictures.plot_style import STYLE
 from launch_scripts.report.pictures.plots import halo
-from swarm.config.scenario import Strategy
+from swarm.config.values import Strategy
 
 _COLOURS: dict[Strategy, str] = {
     "full": INK,

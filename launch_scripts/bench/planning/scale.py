@@ -14,7 +14,8 @@ from launch_scripts.bench.planning.chase import Plan, chase
 from launch_scripts.bench.planning.fields import Field, make_field
 from launch_scripts.bench.tables import Progress, narrow_label_of, number, percent, table
 from planner_service.kernel_build import load_all
-from swarm.config.scenario import PlannerConfig, Strategy
+from swarm.config.scenario import PlannerConfig
+from swarm.config.values import Strategy
 
 Point = tuple[int, int, int]
 """Cells a side, targets, vehicles."""

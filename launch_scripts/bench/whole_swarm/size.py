@@ -7,7 +7,8 @@ import math
 import msgspec
 
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import MOST_TARGETS, Scenario
+from swarm.config.scenario import Scenario
+from swarm.config.values import MOST_TARGETS
 from swarm.errors import ConfigError
 
 CELLS_PER_VEHICLE = 262.144

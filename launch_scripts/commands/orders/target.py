@@ -36,7 +36,7 @@ def add(
         str,
         typer.Option(
             help="still, random, waypoints or evade, as in a scenario.",
-            autocompletion=complete.words("swarm.config.scenario", "Walk"),
+            autocompletion=complete.words("swarm.config.values", "Walk"),
         ),
     ] = "waypoints",
     speed: Annotated[float, typer.Option(help="Metres per second on level open ground.")] = 4.0,

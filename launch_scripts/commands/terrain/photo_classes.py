@@ -22,7 +22,8 @@ from launch_scripts.commands.terrain.terrain_options import (
 )
 from launch_scripts.launcher.progress import progress
 from shared_map.terrain.layers import TerrainClass
-from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.config.ground import TerrainConfig
+from swarm.config.scenario import Scenario
 
 if TYPE_CHECKING:
     from shared_map.terrain.terrain import Terrain

@@ -20,7 +20,8 @@ from shared_map.terrain.slope_rules import (
     step_limits_deg,
 )
 from swarm.config.cost_rules import PRESETS, cost_of_preset
-from swarm.config.scenario import CostConfig, Scenario
+from swarm.config.ground import CostConfig
+from swarm.config.scenario import Scenario
 
 SLOPES_PERCENT = (-30, -20, -10, -5, 0, 5, 10, 20, 30)
 """Of the tables; downhill is negative."""

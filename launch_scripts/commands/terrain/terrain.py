@@ -32,7 +32,8 @@ from launch_scripts.commands.terrain.terrain_options import (
 )
 from launch_scripts.launcher.progress import progress
 from swarm.config.cost_rules import cost_of_preset
-from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.config.ground import TerrainConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError, TerrainError
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass
-from swarm.config.scenario import ElevationEncoding
+from swarm.config.values import ElevationEncoding
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:

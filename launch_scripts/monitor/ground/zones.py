@@ -15,7 +15,8 @@ from launch_scripts.monitor.ground.terrain_mesh import Floats, TerrainMesh
 from shared_map.keeper.zones import cells_of_zones
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.zones import zone_mask
-from swarm.config.scenario import Scenario, ZoneConfig
+from swarm.config.ground import ZoneConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 from swarm.wire.statements import MarkKind

@@ -10,7 +10,7 @@ import numpy as np
 from shared_map.terrain.importers.source import Source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
 

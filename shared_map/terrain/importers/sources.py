@@ -18,8 +18,8 @@ from shared_map.terrain.importers.rasters.raster_kinds import is_raster
 from shared_map.terrain.importers.source import Source as Source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
+from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, check_bytes
-from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 

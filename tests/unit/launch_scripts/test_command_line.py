@@ -19,7 +19,7 @@ from launch_scripts.check import machine
 from launch_scripts.cli import command, main
 from launch_scripts.launcher.options import find_scenario
 from launch_scripts.report.results.run_folder import begin_run
-from swarm.config.scenario import Walk
+from swarm.config.values import Walk
 
 
 def offered(*words: str) -> list[str]:

@@ -23,8 +23,10 @@ from launch_scripts.commands.new import Choices, _asked
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.commented import commented
 from swarm.config.describe import expected, meanings
+from swarm.config.ground import TerrainConfig
 from swarm.config.load import load_scenario, parse_scenario, read_scenario
-from swarm.config.scenario import GroupConfig, Preset, Scenario, TargetConfig, Walk
+from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
+from swarm.config.values import Preset, Walk
 from swarm.errors import ConfigError
 from vehicle_agent.placement import spawn_cells
 
@@ -92,7 +94,8 @@ def test_every_key_that_new_writes_stands_below_its_meaning(
 
 
 def _sections() -> list[type[typing.Any]]:
-    return [each for each in vars(sys.modules[Scenario.__module__]).values() if isinstance(each, type(Scenario))]
+    modules = [vars(sys.modules[each.__module__]) for each in (Scenario, TerrainConfig)]
+    return [each for module in modules for each in module.values() if isinstance(each, type(Scenario))]
 
 
 def test_files_are_named_from_where_the_scenario_lies(

@@ -22,7 +22,9 @@ from launch_scripts.world.walks import (
     far_place,
     slowness_of,
 )
-from swarm.config.scenario import CostConfig, TargetConfig, Walk
+from swarm.config.ground import CostConfig
+from swarm.config.scenario import TargetConfig
+from swarm.config.values import Walk
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

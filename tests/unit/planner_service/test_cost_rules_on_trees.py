@@ -15,7 +15,8 @@ from planner_service.target_tree import TargetTree
 from shared_map.terrain.layers import terrain_pace
 from shared_map.terrain.slope_rules import SLOPE_RULES
 from shared_map.terrain.step_climb import Climb, climb_of
-from swarm.config.scenario import CostConfig, PlannerConfig
+from swarm.config.ground import CostConfig
+from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.routes import RouteStatus
 

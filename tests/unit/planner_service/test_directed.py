@@ -16,8 +16,10 @@ from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.synthetic.noise import mountains
 from shared_map.terrain.terrain import build_terrain, load_prepared, save_prepared
 from swarm.config.agents import plan_agents
+from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import CostConfig, PlannerConfig, Scenario, Strategy, TerrainConfig
+from swarm.config.scenario import PlannerConfig, Scenario
+from swarm.config.values import Strategy
 from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window, walk
 from swarm.right_of_way.holdings import Holdings

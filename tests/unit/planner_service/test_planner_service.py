@@ -20,7 +20,8 @@ from shared_map.cost_map import CostMap
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import PlannerConfig, Strategy
+from swarm.config.scenario import PlannerConfig
+from swarm.config.values import Strategy
 from swarm.grid import GridSpec, walk
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import MAX_PAYLOAD_BYTES, encode

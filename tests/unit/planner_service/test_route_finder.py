@@ -13,7 +13,7 @@ from support.planner_strategies import random_pace
 
 import planner_service
 from planner_service import RouteFinder
-from swarm.config.scenario import Strategy
+from swarm.config.values import Strategy
 from swarm.errors import OutsideGridError
 from swarm.wire.routes import RouteStatus
 

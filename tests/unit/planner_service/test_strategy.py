@@ -26,7 +26,8 @@ from planner_service.strategy import (
 )
 from planner_service.target_tree import TargetTree
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
-from swarm.config.scenario import PlannerConfig, Strategy
+from swarm.config.scenario import PlannerConfig
+from swarm.config.values import Strategy
 from swarm.grid import GridSpec
 from swarm.plugins.find import Plugin
 

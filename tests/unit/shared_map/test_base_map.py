@@ -17,7 +17,8 @@ from shared_map.keeper.base_map_transfer import BaseMapServer, Fetching, fetch_b
 from shared_map.keeper.store import KeeperStore
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Bus, Event, Replied
-from swarm.config.scenario import CostConfig, GroupConfig, Scenario, TerrainConfig, ZoneConfig
+from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
+from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ProtocolError, TerrainError
 from swarm.wire.messages.base import Nothing
 from swarm.wire.messages.base_map import BaseMap, BaseMapRequest, BaseMapTile

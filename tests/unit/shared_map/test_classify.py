@@ -21,7 +21,7 @@ from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import counted, looked_up
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
 from shared_map.terrain.synthetic.noise import fractal
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

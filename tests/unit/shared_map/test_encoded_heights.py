@@ -14,7 +14,7 @@ from support.height_models import SIDE, hills, load, written
 from shared_map.terrain.importers.rasters.encoded_heights import ENCODINGS, decoded, is_plausible
 from shared_map.terrain.importers.rasters.raster_contents import contents_of
 from shared_map.terrain.layers import TerrainClass
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
 STEP_M = {"terrain-rgb": 0.1, "terrarium": 1 / 256}

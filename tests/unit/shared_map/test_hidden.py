@@ -15,7 +15,8 @@ from shared_map.terrain import hidden
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.synthetic.noise import Noise, fractal_noise, mountain_noise
 from shared_map.terrain.terrain import Terrain, build_terrain, build_truth
-from swarm.config.scenario import HiddenConfig, Scenario, TerrainConfig, ZoneConfig
+from swarm.config.ground import HiddenConfig, TerrainConfig, ZoneConfig
+from swarm.config.scenario import Scenario
 
 SYNTHETIC = TerrainConfig(source="synthetic", rows=80, cols=90, relief_m=200, roads=4)
 

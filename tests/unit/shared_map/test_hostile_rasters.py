@@ -15,7 +15,7 @@ from rasterio.transform import from_origin
 from shared_map.terrain.importers.rasters.rasters import read_elevation
 from shared_map.terrain.importers.water.level_ground import level_ground
 from shared_map.terrain.importers.water.voids import undeclared_voids
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
 HEIGHTS = np.add.outer(np.arange(40) * 2.0, np.arange(40) * 1.0).astype(np.float32)

@@ -13,7 +13,8 @@ import pytest
 
 from shared_map.terrain import kept, terrain
 from shared_map.terrain.terrain import prepare
-from swarm.config.scenario import CostConfig, HiddenConfig, Scenario, TerrainConfig, ZoneConfig
+from swarm.config.ground import CostConfig, HiddenConfig, TerrainConfig, ZoneConfig
+from swarm.config.scenario import Scenario
 
 SMALL = Scenario(terrain=TerrainConfig(source="synthetic", rows=40, cols=50, relief_m=50, roads=2), seed=3)
 

@@ -17,8 +17,9 @@ from shared_map.terrain.importers.cover.cover_tables import TABLES, read_cover_t
 from shared_map.terrain.importers.cover.land_cover import read_cover
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
+from swarm.config.ground import TerrainConfig
 from swarm.config.load import COVER_TABLES, parse_scenario
-from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 

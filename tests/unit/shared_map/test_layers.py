@@ -24,7 +24,9 @@ from shared_map.terrain.layers import (
 from shared_map.terrain.slope_rules import SLOPE_RULES, directional_factor, slope_factor
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones, zone_mask
-from swarm.config.scenario import CostConfig, Scenario, SlopeRule, TerrainConfig, ZoneConfig
+from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
+from swarm.config.scenario import Scenario
+from swarm.config.values import SlopeRule
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -16,7 +16,7 @@ from support.zone_shapes import UTM, feature, geojson, middles, painted, written
 
 from shared_map.terrain.importers.zones.zone_outlines import outlines_of
 from shared_map.terrain.layers import polygon_mask
-from swarm.config.scenario import ZoneConfig
+from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

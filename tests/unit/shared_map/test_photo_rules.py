@@ -20,7 +20,7 @@ from shared_map.terrain.importers.photos.photo_rules import CLASS_OF_READINGS, E
 from shared_map.terrain.importers.source import Source
 from shared_map.terrain.layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic.landscape import landscape, paint_photo
-from swarm.config.scenario import CostConfig, TerrainConfig
+from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.grid import GridSpec
 
 BIT = {kind: np.uint8(1 << n) for n, kind in enumerate(READABLE)}

@@ -10,7 +10,8 @@ import pytest
 from shared_map.terrain.importers.grids.plain_files import read_pgm
 from shared_map.terrain.importers.sources import Source, load_source
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.scenario import CostConfig, Scenario, TerrainConfig
+from swarm.config.ground import CostConfig, TerrainConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 
 DATA = Path(__file__).parents[4] / "shared" / "data"

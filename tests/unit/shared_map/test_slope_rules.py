@@ -24,8 +24,8 @@ from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
 from shared_map.terrain.terrain_report import doubts_about, facts_of
 from swarm.config.cost_rules import PRESETS, check_cost, cost_of_preset
+from swarm.config.ground import CostConfig
 from swarm.config.load import load_scenario, parse_scenario
-from swarm.config.scenario import CostConfig
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.wire.statements import PACE_LEAST, PACE_MOST

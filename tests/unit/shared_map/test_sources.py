@@ -18,7 +18,8 @@ from shared_map.terrain.importers.sources import FILE_KINDS, Source, load_source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.describe import meanings
-from swarm.config.scenario import Scenario, TerrainConfig
+from swarm.config.ground import TerrainConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 
 DATA = Path(__file__).parents[4] / "shared" / "data"

@@ -25,8 +25,9 @@ from shared_map.terrain.terrain import (
     scenario_key,
     terrain_of_pace,
 )
+from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.load import load_scenario
-from swarm.config.scenario import CostConfig, Scenario, TerrainConfig, ZoneConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.runtime.role import RoleSetup
 

@@ -19,7 +19,7 @@ from support.zone_shapes import OPEN, UTM, feature, geojson, middles, painted, s
 
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.zones import paint_zones
-from swarm.config.scenario import WayConfig, ZoneConfig
+from swarm.config.ground import WayConfig, ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

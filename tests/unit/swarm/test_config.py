@@ -9,7 +9,8 @@ import pytest
 from swarm.config.agents import plan_agents
 from swarm.config.describe import meanings
 from swarm.config.load import load_scenario, parse_scenario
-from swarm.config.scenario import Scenario, Section
+from swarm.config.scenario import Scenario
+from swarm.config.values import Section
 from swarm.errors import ConfigError
 
 

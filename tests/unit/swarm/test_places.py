@@ -16,8 +16,9 @@ from shared_map.terrain.places import MapFrame, latitudes_of
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import zone_mask
 from swarm.client.frame import Frame
+from swarm.config.ground import TerrainConfig, ZoneConfig
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario, TerrainConfig, ZoneConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 from swarm.places import bounds_of, brief, cell_of, corners_of, extent_of, fields_of, read_place, written

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from planner_service.target_tree import TargetTree
 from shared_map.terrain.step_climb import Climb, climb_of
-from swarm.config.scenario import CostConfig, PlannerConfig
+from swarm.config.ground import CostConfig
+from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, walk
 from swarm.wire.routes import RouteStatus
 from vehicle_agent.bodies import Bodies

@@ -22,7 +22,7 @@ from shared_map.terrain.importers.cover.cover_recognition import (
 )
 from shared_map.terrain.importers.cover.cover_tables import TABLES, CoverTable, own_grounds, table_named
 from shared_map.terrain.importers.rasters.rasters import opened, thinned
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
 _MOST_SAMPLED = 1 << 20

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from shared_map.terrain.layers import TerrainClass
 from swarm.config.input_files import FileKind, read_text
-from swarm.config.scenario import CoverGround
+from swarm.config.values import CoverGround
 from swarm.errors import TerrainError
 
 Rgb = tuple[int, int, int]

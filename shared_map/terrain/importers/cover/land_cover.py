@@ -24,7 +24,7 @@ from shared_map.terrain.importers.rasters.rasters import opened
 from shared_map.terrain.importers.source import Source
 from shared_map.terrain.layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, bands, no_progress
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from shared_map.arrays import Bytes
 from shared_map.terrain.layers import TerrainClass, polygon_mask
 from swarm.config.input_files import FileKind, parse_toml, read_text
-from swarm.config.scenario import ClassName, Point, Polygon, Section
+from swarm.config.values import ClassName, Point, Polygon, Section
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -16,7 +16,7 @@ from shared_map.terrain.importers.rasters.raster_contents import Contents, conte
 from shared_map.terrain.importers.rasters.rasters import elevation_of
 from shared_map.terrain.importers.source import Source
 from shared_map.terrain.row_bands import Progress
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
 _METRES = 'LOCAL_CS["image",UNIT["metre",1]]'

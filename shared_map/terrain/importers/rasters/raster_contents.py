@@ -11,7 +11,7 @@ from shared_map.terrain.importers.cover.cover_meaning import meaning_of, sampled
 from shared_map.terrain.importers.cover.cover_recognition import evidence_of, legend_of, recognise, some
 from shared_map.terrain.importers.cover.cover_tables import TABLES
 from shared_map.terrain.importers.rasters.encoded_heights import TITLES, Encoding, encodings_of
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 
 _MOST_CODES = 256

@@ -22,8 +22,8 @@ from shared_map.terrain.importers.rasters.raster_kinds import kind_of
 from shared_map.terrain.importers.water.level_ground import MOST_SAMPLED, looked_at
 from shared_map.terrain.importers.water.voids import without
 from shared_map.terrain.row_bands import Progress, bands, no_progress
+from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import size
-from swarm.config.scenario import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 

@@ -17,7 +17,7 @@ from shared_map.arrays import Bools, Floats
 from shared_map.terrain.importers.water.level_patches import Patches, level_patches
 from shared_map.terrain.importers.water.voids import HIGHEST_M, undeclared_voids, without
 from shared_map.terrain.row_bands import bands, looked_up
-from swarm.config.scenario import TerrainConfig
+from swarm.config.ground import TerrainConfig
 
 MOST_SAMPLED = 1 << 24
 """Cells of a file in which level ground is looked for, and in rasters voids: of larger ones in every second, ..."""

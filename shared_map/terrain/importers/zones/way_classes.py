@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from swarm.config.scenario import WayConfig
+from swarm.config.ground import WayConfig
 
 Kind = Literal["road", "water"]
 MOST_WIDTH_M = 10_000.0

@@ -33,7 +33,7 @@ from shared_map.terrain.importers.zones.way_classes import (
     way_of,
     width_of,
 )
-from swarm.config.scenario import ZoneConfig
+from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 

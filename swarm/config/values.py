@@ -1,0 +1,80 @@
+"""Types of settings: their ranges, and the words that they may be."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, get_args
+
+import msgspec
+from msgspec import Meta
+
+from swarm.ranks import HIGHEST_RANK
+
+Positive = Annotated[float, Meta(gt=0, le=1e12)]
+NotNegative = Annotated[float, Meta(ge=0, le=1e12)]
+Count = Annotated[int, Meta(ge=1, le=100_000)]
+Standbys = Annotated[int, Meta(ge=0, le=HIGHEST_RANK)]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,40}$")]
+GroupName = Annotated[str, Meta(pattern=r"^(\*|[A-Za-z0-9_][A-Za-z0-9_.-]{0,40})$")]
+ProcessName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}$")]
+CommonName = Annotated[str, Meta(pattern=r"^[a-z]+\.[A-Za-z0-9_.-]{1,56}(~[0-9]{1,4})?$")]
+Metres = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Point = tuple[Metres, Metres]
+Polygon = Annotated[tuple[Point, ...], Meta(min_length=3, max_length=10_000)]
+PlaceText = str
+"""A place as `swarm.places` reads it. No `Meta`: msgspec 0.22 crashes on a union of a bounded text and a pair."""
+
+RESERVED_GROUP = "operator"
+"""No group is called so: zones are marks of this one, which every group hears."""
+MOST_TARGETS = 1000
+"""Of all entries together."""
+
+Strategy = Literal[
+    "auto", "full", "rotation", "variable_range", "multi_resolution", "variable_range+multi_resolution"
+]
+SlopeRule = Literal[
+    "linear", "quadratic", "energy", "tobler", "naismith_langmuir", "minetti", "herzog", "herzog_wheeled", "table"
+]
+
+Preset = Literal["hiker", "wheeled", "tracked", "quadruped"]
+
+Slope = Annotated[float, Meta(gt=-90, lt=90)]
+SlopeFactor = Annotated[float, Meta(ge=0.01, le=100)]
+SpeedOnGround = Annotated[float, Meta(ge=0.01, le=340)]
+"""m/s; what a map can tell of a cell (`swarm.wire.statements.PACE_LEAST` and `PACE_MOST`)."""
+
+Walk = Literal["still", "random", "waypoints", "evade", "external"]
+
+Sensor = Literal["truth"]
+
+Assigner = Literal["spread"]
+
+Dynamics = Literal["ground"]
+
+
+def plugin_name(built_in: Any = None) -> Meta:
+    """Names of one kind: those that are built in, and those of plug-ins (`swarm.config.plugin_names`)."""
+    names = list(get_args(built_in))
+    return Meta(
+        pattern=r"^[\w.+-]{1,100}(:[\w.]{1,100})?$",
+        extra={"built_in": names},
+        extra_json_schema={"examples": [*names, "module:Name"]},
+    )
+
+
+Options = dict[str, Any]
+"""What is said to a plug-in: its own struct checks it."""
+
+ClassName = Literal[
+    "unknown", "water", "forest", "rock", "grass", "soil", "road", "built", "snow", "shrub", "wetland"
+]
+
+CoverGround = Literal[ClassName, "lethal"] | Positive
+"""What a code of a land-cover map stands for: a class, or a pace relative to open ground."""
+
+CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}$")]
+
+ElevationEncoding = Literal["metres", "terrain-rgb", "terrarium"]
+
+
+class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of the sections of a scenario."""
