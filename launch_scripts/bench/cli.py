@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from launch_scripts.bench.options import AsJson, Picture, check_picture, names_of, numbers_of
+from launch_scripts.bench.options import AsJson, Picture, Seed, check_picture, names_of, numbers_of
 from launch_scripts.bench.show import progress_of, show
 from launch_scripts.bench.whole_swarm import commands as whole_swarm
 from swarm.config.values import Strategy
@@ -23,7 +23,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-Seed = Annotated[int, typer.Option(min=0, help="Seed of fields, roots and walks.")]
 Frames = Annotated[int, typer.Option(min=1, help="Frames; each target moves one cell a frame.")]
 FieldOption = Annotated[
     str, typer.Option(help="terrain, uniform, maze, or a file: elevation, MovingAI .map, .npy of paces in s/m.")
@@ -389,37 +388,6 @@ def presence(
     with progress_of("presence") as progress:
         report = run(numbers_of(vehicles, "vehicles", 25), rounds, progress)
     show(report, as_json)
-
-
-@app.command()
-def view(
-    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles, several with commas.")] = "100,1000",
-    targets: Annotated[int, typer.Option(min=1, max=200, help="Targets.")] = 10,
-    groups: Annotated[int, typer.Option(min=1, max=20, help="Groups of vehicles.")] = 1,
-    seconds: Annotated[float, typer.Option(min=1, max=3600, help="How long to draw, after the first frames.")] = 20,
-    seed: Seed = 5,
-    out: Annotated[Path | None, typer.Option(help="Keep the recording here (.rrd), to look at it.")] = None,
-    as_json: AsJson = False,
-) -> None:
-    """The live view: CPU time of a frame and size of a recording, by number of vehicles.
-
-    \b
-    swarm bench view --vehicles 1000 --json
-    swarm bench view --vehicles 1000 --groups 3 --out view.rrd      then: rerun view.rrd
-
-    Made-up vehicles drive along real routes and say so ten times a second; the monitor's own service draws them to
-    a file. No network and no viewer is part of it.
-    """
-    from launch_scripts.bench.view import run_view, tables
-
-    counts = numbers_of(vehicles, "vehicles")
-    if out is not None and (out.suffix != ".rrd" or len(counts) > 1 or not out.absolute().parent.is_dir()):
-        raise ConfigError(
-            f"--out {out}: expected a name that ends in .rrd, in a folder that is there, and one number"
-        )
-    with progress_of("view") as progress:
-        report = run_view(counts, targets, groups, seconds, seed, out, progress)
-    show(report, as_json, tables)
 
 
 app.add_typer(whole_swarm.app)

@@ -12,6 +12,7 @@ from swarm.errors import ConfigError
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 Picture = Annotated[Path | None, typer.Option(help="Write a plot (.png) too.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of fields, roots and walks.")]
 
 
 def names_of(text: str, what: str, allowed: Sequence[str]) -> tuple[Any, ...]:

@@ -1,4 +1,4 @@
-"""`swarm bench swarm` and `swarm bench crowd`."""
+"""`swarm bench swarm`, `swarm bench crowd` and `swarm bench view`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from launch_scripts.bench.options import AsJson, names_of, numbers_of
+from launch_scripts.bench.options import AsJson, Seed, names_of, numbers_of
 from launch_scripts.bench.show import progress_of, show
 from swarm.errors import ConfigError
 
@@ -167,3 +167,34 @@ def _ending_in_order() -> Iterator[None]:
 def _exit_if(failed: bool) -> None:
     if failed:
         raise typer.Exit(1)
+
+
+@app.command()
+def view(
+    vehicles: Annotated[str, typer.Option(help="Numbers of vehicles, several with commas.")] = "100,1000",
+    targets: Annotated[int, typer.Option(min=1, max=200, help="Targets.")] = 10,
+    groups: Annotated[int, typer.Option(min=1, max=20, help="Groups of vehicles.")] = 1,
+    seconds: Annotated[float, typer.Option(min=1, max=3600, help="How long to draw, after the first frames.")] = 20,
+    seed: Seed = 5,
+    out: Annotated[Path | None, typer.Option(help="Keep the recording here (.rrd), to look at it.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """The live view: CPU time of a frame and size of a recording, by number of vehicles.
+
+    \b
+    swarm bench view --vehicles 1000 --json
+    swarm bench view --vehicles 1000 --groups 3 --out view.rrd      then: rerun view.rrd
+
+    Made-up vehicles drive along real routes and say so ten times a second; the monitor's own service draws them to
+    a file. No network and no viewer is part of it.
+    """
+    from launch_scripts.bench.view import run_view, tables
+
+    counts = numbers_of(vehicles, "vehicles")
+    if out is not None and (out.suffix != ".rrd" or len(counts) > 1 or not out.absolute().parent.is_dir()):
+        raise ConfigError(
+            f"--out {out}: expected a name that ends in .rrd, in a folder that is there, and one number"
+        )
+    with progress_of("view") as progress:
+        report = run_view(counts, targets, groups, seconds, seed, out, progress)
+    show(report, as_json, tables)
