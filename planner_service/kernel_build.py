@@ -29,6 +29,8 @@ from planner_service.kernels import (
     directed_growth,
     lower_bounds,
     parents,
+    pieces,
+    pieces_mend,
     radix_heap,
     repair,
     route_walk,
@@ -64,8 +66,15 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     corridor_growth.tighten,
     corridor_growth.mark_levels,
     route_walk.relabel,
+    pieces_mend.mend_tiles,
+    pieces.relabel_tiles,
+    pieces.evaluate,
+    pieces_mend.cut_ways,
+    pieces_mend.merge_parents,
+    pieces_mend.drop_lost,
+    pieces.costs_at,
 )
-"""For windows, repairs and corridors, which save growing whole trees."""
+"""For windows, repairs, corridors and pieces, which save growing whole trees."""
 
 _POLL_S = 0.1
 _BUILDERS = "builders.lock"
