@@ -50,6 +50,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.price_routes,
     cell_costs.changed_cells,
     route_walk.find_starts,
+    route_walk.drive_rests,
     cell_costs.cell_cost_range,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
