@@ -356,11 +356,11 @@ def evaluate(grid, labels, pieces, tiles, names, order, now, stack, todo):
 
     order  all tiles, those nearest the root first
     now    0, or a number that `now` never was: most totals are expected to have changed, as when the root has moved
-    If not, sweep by sweep tiles about one whose totals have changed are added up. A sweep takes a 10th of the time; but
-    where all change, each tile is added up 7 times at 4096 x 4096.
-    Either ends, as pieces lead nowhere in a circle.
+    If not, tiles about one whose totals have changed are added up, sweep by sweep. That takes a tenth of the time
+    where few change; where all do, each tile of 4096 x 4096 cells would be added up 7 times. Either way it ends, as
+    no piece leads to itself.
     """
-    exits, many, _, wanted, falls, ends, across = tiles
+    _, many, _, wanted, falls, ends, across = tiles
     down = many.size // across
     for t in range(many.size):
         falls[0, t], falls[1, t] = (0.0, 0.0) if many[t] else (np.inf, -np.inf)

@@ -32,8 +32,7 @@ class PieceTree:
                before the first `take`
     root       the target's cell, of the grid; -1 before the first `take`
     exact      whether all costs are the least there are. `take` sets it; a `move` or a `repair` that gives way
-    resets
-               it. The tree then still leads to its root, and states what is driven
+               resets it. The tree then still leads to its root, and states what is driven
     """
 
     def __init__(self, cost_grid: CostGrid) -> None:
@@ -143,8 +142,10 @@ class PieceTree:
         pieces.relabel_tiles(self.cost_grid.padded, self._labels, self._tiles, self._bench, which)
 
     def _settle(self, most: float, moved: bool) -> int:
-        """Look at tiles until the tree is exact, or gives way to a growth once it has looked at `most`. moved: totals
-        have changed nearly everywhere."""
+        """Look at tiles until the tree is exact, or gives way to a growth once it has looked at `most`.
+
+        moved  totals have changed nearly everywhere
+        """
         grid = self.cost_grid.padded
         self._now += moved
         now = self._now if moved else 0
