@@ -99,7 +99,7 @@ def _flood(grid, side, box, node, count, first, queue):
 
 
 @kernel(f"({GRID}, i4[::1], u4[::1], f4[::1], u1[::1], i4[::1], Tuple((f4[::1], i8[::1], i4[::1])))")
-def grow_inside_nodes(grid, node, centre, cost, parent, depth, heap):
+def find_ways_to_centres(grid, node, centre, cost, parent, depth, heap):
     """Grow a tree from each centre over the cells of its node (Dijkstra's algorithm with a binary heap). Writes
     cost, parent and depth of all cells that belong to a node.
 

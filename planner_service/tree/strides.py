@@ -228,7 +228,7 @@ def _find_stride(
     cost, parent = np.empty(size, np.float32), np.empty(size, np.uint8)
     depth, place = np.empty(size, np.int32), np.empty(size, np.int32)
     heap = np.empty(room, np.float32), np.empty(room, np.int64)
-    stride_network.grow_inside_nodes(padded, node, centre, cost, parent, depth, (*heap, place))
+    stride_network.find_ways_to_centres(padded, node, centre, cost, parent, depth, (*heap, place))
     del place, heap
     steps, price = _joining_steps(grid, node, cost, many)
     u, v = steps >> 3, (steps >> 3) + offsets[steps & 7]
