@@ -187,8 +187,8 @@ class Life:
         followed = self._some(5)
         self._tree.adopt(self._grown, self._pace, self._target, self._dirty, self._version, followed)
         self._grown = None
-        if self._tree.wants_corridors:
-            self._tree.take_corridors(self._tree.corridor_job().run())
+        if self._tree.wants_strides:
+            self._tree.take_strides(self._tree.stride_job().run())
 
     def _check(self) -> None:
         if not self._tree.ready:

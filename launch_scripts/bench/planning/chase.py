@@ -335,8 +335,8 @@ class _Racer:
         update = tree.update(self._field.pace, cell, [], 0)
         if update.kind == "full":
             tree.observe_full_ns(time.thread_time_ns() - began_ns)
-        if tree.wants_corridors:
-            tree.take_corridors(tree.corridor_job().run())
+        if tree.wants_strides:
+            tree.take_strides(tree.stride_job().run())
         if count:
             self.tally.count(update.kind)
         if not (update.wants_full or grow):
