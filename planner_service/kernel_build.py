@@ -28,6 +28,7 @@ from planner_service.kernels import (
     directed_buckets,
     directed_growth,
     lower_bounds,
+    mend,
     parents,
     radix_heap,
     repair,
@@ -55,6 +56,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
 takes longest comes first, so that builders end together."""
 
 LATER: tuple[Kernel | StepKernel, ...] = (
+    mend.mend,
     repair.repair,
     corridor_growth.grow_corridors,
     lower_bounds.bound_by_heuristic,
