@@ -27,6 +27,7 @@ from planner_service.kernels import (
     corridor_growth,
     directed_buckets,
     lower_bounds,
+    mend,
     parents,
     parents_from_root,
     pieces,
@@ -57,6 +58,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
 takes longest comes first, so that builders end together."""
 
 LATER: tuple[Kernel | StepKernel, ...] = (
+    mend.mend,
     repair.repair,
     corridor_growth.grow_corridors,
     lower_bounds.bound_by_heuristic,

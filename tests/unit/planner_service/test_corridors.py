@@ -12,7 +12,7 @@ from support import slow_twins as naive
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, random_pace
 
-from planner_service import target_tree
+from planner_service import growth_times, target_tree
 from planner_service.strategy import Auto, Growths
 from planner_service.tree import corridors as corridor_graphs
 from planner_service.tree.corridors import CorridorGraph, find_corridors
@@ -41,7 +41,7 @@ def small_corridors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(corridor_graphs, "LEAST", 3)
     monkeypatch.setattr(corridor_graphs, "AROUND", 2)
     monkeypatch.setattr("planner_service.tree.cost_to_go.INNER", 6)
-    monkeypatch.setattr(target_tree, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
+    monkeypatch.setattr(growth_times, "INLINE_NS", 5_000)  # of the model: windows of 160 cells
     monkeypatch.setattr(target_tree, "WIDE_SHARE", 64)
 
 
@@ -144,7 +144,9 @@ def test_auto_grows_exactly_then_rotates_then_coarsens_and_does_not_flap() -> No
     auto = Auto()
     stages = []
     for full_ms in (2, 9, 11, 9, 8, 6, 11, 150, 330, 300, 250, 200, 50, 6):
-        auto.row(Growths(full_ms * 1e6, budget_ns=10e6, widest_cells=512, map_cells=1 << 20))
+        auto.row(
+            Growths(full_ms * 1e6, budget_ns=10e6, widest_cells=512, map_cells=1 << 20, exact_ns=full_ms * 1e6)
+        )
         stages.append(auto.stage)
     assert stages == [
         *("exact", "exact", "rotate", "rotate", "rotate", "exact", "rotate"),
@@ -206,7 +208,7 @@ def test_what_is_asked_for_costs_what_is_driven_however_far_the_target_went() ->
 def test_on_a_large_map_a_forced_range_is_a_window_over_vehicle_and_target_until_a_worker_has_grown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(target_tree, "INLINE_NS", 60_000)
+    monkeypatch.setattr(growth_times, "INLINE_NS", 50_000)
     pace = random_pace(np.random.default_rng(1), 100, 100, 5.0, 0.1)
     play = Play(pace, PlannerConfig(strategy="rotation", k_min=0))
     for _ in range(4):
