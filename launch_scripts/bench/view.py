@@ -27,7 +27,8 @@ from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.route_reading import read_routes
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import Heard
-from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
+from swarm.bus.memory_bus import MemoryNetwork
+from swarm.bus.memory_links import PerfectLinks
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.agents import AgentPlan, plan_agents

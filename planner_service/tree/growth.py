@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import bucket_queue, directed_buckets, radix_heap
+from planner_service.kernels import bucket_queue, radix_heap
+from planner_service.kernels.cell_costs import cell_cost_range
 from planner_service.kernels.climbs import Climbs
-from planner_service.kernels.directed_growth import grow_directed
-from planner_service.kernels.layout import TOO_FINE, Labels, PaddedGrid
+from planner_service.kernels.layout import TOO_FINE, PaddedGrid
 from planner_service.kernels.parents import point_to_parents
+from planner_service.kernels.parents_from_root import find_parents_from_root
+from planner_service.tree.directed_growth import grow_directed_costs
 from shared_map.arrays import Floats
 
 MAX_RATIO = 1 << 12
@@ -23,14 +25,6 @@ SMALL_RATIO = 64
 """No grid is so small that a queue of this many buckets does not pay."""
 FINE = float(1 << 20)
 """While no cost exceeds so many lowest cell costs, float32 tells any cell's cost from its parent's."""
-
-MOST_CLIMBED = 1 << 14
-"""Where steps cost by what they climb, the same as `MAX_RATIO`: few steps are as dear as the dearest, so that more
-buckets pay."""
-_WIDE = 2.0
-"""Width of a bucket, in lowest cell costs, where a cell may be taken twice. Measured from 1 to 40."""
-_MOST_WIDE = 1 << 12
-
 
 Bounds = tuple[float, float, float]
 """Lowest and highest finite cell cost, s, and what the dearest step that is not forbidden costs, in cell costs."""
@@ -51,63 +45,46 @@ def grow_tree(
     """Grow the exact tree of a padded, passable root. Returns a bound, s, that no cost exceeds.
 
     climbs         of the same cells; None where entering a cell costs the same from everywhere
-    cost, parent   padded, written whole; None where parents are not wanted
+    cost, parent   padded, written whole; None where parents, and a bound, are not wanted
     kept           scratch of the last growth, for one of the same size: small ones feel what it takes to make it
     """
     cell_cost, _, stride, _, _ = padded
     size, lowest = cell_cost.size, bounds[0]
     box = (0, 0, size // stride - 2, stride - 2)
-    width = float(np.float32(lowest * (0.98 if climbs is None else directed_buckets.WIDTH)))
-    last = _grow_by_buckets(padded, climbs, bounds, width, root, cost, {} if kept is None else kept)
+    if climbs is not None:
+        grow_directed_costs(padded, climbs, bounds, root, cost, {} if kept is None else kept)
+        if parent is None:
+            return math.inf
+        reach = float(np.array(cell_cost_range(cost.view(np.int32)), np.int32).view(np.float32)[1])
+        if reach <= FINE * lowest:
+            point_to_parents(padded, climbs, cost, root, box, parent)
+        else:
+            find_parents_from_root(padded, climbs, (cost, parent, root), np.empty(size, np.uint32))
+        return reach
+    width = float(np.float32(lowest * 0.98))
+    last = _grow_by_buckets(padded, bounds, width, root, cost, {} if kept is None else kept)
     if last != TOO_FINE:
         if parent is not None:
-            point_to_parents(padded, climbs, cost, root, box, parent)
+            point_to_parents(padded, None, cost, root, box, parent)
         return float((last + 1) * width)
     parents = np.empty(size, np.uint8) if parent is None else parent
-    reach = _grow_in_order(padded, climbs, bounds, (cost, parents, root))
+    scratch = radix_heap.make_scratch(size, padded[3])
+    reach = float(radix_heap.grow_by_radix_heap(padded, (cost, parents, root), lowest, scratch))
     if parent is not None and reach <= FINE * lowest:
-        point_to_parents(padded, climbs, cost, root, box, parent)
+        point_to_parents(padded, None, cost, root, box, parent)
     return reach
 
 
 def _grow_by_buckets(
-    padded: PaddedGrid,
-    climbs: Climbs | None,
-    bounds: Bounds,
-    width: float,
-    root: int,
-    cost: Floats,
-    kept: KeptScratch,
+    padded: PaddedGrid, bounds: Bounds, width: float, root: int, cost: Floats, kept: KeptScratch
 ) -> int:
     """The last bucket; TOO_FINE where buckets do not suit."""
     cell_cost, _, _, rule, _ = padded
     size, (lowest, highest, dearest) = cell_cost.size, bounds
-    ratio = highest * (dearest if climbs is None else 1.0) / lowest
-    if ratio > min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)):
+    if highest / lowest > min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)):
         return TOO_FINE
     count = 1 << max(2, math.ceil(math.log2(highest * dearest / width + 3)))
-    if count > MOST_CLIMBED:
-        return TOO_FINE
     if (size, count) not in kept:
         kept.clear()
-        kept[size, count] = (
-            bucket_queue.make_scratch(size, rule, count)
-            if climbs is None
-            else directed_buckets.make_scratch(size, count)
-        )
-    scratch = kept[size, count]
-    if climbs is None:
-        return int(bucket_queue.grow_by_buckets(padded, cost, root, (width, count), scratch))
-    return int(directed_buckets.grow_directed_by_buckets(padded, cost, root, climbs, (width, count), scratch))
-
-
-def _grow_in_order(padded: PaddedGrid, climbs: Climbs | None, bounds: Bounds, labels: Labels) -> float:
-    """Whatever the ratio of costs is; parents are written, too."""
-    size, (lowest, highest, dearest) = padded[0].size, bounds
-    if climbs is None:
-        scratch = radix_heap.make_scratch(size, padded[3])
-        return float(radix_heap.grow_by_radix_heap(padded, labels, lowest, scratch))
-    width = max(lowest * _WIDE, highest * dearest / (_MOST_WIDE - 4))
-    count = 1 << math.ceil(math.log2(highest * dearest / width + 3))
-    links, first = np.empty((size, 2), np.int32), np.empty(count, np.int32)
-    return float(grow_directed(padded, labels, climbs, (width, count), links, first))
+        kept[size, count] = bucket_queue.make_scratch(size, rule, count)
+    return int(bucket_queue.grow_by_buckets(padded, cost, root, (width, count), kept[size, count]))

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from swarm.bus.bus import (
     Appeared,
@@ -34,6 +33,7 @@ from swarm.bus.memory_declarations import (
     narrowed,
     sampled,
 )
+from swarm.bus.memory_links import LinkModel
 from swarm.bus.memory_query import Asking, MemoryAnswerer
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S
@@ -47,32 +47,6 @@ from swarm.wire.topics import Topic
 
 TOKEN_NS = 1_000_000
 """Until a token that rises or falls is noticed. Zenoh takes 3 to 8 ms to notice a killed process."""
-
-
-class LinkModel(Protocol):
-    """What happens to a message between two nodes."""
-
-    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
-        """One delay per copy that arrives; none where it is lost."""
-        ...
-
-    def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        """Whether the network holds the two for connected, in the direction of the message. Tokens and queries
-        depend on it. It may lag behind `delays_ns`: a cut is noticed when the lease runs out."""
-        ...
-
-
-class PerfectLinks:
-    """Every message arrives once, after the same short time."""
-
-    def __init__(self, delay_ns: int = 200_000) -> None:
-        self._delays = (delay_ns,)
-
-    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
-        return self._delays
-
-    def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        return True
 
 
 Trace = Callable[[int, str, str, str, bytes], None]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -28,21 +28,20 @@ from swarm.bus.bus import (
     Post,
     Replied,
     check_subscription,
-    new_counts,
-    newest_of,
 )
 from swarm.bus.endpoints import listening, wait_for_router
 from swarm.bus.open_errors import why_not_listening, why_unreachable
 from swarm.bus.zenoh_answerer import ZenohAnswerer
 from swarm.bus.zenoh_config import session_config
-from swarm.bus.zenoh_threads import attached, guarded, says_json, taken_after, taken_from, timeout_of, waiting_in
+from swarm.bus.zenoh_intake import Intake
+from swarm.bus.zenoh_threads import guarded, says_json, taken_after, taken_from, timeout_of, waiting_in
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
-from swarm.wire.authentication import Authenticator, check_code, code_of
-from swarm.wire.codec import decode, decode_either, decode_many, encode
+from swarm.wire.authentication import Authenticator, code_of
+from swarm.wire.codec import decode_either, encode
 from swarm.wire.messages.base import Message
-from swarm.wire.readable import decode_parameters, encode_readable, packed_json
+from swarm.wire.readable import encode_readable
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, peer_of
 
 log = logging.getLogger(__name__)
@@ -52,10 +51,6 @@ _PRIORITIES = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
-_LOG_AGAIN_S = 60.0
-"""A key whose payloads are dropped is logged again after this."""
-_LOGGED_KEYS = 10_000
-"""Most keys whose last log is remembered: a hostile sender may use a new one each time."""
 _QUERY_BUFFER = 4096
 """Queries that wait to be answered, per queryable. It takes no more until one is read."""
 _TOKEN_BUFFER = 65_536
@@ -106,9 +101,7 @@ class ZenohBus:
         self._session = session
         self._namespace = namespace
         self._authenticator = authenticator
-        self._counts = new_counts()
-        self._counting = threading.Lock()
-        """Held to add to `_counts`."""
+        self._intake = Intake(namespace, authenticator)
         self._own_peers: list[Peer] = []
         """Our tokens, of which `watch_alive` does not tell."""
         self._entities: list[Any] = []
@@ -121,8 +114,6 @@ class ZenohBus:
         """Key expression -> its queryables, for `unserve`."""
         self._threads: list[threading.Thread] = []
         """One per channel; those that have ended are removed when the next is ended."""
-        self._logged_s: dict[str, float] = {}
-        """Key -> when a dropped payload on it was last logged, by the monotonic clock."""
         self._closing = threading.Event()
         """Set by `close`, for good: nothing is sent from then on."""
 
@@ -132,7 +123,7 @@ class ZenohBus:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        return self._counts
+        return self._intake.counts
 
     @property
     def _closed(self) -> bool:
@@ -153,7 +144,7 @@ class ZenohBus:
         if self._closed:
             return
         key, payload = topic.keyed(self._namespace, **fields), encode(message)
-        self._sent(payload)
+        self._intake.sent(payload)
         self._session.put(
             key,
             payload,
@@ -169,19 +160,17 @@ class ZenohBus:
         check_subscription(topic, together, every_s)
 
         def arrive(sample: zenoh.Sample) -> None:
-            payload = sample.payload.to_bytes()
-            self._received(payload)
-            heard = self._heard(topic, sample, payload)
+            heard = self._intake.arrived(topic, sample)
             if heard is not None:
                 post(heard)
 
         def arrive_together(samples: list[zenoh.Sample]) -> None:
-            heard = self._together(topic, samples)
+            heard = self._intake.together(topic, samples)
             if heard:
                 post(HeardMany(topic, heard))
 
         def arrive_sampled(samples: list[zenoh.Sample]) -> None:
-            for heard in self._newest(topic, samples):
+            for heard in self._intake.newest(topic, samples):
                 post(heard)
 
         subscriber = self._subscriber(topic, fields)
@@ -201,34 +190,14 @@ class ZenohBus:
     def collected(self, topic: Topic) -> list[Heard]:
         heard: list[Heard] = []
         for subscriber in self._collecting.get(topic.name, ()):
-            heard += self._newest(topic, taken_from(subscriber.handler, topic.buffer))
+            heard += self._intake.newest(topic, taken_from(subscriber.handler, topic.buffer))
         return heard
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
         samples: list[zenoh.Sample] = []
         for subscriber in self._collecting.get(topic.name, ()):
             samples += taken_from(subscriber.handler, topic.buffer)
-        return self._together(topic, samples) if samples else []
-
-    def _together(self, topic: Topic, samples: list[zenoh.Sample]) -> list[tuple[str, Message]]:
-        """Keys below the namespace and messages of samples, without those that are rejected."""
-        keyed = list(self._packed(topic, samples))
-        keys = [key for key, _ in keyed]
-        decoded = decode_many([payload for _, payload in keyed], topic.message)
-        heard: list[tuple[str, Message]] = []
-        for key, message in zip(keys, decoded, strict=True):
-            if isinstance(message, ProtocolError):
-                self._drop(key, message)
-            else:
-                heard.append((key[len(self._namespace) + 1 :], message))
-        return heard
-
-    def _newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:
-        payloads = [sample.payload.to_bytes() for sample in samples]
-        if samples:
-            self._received(*payloads)
-        keyed = ((str(each[0].key_expr), each) for each in zip(samples, payloads, strict=True))
-        return newest_of(topic, keyed, lambda waited: self._heard(topic, *waited))
+        return self._intake.together(topic, samples) if samples else []
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         subscribers = self._subscribers.pop(topic.expression(self._namespace, **fields), ())
@@ -256,7 +225,7 @@ class ZenohBus:
         if not query.key_expr.intersects(zenoh.KeyExpr(key)):
             return
         payload = encode_readable(message) if as_json else encode(message)
-        self._sent(payload)
+        self._intake.sent(payload)
         if as_json:
             query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON)
         else:
@@ -267,35 +236,6 @@ class ZenohBus:
         subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
-
-    def _packed(self, topic: Topic, samples: list[zenoh.Sample]) -> Iterator[tuple[str, bytes]]:
-        """Keys and payloads as MessagePack, without those that are broken JSON."""
-        payloads = [sample.payload.to_bytes() for sample in samples]
-        self._received(*payloads)
-        for sample, payload in zip(samples, payloads, strict=True):
-            key = str(sample.key_expr)
-            try:
-                if says_json(sample, payload):
-                    payload = packed_json(payload, topic.message, self._fields(topic, key))
-            except ProtocolError as error:
-                self._drop(key, error)
-            else:
-                yield key, payload
-
-    def _heard(self, topic: Topic, sample: zenoh.Sample, payload: bytes) -> Heard | None:
-        """The event of a sample; None, counted and logged, if it is rejected."""
-        key = str(sample.key_expr)
-        try:
-            named = self._fields(topic, key)
-            check_code(self._authenticator, attached(sample), topic, key, payload)
-            if says_json(sample, payload):
-                payload = packed_json(payload, topic.message, named)
-            message = decode(payload, topic.message)
-            topic.check_key(named, message)
-        except ProtocolError as error:
-            self._drop(key, error)
-            return None
-        return Heard(topic, named, message)
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         request_type = topic.request
@@ -310,18 +250,13 @@ class ZenohBus:
             in_json = query.payload is not None and says_json(query, query.payload.to_bytes())
             as_json = in_json or parameters.get("format") == "json"
             answerer = ZenohAnswerer(query, partial(self._reply, topic, concrete, as_json))
-            self._received(answerer.asked)
+            self._intake.received(answerer.asked)
             try:
                 answerer.timeout_s = timeout_of(timeout)
-                check_code(self._authenticator, attached(query), topic, key, answerer.asked)
-                if query.payload is None:
-                    request = decode_parameters(parameters, request_type)
-                elif in_json:
-                    request = decode(packed_json(answerer.asked, request_type), request_type)
-                else:
-                    request = decode(answerer.asked, request_type)
+                self._intake.check(topic, key, query, answerer.asked)
+                request = self._intake.request(request_type, query, answerer.asked, parameters)
             except ProtocolError as error:
-                self._drop(key, error)
+                self._intake.drop(key, error)
                 answerer.refuse(f"{topic.name}: {error}")
                 answerer.end()
                 return
@@ -362,14 +297,14 @@ class ZenohBus:
             key = str(reply.ok.key_expr)
             try:
                 payload = reply.ok.payload.to_bytes()
-                check_code(self._authenticator, attached(reply.ok), topic, key, payload, asked)
+                self._intake.check(topic, key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)
-                named = self._fields(topic, key)
+                named = self._intake.fields(topic, key)
             except ProtocolError as error:
-                self._drop(key, error)
+                self._intake.drop(key, error)
                 return
             replies += 1
-            self._received(payload)
+            self._intake.received(payload)
             post(Replied(tag, topic, named, message, took_s))
 
         def finish() -> None:
@@ -378,7 +313,7 @@ class ZenohBus:
         if self._closed:
             finish()
             return
-        self._sent(asked)
+        self._intake.sent(asked)
         self._session.get(
             f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
             zenoh.handlers.Callback(guarded(arrive), guarded(finish), indirect=False),
@@ -400,7 +335,7 @@ class ZenohBus:
             try:
                 peer = peer_of(str(sample.key_expr))
             except ProtocolError as error:
-                self._drop(str(sample.key_expr), error)
+                self._intake.drop(str(sample.key_expr), error)
                 return
             if peer in self._own_peers:
                 return  # our own token falls with the link, though we live
@@ -468,31 +403,3 @@ class ZenohBus:
         thread = threading.Thread(target=run, name=name, daemon=True)
         thread.start()
         self._threads.append(thread)
-
-    def _fields(self, topic: Topic, key: str) -> dict[str, str]:
-        fields = topic.parse(self._namespace, key)
-        if fields is None:
-            raise ProtocolError(f"{key} is not a key of topic {topic.name} ({topic.key})")
-        return fields
-
-    # Several of zenoh's threads count: adding is not atomic.
-
-    def _sent(self, payload: bytes) -> None:
-        with self._counting:
-            self._counts["messages_out"] += 1
-            self._counts["bytes_out"] += len(payload)
-
-    def _received(self, *payloads: bytes) -> None:
-        with self._counting:
-            self._counts["messages_in"] += len(payloads)
-            self._counts["bytes_in"] += sum(map(len, payloads))
-
-    def _drop(self, key: str, error: ProtocolError) -> None:
-        with self._counting:
-            self._counts["payloads_dropped"] += 1
-        now_s = time.monotonic()
-        if now_s - self._logged_s.get(key, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
-            if len(self._logged_s) > _LOGGED_KEYS:
-                self._logged_s.clear()
-            self._logged_s[key] = now_s
-            log.warning("dropped a payload on %s: %s", key[:200], error)

@@ -12,7 +12,7 @@ from support.swarm_model import SwarmModel
 
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Asked, Event, Heard
-from swarm.bus.memory_bus import LinkModel
+from swarm.bus.memory_links import LinkModel
 from swarm.clock import NS_PER_S
 from swarm.config.agents import AgentPlan, plan_agents
 from swarm.config.load import parse_scenario

@@ -19,7 +19,8 @@ from launch_scripts.metrics.endpoint import MetricsEndpoint
 from launch_scripts.metrics.exporter import Exporter
 from launch_scripts.metrics.families import HELP, Figures, Run, families, named
 from launch_scripts.report.results.counts import Counts
-from swarm.bus.memory_bus import MemoryNetwork, PerfectLinks
+from swarm.bus.memory_bus import MemoryNetwork
+from swarm.bus.memory_links import PerfectLinks
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S, ManualClock
 from swarm.errors import BusError
