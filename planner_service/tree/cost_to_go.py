@@ -210,22 +210,6 @@ class CostToGoTree:
         self._ways_changed()
         return int(visited)
 
-    def cost_at(self, cells: Cells) -> NDArray[np.float64]:
-        """float64, s: what it costs to go from padded cells along the parents, length's price with it; inf where
-        there is no way. Raises ValueError where one is no padded cell.
-
-        With `time_at` the one way to ask a tree what a cell costs: labels are upper bounds, rounded to float32.
-        """
-        return self._driven(cells, self.cost_grid.cell_cost)
-
-    def time_at(self, cells: Cells) -> NDArray[np.float64]:
-        """float64, s: how long it takes to drive from padded cells along the parents. Otherwise as `cost_at`."""
-        return self._driven(cells, self.cost_grid.time_cost)
-
-    def _driven(self, cells: Cells, cell_cost: Floats) -> NDArray[np.float64]:
-        _, parent, root = self._labels
-        return self.cost_grid.rests(parent, root, cells, cell_cost)
-
     def mend(self) -> int:
         """Make the tree exact by the parents that it has, after whatever windows, moves and repairs.
 
@@ -249,6 +233,22 @@ class CostToGoTree:
         self._become_exact(self.root)
         self.exact = bool(exact)
         return int(visited)
+
+    def cost_at(self, cells: Cells) -> NDArray[np.float64]:
+        """float64, s: what it costs to go from padded cells along the parents, length's price with it; inf where
+        there is no way. Raises ValueError where one is no padded cell.
+
+        With `time_at` the one way to ask a tree what a cell costs: labels are upper bounds, rounded to float32.
+        """
+        return self._driven(cells, self.cost_grid.cell_cost)
+
+    def time_at(self, cells: Cells) -> NDArray[np.float64]:
+        """float64, s: how long it takes to drive from padded cells along the parents. Otherwise as `cost_at`."""
+        return self._driven(cells, self.cost_grid.time_cost)
+
+    def _driven(self, cells: Cells, cell_cost: Floats) -> NDArray[np.float64]:
+        _, parent, root = self._labels
+        return self.cost_grid.rests(parent, root, cells, cell_cost)
 
     def tighten(self, cells: Cells) -> None:
         """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.
