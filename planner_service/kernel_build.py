@@ -28,10 +28,10 @@ from planner_service.kernels import (
     directed_buckets,
     lower_bounds,
     parents,
-    parents_from_root,
     radix_heap,
     repair,
     route_walk,
+    tied_parents,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
@@ -42,7 +42,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(radix_heap.grow_by_radix_heap, parents_from_root.find_parents_from_root),
+    StepKernel(radix_heap.grow_by_radix_heap, tied_parents.untie_parents),
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
