@@ -24,13 +24,16 @@ from typing import Any
 from planner_service.kernels import (
     bucket_queue,
     cell_costs,
-    corridor_growth,
     directed_buckets,
     lower_bounds,
     parents,
+    pieces,
+    pieces_mend,
     radix_heap,
     repair,
     route_walk,
+    stride_growth,
+    stride_network,
     tied_parents,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
@@ -48,6 +51,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.price_routes,
     cell_costs.changed_cells,
     route_walk.find_starts,
+    route_walk.drive_rests,
     cell_costs.cell_cost_range,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What
@@ -55,16 +59,26 @@ takes longest comes first, so that builders end together."""
 
 LATER: tuple[Kernel | StepKernel, ...] = (
     repair.repair,
-    corridor_growth.grow_corridors,
+    stride_growth.grow_strides,
     lower_bounds.bound_by_heuristic,
     cell_costs.cut_window,
     cell_costs.merge_window,
     cell_costs.find_rim,
-    corridor_growth.tighten,
-    corridor_growth.mark_levels,
+    stride_network.cut_blocks,
+    stride_network.find_ways_to_centres,
+    stride_network.join_nodes,
+    stride_growth.tighten,
+    stride_network.write_paths,
     route_walk.relabel,
+    pieces_mend.mend_tiles,
+    pieces.relabel_tiles,
+    pieces.evaluate,
+    pieces_mend.cut_ways,
+    pieces_mend.merge_parents,
+    pieces_mend.drop_lost,
+    pieces.costs_at,
 )
-"""For windows, repairs and corridors, which save growing whole trees."""
+"""For windows, repairs, strides and pieces, which save growing whole trees."""
 
 _POLL_S = 0.1
 _BUILDERS = "builders.lock"

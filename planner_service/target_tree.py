@@ -26,10 +26,10 @@ from planner_service.strategy import (
     whole_trees_only,
 )
 from planner_service.tree.bounds import LowerBounds
-from planner_service.tree.corridors import CorridorGraph, CorridorSearch, CorridorShelf, CorridorUpkeep
 from planner_service.tree.cost_grid import Changes, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.route_reading import read_routes
+from planner_service.tree.strides import FINE, LEAST, StrideSearch, StrideShelf, StrideUpkeep
 from planner_service.tree.windows import AHEAD, WindowSchedule, block_half
 from planner_service.update import Update
 from shared_map.arrays import Floats
@@ -43,8 +43,6 @@ MODEL_NS_PER_CELL = 15
 INLINE_NS = 100_000_000
 """What takes longer is no work for the thread that answers: a forced range is grown at once where a full growth
 takes less, and where there is a worker, so is any other."""
-WIDE_SHARE = 16
-"""A block window over one cell in so many gives way to the corridors, where there are any."""
 FINE_SHARE = 16
 """How far the fine windows of multi-resolution reach, as a share of the map's side."""
 
@@ -61,7 +59,7 @@ class TargetTree:
     map_version  of the last update; -1 before the first
     ready        whether routes can be given; if not, every route's status is NO_TARGET
     all_kernels  whether kernels beside those for whole trees may be called by now. While it says no, windows,
-                 repairs and corridors give way to whole trees, so that nothing waits for a compilation
+                 repairs and strides give way to whole trees, so that nothing waits for a compilation
     has_worker   whether a growth that takes longer than `INLINE_NS` is left to `full_job`. Until that is adopted
                  the tree leads where it led, and says so by `target_cell`; where it is of no use, `ready` is false
     chosen_by    the strategy; the built-in one that `config` names if not given
@@ -101,8 +99,8 @@ class TargetTree:
         self._job_out = False
         # A full growth was left to the worker: until it is adopted, moves are not followed.
         self._left_to_worker = False
-        # The corridors of strategies that thin far cells.
-        self._corridors = CorridorUpkeep()
+        # The networks of strategies that thin far cells.
+        self._strides = StrideUpkeep()
         # What a full growth takes, ns: the model's figure until `observe_full_ns` tells a measured one.
         self._full_ns = self.measured_model_ns()
         # When each width of window was grown last: every growth of a window or of the whole tree is noted there.
@@ -176,17 +174,17 @@ class TargetTree:
         return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered)
 
     @property
-    def wants_corridors(self) -> bool:
-        """Please run `corridor_job` on a worker, and `take_corridors` once it has found them."""
-        return self.strategy.thins_far_cells and self._loaded and self._corridors.wanted
+    def wants_strides(self) -> bool:
+        """Please run `stride_job` on a worker, and `take_strides` once it has found them."""
+        return self.strategy.thins_far_cells and self._loaded and self._strides.wanted
 
-    def corridor_job(self, shelf: CorridorShelf | None = None) -> CorridorSearch:
-        """See `CorridorUpkeep.search`."""
-        return self._corridors.search(self._costs, shelf)
+    def stride_job(self, shelf: StrideShelf | None = None) -> StrideSearch:
+        """See `StrideUpkeep.search`."""
+        return self._strides.search(self._costs, shelf)
 
-    def take_corridors(self, search: CorridorSearch) -> None:
-        """Go by the corridors that were found."""
-        self._corridors.take(self._costs, search)
+    def take_strides(self, search: StrideSearch) -> None:
+        """Go by the networks that were found."""
+        self._strides.take(self._costs, search)
 
     def adopt(
         self,
@@ -259,7 +257,7 @@ class TargetTree:
         return Update("forced", window, grown_cells, wants_full=not self._job_out)
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """What a full growth really took, for the strategy to choose by; not one that found corridors too. A
+        """What a full growth really took, for the strategy to choose by; not one that found networks too. A
         simulation does not call it."""
         self._full_ns = max(1, took_ns)
         self._choose_row()
@@ -287,7 +285,6 @@ class TargetTree:
         if self.ready:
             inside = (asked >= 0) & (asked < self._grid.cells)
             starts = self._costs.pad_all(asked[inside])
-            self._tree.tighten(starts)
             costs[inside] = self._tree.cost_at(starts)
         return costs
 
@@ -299,10 +296,16 @@ class TargetTree:
         return 4 << self._config.k_min
 
     @property
+    def _fine(self) -> int:
+        """How far strides are so short that all cells are grown, in cells: no less than the least block. On a map
+        where that is half of it there are no others."""
+        return max(FINE << self._config.k_min, 1 << LEAST)
+
+    @property
     def _widest(self) -> int:
         """How far the widest window reaches that is grown without a worker, in cells."""
         if self.strategy.widest_window is WidestWindow.SHARE_OF_MAP:
-            return max(self._narrowest, self._side // FINE_SHARE)
+            return max(self._fine if 4 * self._fine <= self._side else self._narrowest, self._side // FINE_SHARE)
         # Over half of the map, a full growth costs as much: that is the worker's.
         share = min(INLINE_NS / self._full_ns, 1.0) / 2
         return math.isqrt(int(share * self._grid.cells)) // 2
@@ -314,7 +317,7 @@ class TargetTree:
             self._loaded = True
             return None
         changes = self._costs.apply(pace, dirty)
-        self._corridors.learn(self._costs, changes)
+        self._strides.learn(self._costs, changes)
         if changes.any_lower:
             self._tree.window_bound = None
         self._learn_bounds(changes)
@@ -390,15 +393,17 @@ class TargetTree:
             return self._grow_full(target_cell)
         if not tree.precise:
             tree.relabel()
-        half, corridors = self._window_reach(target_cell)
+        half, far = self._reach(target_cell)
+        network = self._strides.network if far > half else None
         window = self._grid.around(target_cell, half)
         cells = 0
         while window.cells * 2 < self._grid.cells and self._is_quick(window.cells):
             connected = tree.move(target_cell, window)
             cells += window.cells
-            if connected and corridors is not None:
-                self._schedule.note_grown(target_cell, self._side)
-                return Update("coarse", self._grid.window, cells + tree.grow_corridors(window, corridors))
+            if connected and network is not None:
+                self._schedule.note_grown(target_cell, far)
+                cells += tree.grow_strides(window, network, far)
+                return Update("coarse", self._grid.around(target_cell, far), cells)
             if connected:
                 self._schedule.note_grown(target_cell, half)
                 return Update("window", window, cells)
@@ -406,21 +411,20 @@ class TargetTree:
             window = self._grid.around(target_cell, half)
         return self._grow_full(target_cell) if self._is_quick(self._grid.cells) else self._leave_to_worker()
 
-    def _window_reach(self, target_cell: int) -> tuple[int, CorridorGraph | None]:
-        """How far to every side of the target the tree is grown now, and over which corridors beyond; None for not
-        at all."""
+    def _reach(self, target_cell: int) -> tuple[int, int]:
+        """How far to every side of the target all cells are grown now, and how far strides are: no further
+        where both are the same."""
         row, old = self.strategy, self._tree.root
-        corridors = self._corridors.graph if row.thins_far_cells else None
+        has_strides = row.thins_far_cells and self._strides.network is not None and 4 * self._fine <= self._side
         least = 2 * self._grid.distance_cells(old, target_cell)
         if row.on_move is OnMove.BLOCK_WINDOW:
             half = block_half(self._grid, old, target_cell, self._config.k_min)
-            if corridors is None or self._grid.around(target_cell, half).cells * WIDE_SHARE <= self._grid.cells:
-                return half, None
-            return max(self._narrowest, least), corridors
+            return (min(half, max(self._fine, least)) if has_strides else half), half
         widest = self._widest
-        if corridors is not None and self._schedule.beyond(target_cell, widest):
-            return max(widest, least), corridors
-        return max(self._schedule.half(target_cell, widest), least), None
+        if has_strides and self._schedule.beyond(target_cell, widest):
+            return max(widest, self._fine, least), self._side
+        half = max(self._schedule.half(target_cell, widest), least)
+        return half, half
 
     def _is_full_due(self, done: Update) -> bool:
         """Whether to ask for a full growth after what was done: the row says when, unless one is under way."""
