@@ -28,7 +28,6 @@ from planner_service.kernels import (
     lower_bounds,
     mend,
     parents,
-    parents_from_root,
     pieces,
     pieces_mend,
     radix_heap,
@@ -36,6 +35,7 @@ from planner_service.kernels import (
     route_walk,
     stride_growth,
     stride_network,
+    tied_parents,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
@@ -46,7 +46,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(radix_heap.grow_by_radix_heap, parents_from_root.find_parents_from_root),
+    StepKernel(radix_heap.grow_by_radix_heap, tied_parents.untie_parents),
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,
