@@ -29,9 +29,9 @@ from planner_service.kernels import (
     directed_growth,
     lower_bounds,
     parents,
-    radix_heap,
     repair,
     route_walk,
+    wide_buckets,
 )
 from planner_service.kernels.compile import StepKernel, cache_folder, is_loaded, is_on_disk, load
 
@@ -42,7 +42,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.walk_routes,
     StepKernel(bucket_queue.grow_by_buckets, directed_buckets.grow_directed_by_buckets),
     parents.point_to_parents,
-    StepKernel(radix_heap.grow_by_radix_heap, directed_growth.grow_directed),
+    StepKernel(wide_buckets.grow_by_wide_buckets, directed_growth.grow_directed),
     route_walk.join_routes,
     cell_costs.pad_cell_costs,
     route_walk.price_routes,

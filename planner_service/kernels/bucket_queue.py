@@ -7,7 +7,7 @@ key is ever decreased. Octile steps make two keys per cell, straight and diagona
 
 Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)      padded cells that got their cost from the last bucket
-    batch    uint32  (size + _AHEAD,) padded cells of the bucket that is being served
+    batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
     queue    as of `chunked_buckets`; `make_scratch` says how large
 
 What the loops look like was measured, and small changes cost much: cells are touched without branches, sorted into
@@ -26,27 +26,37 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.chunked_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.compile import helper, kernel
-from planner_service.kernels.layout import BUCKETS, GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, TOO_FINE, WALL
+from planner_service.kernels.layout import (
+    BUCKETS,
+    GRID,
+    INF,
+    RULE_OCTILE,
+    RULE_PAPER,
+    SQRT2,
+    TOO_FINE,
+    WALL,
+    exit_key,
+)
 from planner_service.kernels.prefetch import prefetch
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
-_AHEAD = 8
+AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048."""
 _SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
 
 
 @helper
-def _open_costs(cell_cost, cost):
+def open_costs(cell_cost, cost):
     """Before a growth: inf on passable cells, WALL on the others."""
     for i in range(cell_cost.size):
         cost[i] = INF if cell_cost[i] < INF else WALL
 
 
 @helper
-def _close_costs(cost):
+def close_costs(cost):
     """After a growth: inf on lethal cells too."""
     for i in range(cost.size):
         c = cost[i]
@@ -61,7 +71,7 @@ def make_scratch(size: int, rule: int, buckets: int) -> Scratch:
     that was not written."""
     kinds = 2 if rule == RULE_OCTILE else 1
     # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
-    touched, batch = np.empty(size + 1, np.uint32), np.empty(size + _AHEAD, np.uint32)
+    touched, batch = np.empty(size + 1, np.uint32), np.empty(size + AHEAD, np.uint32)
     return touched, batch, make_queue(kinds * size, kinds * buckets)
 
 
@@ -82,14 +92,14 @@ def _ask_for(cell_cost, cost, s, u):
 
 
 @helper
-def _offer_straight(cell_cost, cost, s, batch, n, touched):
+def offer_straight(cell_cost, cost, s, batch, n, touched, always):
     """Offer their exit keys to four neighbours. Writes the cells that had no cost yet to `touched`; returns how
-    many."""
+    many. `always` is that of `exit_key`."""
     count = _ZERO
     for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u]
+        key = exit_key(cost[u], cell_cost[u], always)
         north, west, east, south = cost[u - s], cost[u - _ONE], cost[u + _ONE], cost[u + s]
         for i, old in ((u - s, north), (u - _ONE, west), (u + _ONE, east), (u + s, south)):
             cost[i] = min(old, key)
@@ -99,12 +109,12 @@ def _offer_straight(cell_cost, cost, s, batch, n, touched):
 
 
 @helper
-def _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
-    """As `_offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
+def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count, always):
+    """As `offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
     for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u] * SQRT2
+        key = exit_key(cost[u], cell_cost[u] * SQRT2, always)
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
@@ -130,13 +140,13 @@ def _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
 
 
 @helper
-def _offer_around(cell_cost, cost, s, corners, batch, n, touched):
-    """As `_offer_straight`, to eight neighbours, all a step of length 1 away."""
+def offer_around(cell_cost, cost, s, corners, batch, n, touched, always):
+    """As `offer_straight`, to eight neighbours, all a step of length 1 away."""
     count = _ZERO
     for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(_AHEAD)]))
+        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u]
+        key = exit_key(cost[u], cell_cost[u], always)
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
@@ -187,7 +197,7 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
     second = length if rule == RULE_OCTILE else _ZERO
     inverse = _ONE32 / np.float32(width)
 
-    _open_costs(cell_cost, cost)
+    open_costs(cell_cost, cost)
     cost[np.uint64(root)] = _ZERO32
     touched[0] = root
     count = _ONE
@@ -204,7 +214,7 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
             _choose(cell_cost, cost, SQRT2, inverse, following, touched, count, batch)
             put(queue, touched, count, batch, mask, length)
         if waiting == _ZERO:
-            _close_costs(cost)
+            close_costs(cost)
             return current
         if current > 1 << 20:
             return TOO_FINE
@@ -216,13 +226,13 @@ def grow_by_buckets(grid, cost, root, buckets, scratch):
         n = take(queue, b, batch)
         waiting -= n
         if rule == RULE_PAPER:
-            count = _offer_around(cell_cost, cost, s, corners, batch, n, touched)
+            count = offer_around(cell_cost, cost, s, corners, batch, n, touched, None)
         else:
-            count = _offer_straight(cell_cost, cost, s, batch, n, touched)
+            count = offer_straight(cell_cost, cost, s, batch, n, touched, None)
         if rule == RULE_OCTILE:
             n = take(queue, b + length, batch)
             waiting -= n
-            count = _offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count)
+            count = offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count, None)
 
 
 @kernel(f"({GRID}, f4[::1], i8, u4[::1])")

@@ -3,7 +3,7 @@
 `mark_levels` counts how many shortest paths pass each cell of a tree. `grow_corridors` is a label-correcting search
 (Dijkstra's with a binary heap, cells being re-entered when they get cheaper; E. W. Dijkstra 1959, D. P. Bertsekas
 1993) over the cells so marked. It needs an order by cost that may fall back: a cell's cost is first recomputed
-along its parents, and may turn out to be less than what was served last, which bucket queues and radix heaps rule
+along its parents, and may turn out to be less than what was served last, which bucket queues rule
 out.
 
 Arrays, beside those of `layout`:

@@ -3,7 +3,7 @@ decrease-key (Dial 1969 with buckets wider than a step: B. V. Cherkassky, A. V. 
 algorithms", Mathematical Programming 73, 1996, 129-174).
 
 Where a step's cost depends on both its ends, a cell's first offer is not its least, and the growths of
-`bucket_queue` and `radix_heap` do not hold. Here a cell waits in one bucket, by its cost, and moves to an earlier
+`bucket_queue` and `wide_buckets` do not hold. Here a cell waits in one bucket, by its cost, and moves to an earlier
 one when it gets cheaper.
 
 Arrays, beside those of `layout`:

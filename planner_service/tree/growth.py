@@ -8,25 +8,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import bucket_queue, directed_buckets, radix_heap
+from planner_service.kernels import bucket_queue, directed_buckets, wide_buckets
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.directed_growth import grow_directed
 from planner_service.kernels.layout import TOO_FINE, Labels, PaddedGrid
 from planner_service.kernels.parents import point_to_parents
 from shared_map.arrays import Floats
 
-MAX_RATIO = 1 << 12
-"""Between dearest and cheapest step: beyond it, turning over buckets as narrow as the cheapest, most of them empty,
-costs more than a radix heap; on a small grid, beyond one bucket for so many cells:"""
-CELLS_PER_BUCKET = 16
-SMALL_RATIO = 64
-"""No grid is so small that a queue of this many buckets does not pay."""
+MOST_BUCKETS = 1 << 8
+"""As narrow as the cheapest step: where the dearest takes more of them, their width follows the map."""
 FINE = float(1 << 20)
 """While no cost exceeds so many lowest cell costs, float32 tells any cell's cost from its parent's."""
 
+MAX_RATIO = 1 << 12
+"""Between dearest and cheapest step that cost by what they climb: beyond it, turning over buckets as narrow as the
+cheapest, most of them empty, does not pay; on a small grid, beyond one bucket for so many cells:"""
+CELLS_PER_BUCKET = 16
+SMALL_RATIO = 64
+"""No grid is so small that a queue of this many buckets does not pay."""
 MOST_CLIMBED = 1 << 14
-"""Where steps cost by what they climb, the same as `MAX_RATIO`: few steps are as dear as the dearest, so that more
-buckets pay."""
+"""Buckets of such a growth: few steps are as dear as the dearest, so that more of them pay."""
+_NARROW = 0.98
+"""Width of a bucket, in lowest cell costs, that no cell in it leads back into, whatever the rounding."""
 _WIDE = 2.0
 """Width of a bucket, in lowest cell costs, where a cell may be taken twice. Measured from 1 to 40."""
 _MOST_WIDE = 1 << 12
@@ -54,11 +57,17 @@ def grow_tree(
     cost, parent   padded, written whole; None where parents are not wanted
     kept           scratch of the last growth, for one of the same size: small ones feel what it takes to make it
     """
-    cell_cost, _, stride, _, _ = padded
-    size, lowest = cell_cost.size, bounds[0]
+    size, stride = padded[0].size, padded[2]
     box = (0, 0, size // stride - 2, stride - 2)
-    width = float(np.float32(lowest * (0.98 if climbs is None else directed_buckets.WIDTH)))
-    last = _grow_by_buckets(padded, climbs, bounds, width, root, cost, {} if kept is None else kept)
+    scratch_of = {} if kept is None else kept
+    if climbs is None:
+        reach = _grow_alike(padded, bounds, root, cost, scratch_of)
+        if parent is not None:
+            point_to_parents(padded, None, cost, root, box, parent)
+        return reach
+    lowest = bounds[0]
+    width = float(np.float32(lowest * directed_buckets.WIDTH))
+    last = _grow_by_buckets(padded, climbs, bounds, width, root, cost, scratch_of)
     if last != TOO_FINE:
         if parent is not None:
             point_to_parents(padded, climbs, cost, root, box, parent)
@@ -70,9 +79,28 @@ def grow_tree(
     return reach
 
 
+def _grow_alike(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, kept: KeptScratch) -> float:
+    """Where entering a cell costs the same from everywhere."""
+    size, rule, (lowest, highest, dearest) = padded[0].size, padded[3], bounds
+    width = float(np.float32(lowest * _NARROW))
+    needed = highest * dearest / width + 3
+    if needed <= MOST_BUCKETS:
+        count = 1 << max(2, math.ceil(math.log2(needed)))
+        if (size, count) not in kept:
+            kept.clear()
+            kept[size, count] = bucket_queue.make_scratch(size, rule, count)
+        last = int(bucket_queue.grow_by_buckets(padded, cost, root, (width, count), kept[size, count]))
+        if last != TOO_FINE:
+            return (last + 1) * width
+    if (size, 0) not in kept:
+        kept.clear()
+        kept[size, 0] = wide_buckets.make_scratch(size, rule)
+    return float(wide_buckets.grow_by_wide_buckets(padded, cost, root, width, kept[size, 0]))
+
+
 def _grow_by_buckets(
     padded: PaddedGrid,
-    climbs: Climbs | None,
+    climbs: Climbs,
     bounds: Bounds,
     width: float,
     root: int,
@@ -80,33 +108,22 @@ def _grow_by_buckets(
     kept: KeptScratch,
 ) -> int:
     """The last bucket; TOO_FINE where buckets do not suit."""
-    cell_cost, _, _, rule, _ = padded
-    size, (lowest, highest, dearest) = cell_cost.size, bounds
-    ratio = highest * (dearest if climbs is None else 1.0) / lowest
-    if ratio > min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)):
+    size, (lowest, highest, dearest) = padded[0].size, bounds
+    if highest / lowest > min(MAX_RATIO, max(SMALL_RATIO, size // CELLS_PER_BUCKET)):
         return TOO_FINE
     count = 1 << max(2, math.ceil(math.log2(highest * dearest / width + 3)))
     if count > MOST_CLIMBED:
         return TOO_FINE
     if (size, count) not in kept:
         kept.clear()
-        kept[size, count] = (
-            bucket_queue.make_scratch(size, rule, count)
-            if climbs is None
-            else directed_buckets.make_scratch(size, count)
-        )
+        kept[size, count] = directed_buckets.make_scratch(size, count)
     scratch = kept[size, count]
-    if climbs is None:
-        return int(bucket_queue.grow_by_buckets(padded, cost, root, (width, count), scratch))
     return int(directed_buckets.grow_directed_by_buckets(padded, cost, root, climbs, (width, count), scratch))
 
 
-def _grow_in_order(padded: PaddedGrid, climbs: Climbs | None, bounds: Bounds, labels: Labels) -> float:
+def _grow_in_order(padded: PaddedGrid, climbs: Climbs, bounds: Bounds, labels: Labels) -> float:
     """Whatever the ratio of costs is; parents are written, too."""
     size, (lowest, highest, dearest) = padded[0].size, bounds
-    if climbs is None:
-        scratch = radix_heap.make_scratch(size, padded[3])
-        return float(radix_heap.grow_by_radix_heap(padded, labels, lowest, scratch))
     width = max(lowest * _WIDE, highest * dearest / (_MOST_WIDE - 4))
     count = 1 << math.ceil(math.log2(highest * dearest / width + 3))
     links, first = np.empty((size, 2), np.int32), np.empty(count, np.int32)
