@@ -48,7 +48,6 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     route_walk.price_routes,
     cell_costs.changed_cells,
     route_walk.find_starts,
-    lower_bounds.bound_by_exact_cost,
     cell_costs.cell_cost_range,
 )
 """Enough to grow whole trees, to keep up with the map by growing them anew, and to give certified routes. What

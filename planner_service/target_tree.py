@@ -288,7 +288,7 @@ class TargetTree:
             inside = (asked >= 0) & (asked < self._grid.cells)
             starts = self._costs.pad_all(asked[inside])
             self._tree.tighten(starts)
-            costs[inside] = np.maximum(self._tree.cost[starts] + np.float32(self._tree.offset), 0)
+            costs[inside] = self._tree.cost_at(starts)
         return costs
 
     # --- how ----------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from planner_service.kernels.compile import helper, kernel
 from planner_service.kernels.layout import BOX, INF, check_cells
 
-_ROUNDING = 2.0**-23
+ROUNDING = 2.0**-23
 """Relative error of one float32 step, doubled for the sum over a route's steps."""
 
 
@@ -39,16 +39,7 @@ rim_cost  float64  (m,)      s; the window's own cost of each cell of the rim
 def _rounding(cost, lowest, most):
     """How far float32 may have put this cost off, relatively: no optimal route has more steps than its cost has
     lowest cell costs, or than there are cells (`most`)."""
-    return min((min(cost / lowest, most) + 4.0) * _ROUNDING, 1.0)
-
-
-@kernel("(f4[::1], i8[::1], f8, i8, f8[::1])")
-def bound_by_exact_cost(cost, starts, lowest, most, bound):
-    """bound := what an exact tree says. lowest: cell cost, s; most: cells of the grid."""
-    check_cells(starts, cost.size)
-    for i in range(starts.size):
-        own = np.float64(cost[starts[i]])
-        bound[i] = own * (1.0 - _rounding(own, lowest, most))
+    return min((min(cost / lowest, most) + 4.0) * ROUNDING, 1.0)
 
 
 @kernel(f"(f4[::1], i8, i8, f4[::1], {BOX}, i8[::1], f8[::1], i8[::1], f8, i8, f8[::1])")

@@ -246,8 +246,8 @@ def join_routes(walks, walk, directions):
         n = max(n, ends[r])
 
 
-@kernel("(f4[::1], f4[::1], i8, i8, i8[::1], i8[::1], u1[::1])")
-def find_starts(cell_cost, cost, stride, root, asked, starts, status):
+@kernel("(f4[::1], u1[::1], i8, i8, i8[::1], i8[::1], u1[::1])")
+def find_starts(cell_cost, parent, stride, root, asked, starts, status):
     """Where routes from `asked` cells (int64, of the grid) start, padded, and whether there is one.
 
     Written: starts (int64; the root where there is no route, so that none is walked), status (uint8).
@@ -263,26 +263,26 @@ def find_starts(cell_cost, cost, stride, root, asked, starts, status):
         v = (cell // cols + 1) * stride + cell % cols + 1
         if not cell_cost[v] < INF:
             status[i] = LETHAL_START
-        elif not cost[v] < INF:
+        elif parent[v] == NONE and v != root:
             status[i] = UNREACHABLE
         else:
             status[i] = OK
             starts[i] = v
 
 
-@kernel(f"(f4[::1], f8, i8, UniTuple(f8, 3), {_WALKS}, u1[::1], f8[::1], f8[:, ::1])")
-def price_routes(cost, offset, root, metres, walks, status, bound, prices):
+@kernel(f"(UniTuple(f8, 3), {_WALKS}, f8[::1], u1[::1], f8[::1], f8[:, ::1])")
+def price_routes(metres, walks, rest, status, bound, prices):
     """What walked routes cost and how long they are.
 
-    offset  s; what a tree's stored costs lack
     metres  (resolution, m; length of a diagonal in straight steps; price of length, s/m)
     walks   (ends, driven, diagonals, last) as `walk_routes` and `join_routes` wrote them
+    rest    float64 (n,), s; cost-to-go from where each ends
     bound   float64 (n,), s; proven lower bound on the cost of each
     prices  written whole
     Returns False if a route does not end where it should.
     """
     resolution, diagonal, length_weight = metres
-    ends, driven, diagonals, last = walks
+    ends, driven, diagonals, _ = walks
     begin = 0
     for i in range(status.size):
         if status[i] != OK:
@@ -295,12 +295,9 @@ def price_routes(cost, offset, root, metres, walks, status, bound, prices):
             return False
         length = (np.float64(ends[i] - begin) + np.float64(diagonals[i]) * (diagonal - 1.0)) * resolution
         begin = ends[i]
-        remaining = 0.0
-        if last[i] != root:
-            remaining = max(np.float64(cost[last[i]]) + offset, 0.0)
-        whole = driven[i] - length * length_weight + remaining
+        whole = driven[i] - length * length_weight + rest[i]
         prices[0, i] = whole
         prices[1, i] = min(bound[i], whole)
         prices[2, i] = length
-        prices[3, i] = remaining
+        prices[3, i] = rest[i]
     return True

@@ -59,10 +59,12 @@ class LowerBounds:
         """
         grid = self._grid
         lowest, most = grid.lowest_cell_cost, grid.grid.cells
-        bound = np.zeros(starts.size)
         if tree.exact:
-            kernels.bound_by_exact_cost(tree.cost, starts, lowest, most, bound)
+            cost = tree.cost_at(starts)
+            steps = np.minimum(cost / lowest, most) + 4.0  # as `kernels` bounds them
+            bound = cost * np.maximum(1.0 - steps * kernels.ROUNDING, 0.0)
         else:
+            bound = np.zeros(starts.size)
             part, box, rim, rim_cost = NO_WINDOW if tree.window_bound is None else tree.window_bound
             heuristic = _NONE if self._heuristic is None else self._heuristic
             root = grid.pad(tree.root)

@@ -197,6 +197,18 @@ class CostToGoTree:
         self._ways_changed()
         return int(visited)
 
+    def cost_at(self, cells: Cells) -> NDArray[np.float64]:
+        """float64, s: the cost-to-go of padded cells, inf where there is no way; at least what is driven along the
+        parents, up to the rounding of float32. Raises ValueError where one is no padded cell.
+
+        The one way to ask a tree what a cell costs: readers know neither how labels are kept nor what they lack.
+        """
+        if ((cells < 0) | (cells >= self.cost_grid.size)).any():
+            raise ValueError("padded cells lie outside the map")
+        costs: NDArray[np.float64] = np.maximum(self.cost[cells].astype(np.float64) + self.offset, 0.0)
+        costs[cells == self.cost_grid.pad(self.root)] = 0.0
+        return costs
+
     def tighten(self, cells: Cells) -> None:
         """Lower the costs of padded cells, and of all on their ways, to what is driven along the parents.
 

@@ -17,21 +17,22 @@ def read_routes(tree: CostToGoTree, bounds: LowerBounds, asked: NDArray[np.int64
     root = grid.pad(tree.root)
     starts = np.empty(asked.size, np.int64)
     statuses = np.empty(asked.size, np.uint8)
-    find_starts(grid.cell_cost, tree.cost, grid.stride, root, asked, starts, statuses)
+    find_starts(grid.cell_cost, tree.parent, grid.stride, root, asked, starts, statuses)
     walks = grid.walk(tree.parent, root, starts, max_cells, grid.cell_cost)
     if max_cells:
         tree.tighten(walks.last)
     bound = bounds.at(tree, starts)
     prices = np.empty((4, asked.size), np.float64)
     metres = (grid.grid.resolution_m, grid.diagonal, grid.config.length_weight)
-    whole = price_routes(tree.cost, tree.offset, root, metres, walks[1:], statuses, bound, prices)
+    rest = tree.cost_at(walks.last)
+    whole = price_routes(metres, walks[1:], rest, statuses, bound, prices)
     if not whole:
         raise AssertionError("a route does not end at the target: the tree is broken")
     if max_cells and grid.config.length_weight:
         # The tree's cost of what is cut off holds a price of its length; only driving it tells the time it takes.
         ends = grid.walk(tree.parent, root, starts, 0, grid.cell_cost)
         of_whole = np.empty_like(prices)
-        price_routes(tree.cost, tree.offset, root, metres, ends[1:], statuses, bound, of_whole)
+        price_routes(metres, ends[1:], np.zeros_like(rest), statuses, bound, of_whole)
         known = np.isfinite(prices[0])
         given_s = prices[0, known] - prices[3, known]
         prices[0, known] = of_whole[0, known]
